@@ -1,0 +1,1 @@
+"""Jobs, routes, dashboard, and the pipeline that strings the stages together."""

@@ -1,0 +1,1 @@
+"""Plan, dome and cameras, real and simulated; writes the capture store."""

@@ -1,0 +1,136 @@
+"""The one exception tree.
+
+::
+
+    DentineError              .code, .exit_status
+    ├── InputError            bad input: names the thing and the remedy
+    │   ├── SettingsError     unknown option, wrong type, impossible combination
+    │   ├── MeshError         open, inside-out or wrongly scaled geometry
+    │   └── CaptureInputError a frame or file is missing or malformed
+    ├── StoreError            what is on disk is not what was published
+    │   ├── MissingStageError nothing published where something is expected
+    │   ├── CorruptStoreError a shard is missing, truncated or altered
+    │   └── FencedError       a newer attempt owns this stage
+    ├── PlatformError         the machine lacks something: a library, a device
+    ├── RigError              the dome or a camera misbehaves; lights are dark when it is raised
+    │   ├── InterlockError    e-stop or interlock open
+    │   ├── ExposureLimitError photobiological limit, refused before anything is sent
+    │   └── ReadbackError     the controller does not hold what was written
+    ├── NonFiniteError        a kernel produced NaN or Inf; count and place in the message
+    └── JobCancelledError          cooperative cancel
+
+Every message is one sentence that names the thing and the remedy. Every error survives pickling.
+"""
+
+from __future__ import annotations
+
+
+class DentineError(Exception):
+    """Root of the tree; ``code`` is stable and machine-readable."""
+
+    code = "dentine-error"
+    exit_status = 1
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+
+    @property
+    def message(self) -> str:
+        """The sentence for the user."""
+        return str(self.args[0])
+
+
+class InputError(DentineError):
+    """Something the user gave is wrong."""
+
+    code = "bad-input"
+    exit_status = 2
+
+
+class SettingsError(InputError):
+    """An option is unknown, of the wrong type, or contradicts another."""
+
+    code = "bad-settings"
+
+
+class MeshError(InputError):
+    """A mesh cannot bound a medium."""
+
+    code = "bad-mesh"
+
+
+class CaptureInputError(InputError):
+    """A capture lacks a frame or holds one that cannot be read."""
+
+    code = "bad-capture"
+
+
+class StoreError(DentineError):
+    """Stored data cannot be used."""
+
+    code = "store-error"
+    exit_status = 3
+
+
+class MissingStageError(StoreError):
+    """A stage's result is expected and none is published."""
+
+    code = "stage-missing"
+
+
+class CorruptStoreError(StoreError):
+    """A published file is missing, truncated or altered."""
+
+    code = "store-corrupt"
+
+
+class FencedError(StoreError):
+    """A newer attempt owns the stage; this one must not write."""
+
+    code = "attempt-fenced"
+
+
+class PlatformError(DentineError):
+    """The machine lacks a library or a device."""
+
+    code = "platform-missing"
+    exit_status = 4
+
+
+class RigError(DentineError):
+    """The dome or a camera misbehaves. Whoever raises it has already switched the lights off."""
+
+    code = "rig-fault"
+    exit_status = 5
+
+
+class InterlockError(RigError):
+    """The interlock is open or the emergency stop is pressed."""
+
+    code = "rig-interlock"
+
+
+class ExposureLimitError(RigError):
+    """A plan exceeds the photobiological limit; nothing was lit."""
+
+    code = "rig-exposure-limit"
+
+
+class ReadbackError(RigError):
+    """The controller does not hold what was written to it."""
+
+    code = "rig-readback"
+
+
+class NonFiniteError(DentineError):
+    """A computation produced NaN or infinity."""
+
+    code = "non-finite"
+    exit_status = 6
+
+
+class JobCancelledError(DentineError):
+    """The job was cancelled between two frames or steps."""
+
+    code = "cancelled"
+    exit_status = 130

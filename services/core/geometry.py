@@ -1,0 +1,114 @@
+"""Cameras, lights and meshes as records. Lengths are millimetres, camera axes follow OpenCV (x right, y down, z forward)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from services.core.errors import MeshError
+
+Vector3 = tuple[float, float, float]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+class Record(BaseModel):
+    """Base of every record at a process edge: frozen, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
+
+
+class Camera(Record):
+    """A pinhole camera without distortion."""
+
+    name: str
+    size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(description="width, height in pixels")
+    K: Matrix3 = Field(description="intrinsic matrix, pixels; pixel centres at half-integers")
+    camera_from_world: Matrix4 = Field(description="rigid transform, mm, OpenCV axes")
+
+    @field_validator("camera_from_world")
+    @classmethod
+    def _rigid(cls, value: Matrix4) -> Matrix4:
+        rotation = np.asarray(value)[:3, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
+            raise ValueError("camera_from_world must be a rotation and a translation; re-export the calibrated pose")
+        return value
+
+    def project(self, points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project world points (N, 3) to pixels (N, 2) and depths (N,) in mm."""
+        pose = np.asarray(self.camera_from_world)
+        local = points_mm @ pose[:3, :3].T + pose[:3, 3]
+        image = local @ np.asarray(self.K).T
+        return image[:, :2] / image[:, 2:3], local[:, 2]
+
+    def rays(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World-space origin (3,) and unit directions (N, 3) through pixel coordinates."""
+        pose = np.asarray(self.camera_from_world)
+        local = np.stack([x_px, y_px, np.ones_like(x_px)], axis=-1) @ np.linalg.inv(np.asarray(self.K)).T
+        directions = local @ pose[:3, :3]
+        return -pose[:3, :3].T @ pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+class Light(Record):
+    """An isotropic point light."""
+
+    name: str
+    position_mm: Vector3
+    intensity: tuple[float, ...] = Field(description="radiant intensity per channel, with mm as the length unit")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh: vertices (V, 3) float64 in mm, faces (F, 3) int32, counter-clockwise seen from outside."""
+
+    vertices_mm: NDArray[np.float64]
+    faces: NDArray[np.int32]
+
+    def edge_counts(self) -> NDArray[np.int64]:
+        """How many faces use each undirected edge."""
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return np.unique(edges, axis=0, return_counts=True)[1]
+
+    def signed_volume_mm3(self) -> float:
+        """Volume by the divergence theorem; negative when the mesh is inside out."""
+        a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    def require_solid(self, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:
+        """Refuse a mesh that cannot bound a medium.
+
+        Raises:
+            MeshError: open, inside out, not finite, or of an extent that no tooth or jaw in millimetres has.
+        """
+        if not np.isfinite(self.vertices_mm).all():
+            raise MeshError(f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again.")
+        extent = float(np.ptp(self.vertices_mm, axis=0).max())
+        if not extent_mm[0] <= extent <= extent_mm[1]:
+            raise MeshError(
+                f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices must be in millimetres, so rescale it."
+            )
+        open_edges = int(np.count_nonzero(self.edge_counts() != 2))
+        if open_edges:
+            raise MeshError(f"Mesh {name} is not watertight: {open_edges} edges do not join exactly two faces; close its holes.")
+        if self.signed_volume_mm3() <= 0:
+            raise MeshError(f"Mesh {name} is inside out (negative volume); flip its face orientation.")
+
+
+@dataclass(frozen=True)
+class Tooth:
+    """One tooth by FDI number: the enamel's outer surface, and the dentin's where it is known."""
+
+    fdi: int
+    outer: Mesh
+    dentin: Mesh | None = None
+
+
+def teeth_folder(root: Path, fdi: int) -> Path:
+    """Where a capture or prepared folder keeps one tooth's meshes: ``teeth/<FDI>/outer.ply`` and ``dentin.ply``."""
+    return root / "teeth" / str(fdi)

@@ -1,0 +1,61 @@
+"""Read and write meshes. The one place that touches a mesh file format; trimesh does the parsing, imported when needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Mesh, Tooth, teeth_folder
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a PLY, OBJ or STL file in mm, vertices welded, orientation untouched.
+
+    Raises:
+        CaptureInputError: the file is absent or no triangle mesh.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+        vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32)
+    except Exception as problem:
+        raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
+    if len(faces) == 0:
+        raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
+    welded, index = np.unique(vertices, axis=0, return_inverse=True)
+    return Mesh(welded, index.reshape(-1)[faces].astype(np.int32))
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a binary PLY with float32 coordinates."""
+    import trimesh
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(path)
+
+
+def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, ...]:
+    """Read and check every tooth below ``root/teeth``.
+
+    Raises:
+        CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
+    """
+    numbers = fdi if fdi is not None else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isdigit()))
+    if not numbers:
+        raise CaptureInputError(f"No tooth mesh below {root / 'teeth'}; put teeth/<FDI>/outer.ply there.")
+    teeth = []
+    for number in numbers:
+        folder = teeth_folder(root, number)
+        outer = read_mesh(folder / "outer.ply")
+        outer.require_solid(f"teeth/{number}/outer.ply")
+        dentin = None
+        if (folder / "dentin.ply").exists():
+            dentin = read_mesh(folder / "dentin.ply")
+            dentin.require_solid(f"teeth/{number}/dentin.ply")
+        teeth.append(Tooth(number, outer, dentin))
+    return tuple(teeth)

@@ -1,0 +1,172 @@
+"""Records that cross a process boundary: what a job asks for and what each stage hands on."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from services.core.geometry import Camera, Light, Record, Vector3
+
+Unit = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+Boundary = Literal["matched", "thin"]
+
+
+class MaskBit(IntFlag):
+    """Why a pixel is not used; 0 means valid. Stored as uint16 in ``prepared.zarr/valid``."""
+
+    OUTSIDE = 1
+    HIGHLIGHT = 2
+    SATURATED = 4
+    MOTION = 8
+    SHADOW = 16
+    NOT_FINITE = 32
+    MANUAL = 64
+    UNLIT = 128
+
+
+class ImageEntry(Record):
+    """One image of a folder capture."""
+
+    camera: str
+    light: str
+    file: str
+    variance_file: str | None = None
+    held_out: bool = False
+
+
+class FolderCapture(Record):
+    """``capture.json`` of a folder capture, also the description of a rig (then ``images`` may be empty)."""
+
+    units: Literal["mm"]
+    channels: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    images: tuple[ImageEntry, ...] = ()
+
+
+class SimulatedCameraSpec(Record):
+    """What the simulated cameras add to the virtual mouth they look at."""
+
+    bits: Literal[8, 10, 12, 14, 16] = Field(default=12, description="analogue-to-digital resolution")
+    black_level: int = Field(default=64, description="counts without light")
+    noise_relative: Unit = Field(default=0.01, description="noise, fraction of the value")
+    noise_floor: Unit = Field(default=0.002, description="noise, fraction of full scale")
+    motion_px: float = Field(default=0.0, ge=0, description="largest displacement of the subject between frames, pixels")
+    seed: int = 0
+
+
+class RigSpec(Record):
+    """Which dome and cameras to capture with."""
+
+    dome: str = Field(default="simulated", description="host:port of the Modbus controller, or 'simulated' to start one on loopback")
+    cameras: Literal["simulated", "playback"] = "simulated"
+    mouth: Path = Field(description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see")
+    level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
+    exposure_s: Positive = Field(default=0.05, description="exposure time")
+    settle_s: float = Field(default=0.002, ge=0, description="wait between light on and exposure")
+    tracking_every: int = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
+    black_frames: int = Field(default=2, ge=1, description="frames without light")
+    simulation: SimulatedCameraSpec = SimulatedCameraSpec()
+
+
+class JobSpec(Record):
+    """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
+
+    kind: Literal["tooth"] = Field(default="tooth", description="what is fitted")
+    capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
+    rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
+    boundary: Boundary = Field(default="thin", description="model of the enamel surface")
+    ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
+    dentin: Literal["known", "fit", "none"] = Field(default="fit", description="dentin surface: given by the capture, fitted as blend shape, or absent")
+    lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
+    held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
+    channels: tuple[str, ...] | None = Field(default=None, description="channels to fit; default: all")
+    seed: int = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
+    pixel_step: int = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
+    samples_per_pixel: int = Field(default=64, ge=16, le=65536, description="paths per pixel and pass at the start; raised as the fit needs")
+    max_samples_per_pixel: int = Field(default=1024, ge=16, le=65536, description="most paths per pixel and pass")
+    max_steps: int = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
+    search_candidates: int = Field(default=50_000, ge=100, description="table-search points per channel")
+    sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
+    sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
+    workers: int = Field(default=2, ge=1, le=1024, description="processes of a local run")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> JobSpec:
+        if (self.capture is None) == (self.rig is None):
+            raise ValueError("give exactly one of 'capture' (a folder) and '[rig]'")
+        if self.max_samples_per_pixel < self.samples_per_pixel:
+            raise ValueError("max_samples_per_pixel must be at least samples_per_pixel")
+        return self
+
+
+class FrameRecord(Record):
+    """One acknowledged frame of a capture: it is on disk when this row is."""
+
+    index: int
+    kind: Literal["black", "tracking", "light"]
+    light: str | None
+    exposure_s: Positive
+    level: Unit
+    time_s: float = Field(description="since the capture began")
+    readback: tuple[int, int, int] = Field(description="R, G, B register levels read back from the controller; all-on frames give the first light's")
+
+
+class CaptureManifest(Record):
+    """Published by the capture stage: ``capture.zarr`` plus the rig's calibration and meshes."""
+
+    description: FolderCapture = Field(description="cameras, lights, channels; images empty")
+    frames: tuple[FrameRecord, ...]
+    bits: int
+    black_level: int
+    radiance_per_count: float = Field(description="scene radiance of one count above black at level 1 and 1 s exposure")
+    sensor_noise_relative: float
+    sensor_noise_floor: float
+    fdi: tuple[int, ...]
+
+
+class PreparedManifest(Record):
+    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid; and ``teeth/``."""
+
+    channels: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
+    fdi: tuple[int, ...]
+    dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
+    median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
+    valid_fraction: float
+
+
+class Estimate(Record):
+    """A number with its unit and uncertainty. Undetermined numbers are flagged, never bare."""
+
+    value: float
+    se: float | None = Field(description="one standard error; null where the parameter was not fitted")
+    unit: str = Field(description="'1' for dimensionless")
+    determined: bool = Field(description="whether the data fixes this number")
+
+
+class FitReport(Record):
+    """Published by the fit stage, and as parameters.json and errors.json by export."""
+
+    converged: bool
+    advice: str = Field(description="what to do when it did not converge; empty otherwise")
+    parameters: dict[str, dict[str, Estimate]] = Field(description="per channel: name -> estimate, derived quantities included")
+    fit_error: dict[str, float] = Field(description="per channel: relative image error on fitted images")
+    held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
+    steps: int
+    shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
+    seconds: float
+
+
+class AssetManifest(Record):
+    """Published by the export stage."""
+
+    files: tuple[str, ...]
+    held_out_error: float = Field(description="mean over channels")
+    centre_mm: Vector3 = (0.0, 0.0, 0.0)

@@ -1,0 +1,90 @@
+"""One typed tree of settings. ``services.__main__`` alone reads environment (prefix ``DENTINE__``) and files into it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from services.core.errors import SettingsError
+from services.core.geometry import Record
+from services.core.records import JobSpec
+
+
+class ServerSettings(Record):
+    """The API server."""
+
+    host: str = Field(default="127.0.0.1", description="address to listen on")
+    port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
+    data: Path = Field(default=Path("dentine-data"), description="folder of the database and the jobs")
+
+
+class Settings(Record):
+    """Everything a deployment may set."""
+
+    server: ServerSettings = ServerSettings()
+    workers: int = Field(default=2, ge=1, description="worker processes, one thread each")
+    worker_threads: int = Field(default=1, ge=1, description="Dr.Jit threads per worker process")
+    variant: str = Field(default="llvm", pattern="^(llvm|cuda)$", description="Dr.Jit back end")
+
+
+def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> Settings:
+    """Build settings from variables such as ``DENTINE__SERVER__PORT``.
+
+    Raises:
+        SettingsError: unknown key or wrong type; the message names the variable.
+    """
+    tree: dict[str, Any] = {}
+    for variable, value in environment.items():
+        if variable.startswith(prefix):
+            *path, leaf = variable.removeprefix(prefix).lower().split("__")
+            node = tree
+            for part in path:
+                node = node.setdefault(part, {})
+            node[leaf] = value
+    try:
+        return Settings.model_validate(tree)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        name = prefix + "__".join(str(part).upper() for part in first["loc"])
+        raise SettingsError(f"Setting {name}: {first['msg']}; correct or remove the variable.") from problem
+
+
+def read_job(path: Path) -> JobSpec:
+    """Read JOB.toml. Relative paths in it are relative to the file.
+
+    Raises:
+        SettingsError: not TOML, unknown option, wrong value; the message names the option.
+    """
+    if not path.is_file():
+        raise SettingsError(f"Job file {path} does not exist; check the path.")
+    try:
+        tree = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+        raise SettingsError(f"Job file {path} is not valid TOML: {problem}; correct that line.") from problem
+    return job_from_tree(tree, path.parent, str(path))
+
+
+def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
+    """Validate a job's options; relative paths are resolved against ``base``.
+
+    Raises:
+        SettingsError: names the option and what is wrong with it.
+    """
+    try:
+        spec = JobSpec.model_validate(dict(tree))
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        option = ".".join(str(part) for part in first["loc"]) or "options"
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(sorted(JobSpec.model_fields))
+            raise SettingsError(f"{origin}: unknown option '{option}'; known options are {known}.") from problem
+        raise SettingsError(f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it.") from problem
+    if spec.capture is not None:
+        spec = spec.model_copy(update={"capture": (base / spec.capture).resolve()})
+    if spec.rig is not None:
+        spec = spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": (base / spec.rig.mouth).resolve()})})
+    return spec

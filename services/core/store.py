@@ -1,0 +1,185 @@
+"""The only code that knows how a job lies on disk.
+
+::
+
+    JOB/
+      capture/     published by the capture stage
+      prepared/    published by the prepare stage
+      fit/         published by the fit stage
+      asset/       published by the export stage
+      <stage>.lease          highest attempt that has started the stage
+      .<stage>.<attempt>/    being written; never read by others
+
+A stage is written into its own hidden folder and published by one rename, with ``manifest.json`` inside that lists every
+file's size and SHA-256 and the stage's record. A reader sees all of a stage or none of it, and a missing shard, which zarr
+would read as zeros, is an error here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import zarr
+from pydantic import ValidationError
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from services.core.errors import CaptureInputError, CorruptStoreError, FencedError, MissingStageError
+from services.core.geometry import Record
+
+R = TypeVar("R", bound=Record)
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees the old or the new content, also after a power cut."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with partial.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    partial.replace(path)
+    _fsync_folder(path.parent)
+
+
+def write_record(path: Path, record: Record) -> None:
+    """Write a record as readable JSON, atomically."""
+    write_atomic(path, (record.model_dump_json(indent=1) + "\n").encode())
+
+
+def read_record(path: Path, kind: type[R]) -> R:
+    """Read a record that a person or a program wrote.
+
+    Raises:
+        CaptureInputError: absent, not JSON, or not of this kind; the message names the first wrong field.
+    """
+    if not path.is_file():
+        raise CaptureInputError(f"{path} does not exist; check the path.")
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise CaptureInputError(f"{path}: {place}: {first['msg']}; correct it.") from problem
+
+
+class StageWriter:
+    """One attempt's right to write one stage."""
+
+    def __init__(self, root: Path, stage: str, attempt: int) -> None:
+        """Take the lease.
+
+        Raises:
+            FencedError: a newer attempt has started this stage.
+        """
+        self.root, self.stage, self.attempt = Path(root), stage, attempt
+        self.root.mkdir(parents=True, exist_ok=True)
+        self.require_lease(starting=True)
+        write_atomic(self._lease, str(attempt).encode())
+        self.folder = self.root / f".{stage}.{attempt}"
+        self.folder.mkdir(exist_ok=True)
+
+    @property
+    def _lease(self) -> Path:
+        return self.root / f"{self.stage}.lease"
+
+    def require_lease(self, *, starting: bool = False) -> None:
+        """Raise FencedError if a newer attempt has started the stage. Call before every durable write."""
+        newest = int(self._lease.read_text()) if self._lease.exists() else 0
+        if newest > self.attempt or (not starting and newest != self.attempt):
+            raise FencedError(f"Attempt {self.attempt} of stage {self.stage} was overtaken by attempt {newest}; its writes are refused.")
+
+    def publish(self, record: Record) -> Path:
+        """Make everything in ``folder`` visible at once as ``root/stage``; returns that path."""
+        files = {}
+        for path in sorted(p for p in self.folder.rglob("*") if p.is_file() and not p.name.endswith(".partial") and p.name != MANIFEST):
+            files[path.relative_to(self.folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": _sha256(path)}
+        manifest = {"format": FORMAT_VERSION, "stage": self.stage, "attempt": self.attempt, "files": files, "record": json.loads(record.model_dump_json())}
+        write_atomic(self.folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+        self.require_lease()
+        final, retired = self.root / self.stage, self.root / f".{self.stage}.retired"
+        if final.exists():
+            shutil.rmtree(retired, ignore_errors=True)
+            final.rename(retired)
+        self.folder.rename(final)
+        _fsync_folder(self.root)
+        shutil.rmtree(retired, ignore_errors=True)
+        return final
+
+
+def is_published(root: Path, stage: str) -> bool:
+    """Whether the stage has a complete result."""
+    return (Path(root) / stage / MANIFEST).is_file()
+
+
+def open_stage(root: Path, stage: str, kind: type[R], *, verify: bool = True) -> tuple[Path, R]:
+    """Open a published stage: its folder and its record.
+
+    Args:
+        verify: compare every file's size and SHA-256 with the manifest.
+
+    Raises:
+        MissingStageError: nothing published. CorruptStoreError: names the first file that is not as published.
+    """
+    folder = Path(root) / stage
+    if not is_published(root, stage):
+        raise MissingStageError(f"Stage {stage} has no published result in {root}; run the job from that stage.")
+    manifest = json.loads((folder / MANIFEST).read_text())
+    if verify:
+        for name, expected in manifest["files"].items():
+            path = folder / name
+            if not path.is_file():
+                raise CorruptStoreError(f"{path} is missing from published stage {stage}; restore it or run the stage again.")
+            if path.stat().st_size != expected["bytes"]:
+                raise CorruptStoreError(
+                    f"{path} has {path.stat().st_size} bytes instead of {expected['bytes']} (truncated?); restore it or run stage {stage} again."
+                )
+            if _sha256(path) != expected["sha256"]:
+                raise CorruptStoreError(f"{path} differs from its published checksum; restore it or run stage {stage} again.")
+    return folder, kind.model_validate(manifest["record"])
+
+
+def create_array(
+    folder: Path, name: str, shape: tuple[int, ...], shard: tuple[int, ...], dtype: str, dimensions: tuple[str, ...], chunk: tuple[int, ...] | None = None
+) -> zarr.Array[Any]:
+    """Create a zarr v3 array. One writer per shard; ``shard`` is also the chunk unless ``chunk`` divides it."""
+    return zarr.create_array(
+        folder / name,
+        shape=shape,
+        chunks=chunk or shard,
+        shards=shard if chunk else None,
+        dtype=dtype,
+        fill_value=0,
+        compressors=[BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle"), Crc32cCodec()],
+        dimension_names=dimensions,
+    )
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[zarr.Array[Any]]:
+    """Open an array for reading; a damaged chunk becomes a CorruptStoreError that names the array."""
+    try:
+        array = zarr.open_array(path, mode="r")
+        yield array
+    except (FileNotFoundError, ValueError, RuntimeError) as problem:
+        raise CorruptStoreError(f"{path} cannot be read ({problem}); restore it or run its stage again.") from problem
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _fsync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,1 @@
+"""Light transport, its derivatives, the inverse problem, and the exported asset."""

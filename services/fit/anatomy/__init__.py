@@ -1,0 +1,1 @@
+"""The shape of teeth: procedural incisor, dentin blend modes."""

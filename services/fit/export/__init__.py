@@ -1,0 +1,1 @@
+"""The asset: Mitsuba scene, parameters, report."""

@@ -1,0 +1,1 @@
+"""Phase functions, Fresnel, medium parameters and their fitting domain."""

@@ -1,0 +1,1 @@
+"""Flat slabs: totals and their derivatives, by the same walk as the fit."""

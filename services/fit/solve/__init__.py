@@ -1,0 +1,1 @@
+"""Table search, Gauss-Newton, uncertainty."""

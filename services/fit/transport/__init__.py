@@ -1,0 +1,1 @@
+"""The nested-media walk: images under all lights at once, with derivatives."""

@@ -1,0 +1,69 @@
+"""What the engine needs to build a scene: plain arrays, so that it pickles; the scene itself never travels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Mesh
+from services.core.records import Boundary
+
+
+@dataclass(frozen=True)
+class DentinShape:
+    """The dentin surface as a blend shape V = B0 + sum_m c_m modes_m (teeth 2018 Eq. 5); no modes when it is known."""
+
+    base: Mesh
+    modes_mm: NDArray[np.float64]
+    """Displacements B_m - B0, (M, V, 3); M = 0 for a known surface."""
+
+    def vertices_mm(self, shape: tuple[float, ...]) -> NDArray[np.float64]:
+        """Vertices (V, 3) for blend weights c."""
+        return self.base.vertices_mm + np.tensordot(np.asarray(shape, dtype=np.float64), self.modes_mm, axes=1)
+
+
+@dataclass(frozen=True)
+class SceneRecipe:
+    """One tooth, its lights and its boundary model, for one colour channel."""
+
+    outer: Mesh
+    dentin: DentinShape | None
+    light_positions_mm: NDArray[np.float64]
+    """(L, 3)"""
+    light_intensities: NDArray[np.float64]
+    """(L,) radiant intensity of this channel, mm as length unit."""
+    boundary: Boundary = "matched"
+    ior: float = 1.631
+
+
+@dataclass(frozen=True)
+class View:
+    """The pixels of one camera that count."""
+
+    camera: Camera
+    pixels: NDArray[np.int32]
+    """(N, 2) integer x, y of the valid pixels."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass(frozen=True)
+class StackEstimate:
+    """Images of one view under all lights: mean and variance of the mean, both (L, N)."""
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JacobianEstimate:
+    """Images (L, N) and their derivatives (F, L, N) in the order of ``names``, from one seed; variances are of the means."""
+
+    names: tuple[str, ...]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    jacobian_variance: NDArray[np.float64]

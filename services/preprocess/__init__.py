@@ -1,0 +1,1 @@
+"""Radiometry, stabilisation, highlight and valid masks; writes the prepared store."""
