@@ -16,6 +16,7 @@
     │   ├── InterlockError    e-stop or interlock open
     │   ├── ExposureLimitError photobiological limit, refused before anything is sent
     │   └── ReadbackError     the controller does not hold what was written
+    ├── WorkerLostError       worker processes kept dying on a stage
     ├── NonFiniteError        a kernel produced NaN or Inf; count and place in the message
     └── JobCancelledError          cooperative cancel
 
@@ -120,6 +121,13 @@ class ReadbackError(RigError):
     """The controller does not hold what was written to it."""
 
     code = "rig-readback"
+
+
+class WorkerLostError(DentineError):
+    """Worker processes kept dying on the same stage."""
+
+    code = "worker-lost"
+    exit_status = 7
 
 
 class NonFiniteError(DentineError):

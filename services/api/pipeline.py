@@ -1,0 +1,223 @@
+"""Strings the stages together on Dask: records travel between tasks, pixels go through the store.
+
+::
+
+    capture {DOME: 1} -> prepare -> fit -> export        capture only where the job names a rig
+
+Each stage is one task. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task
+whose worker dies is run again by Dask on another worker; it then counts one attempt more than any before, which fences whatever
+the old one may still write. The fit spreads its passes over the same workers and secedes from its own slot meanwhile.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from services.api.events import EVENTS_FILE, EventAddress, EventLog, JobEvent
+from services.core.errors import InputError, JobCancelledError, WorkerLostError
+from services.core.records import AssetManifest, JobSpec
+from services.core.stage import LocalContext, StageEvent, StageName
+from services.core.store import is_published, open_stage, read_record, write_record
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Listener = Callable[[JobEvent], None]
+
+JOB_FILE = "job.json"
+CANCEL_FLAG = "cancel"
+POLL_S = 0.25
+GRACE_S = 5.0
+"""How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
+
+DOORS: Mapping[StageName, str] = MappingProxyType(
+    {
+        "capture": "services.capture.stage:run",
+        "prepare": "services.preprocess.stage:run",
+        "fit": "services.fit.stage:run",
+        "export": "services.fit.stage:export",
+    }
+)
+"""``module:function`` of each stage; imported by the worker, never here."""
+_PUBLISHED_AS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
+_WORKER_CONFIG = {
+    "distributed.worker.daemon": False,  # the fit keeps a child process per worker that owns the renderer
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],  # Ctrl-C is the parent's to handle
+}
+
+
+def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
+    """The stages a job goes through, in order."""
+    return (*(("capture",) if spec.rig is not None else ()), "prepare", "fit", "export")
+
+
+def run_job(
+    spec: JobSpec,
+    root: Path,
+    listener: Listener | None = None,
+    workers: int | None = None,
+    events: EventAddress | None = None,
+    doors: Mapping[StageName, str] = DOORS,
+) -> AssetManifest:
+    """Run a job to its asset on a local cluster; needs no server.
+
+    Args:
+        root: the job's folder; its published stages are kept and skipped.
+        listener: called in this thread with every new event.
+        workers: worker processes, default ``spec.workers``.
+        events: event table to append to, default one in ``root``.
+        doors: where each stage is entered.
+
+    Raises:
+        DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
+    """
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors)
+    return open_stage(root, "asset", AssetManifest, verify=False)[1]
+
+
+def run_stages(
+    spec: JobSpec,
+    root: Path,
+    stages: tuple[StageName, ...],
+    listener: Listener | None = None,
+    workers: int | None = None,
+    events: EventAddress | None = None,
+    doors: Mapping[StageName, str] = DOORS,
+    *,
+    again: bool = False,
+) -> None:
+    """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
+    root = root.resolve()
+    with _sole_owner(root):
+        _claim_folder(root, spec)
+        (root / CANCEL_FLAG).unlink(missing_ok=True)
+        address = events or EventAddress(root / EVENTS_FILE, "local")
+        todo = tuple(stage for stage in stages if again or not is_published(root, _PUBLISHED_AS[stage]))
+        with address.open() as log:
+            watch = _Watch(log, listener, log.newest_id())
+            if todo:
+                with _local_cluster(workers or spec.workers) as client:
+                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again) for stage in todo], watch)
+            watch.tell()
+
+
+def request_cancel(root: Path) -> None:
+    """Ask whoever runs the job in this folder to stop between two frames or steps."""
+    (root / CANCEL_FLAG).touch()
+
+
+@dataclass(frozen=True)
+class StageTask:
+    """What a worker needs to run one stage."""
+
+    stage: StageName
+    door: str
+    spec: JobSpec
+    root: Path
+    events: EventAddress
+    again: bool = False
+
+    def __call__(self, _previous: str | None = None) -> str:
+        """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
+        folder = _PUBLISHED_AS[self.stage]
+        if is_published(self.root, folder) and not self.again:
+            return self.stage
+        with self.events.open() as log:
+            lease = self.root / f"{folder}.lease"
+            attempt = log.begin_stage(self.stage, int(lease.read_text()) if lease.exists() else 0)
+            context = LocalContext(self.root, attempt, lambda event: log.append(attempt, event))
+            context.raise_if_cancelled()
+            module, function = self.door.split(":")
+            getattr(importlib.import_module(module), function)(self.spec, context)
+            context.report(StageEvent(stage=self.stage, kind="finished", done=1.0))
+        return self.stage
+
+
+class _Watch:
+    """Passes new rows of the event table to the listener and remembers which stage runs."""
+
+    def __init__(self, log: EventLog, listener: Listener | None, after: int) -> None:
+        self._log, self._listener, self._after = log, listener, after
+        self.stage: StageName | None = None
+
+    def tell(self) -> None:
+        while new := self._log.read(self._after):
+            for event in new:
+                self.stage = event.stage or self.stage
+                if self._listener is not None:
+                    self._listener(event)
+            self._after = new[-1].id
+
+
+def _await_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None:
+    """Submit the chain, follow its events, and raise what it raises."""
+    from distributed import KilledWorker, wait
+
+    last: Future | None = None
+    for task in tasks:
+        last = client.submit(task, last, key=f"{task.stage}-{task.events.job}", resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
+    flag, give_up_at = tasks[0].root / CANCEL_FLAG, None
+    while not last.done():  # type: ignore[union-attr]
+        with suppress(TimeoutError):
+            wait([last], timeout=POLL_S)
+        watch.tell()
+        if give_up_at is None and flag.exists():
+            give_up_at = time.monotonic() + GRACE_S
+        if give_up_at is not None and time.monotonic() > give_up_at and watch.stage != "capture":
+            raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
+    try:
+        last.result()  # type: ignore[union-attr]
+    except KilledWorker as problem:
+        raise WorkerLostError(
+            f"Every worker that took on stage {watch.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again."
+        ) from problem
+
+
+@contextmanager
+def _local_cluster(workers: int) -> Iterator[Client]:
+    """Spawned single-thread workers on loopback; every one may reach the dome, one stage at a time."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with (
+        dask.config.set(_WORKER_CONFIG),
+        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, resources={"DOME": 1}, silence_logs=50) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def _sole_owner(root: Path) -> Iterator[None]:
+    """Hold the folder's lock; the system drops it however this process ends."""
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / ".lock").open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"Folder {root} is in use by another running job; wait for it or choose another folder.") from None
+        yield
+
+
+def _claim_folder(root: Path, spec: JobSpec) -> None:
+    """Write the job's options, or refuse a folder that holds the results of other ones."""
+    path, indifferent = root / JOB_FILE, {"workers"}
+    if path.exists():
+        earlier = read_record(path, JobSpec)
+        theirs, ours = (_options(one) for one in (earlier, spec))
+        changed = sorted(name for name in ours if name not in indifferent and ours[name] != theirs[name])
+        if changed:
+            raise InputError(f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or remove it.")
+    write_record(path, spec)
+
+
+def _options(spec: JobSpec) -> dict[str, Any]:
+    return spec.model_dump(mode="json")

@@ -1,0 +1,88 @@
+"""``dentine simulate slab``: reads one slab or a stack of layers from options and prints its totals."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from services.core.errors import SettingsError
+
+
+class SlabBoundary(StrEnum):
+    """Optical boundary of a slab."""
+
+    MATCHED = "matched"
+    THIN = "thin"
+    SMOOTH = "smooth"
+
+
+class SlabSource(StrEnum):
+    """How a slab is lit."""
+
+    NORMAL = "normal"
+    DIFFUSE = "diffuse"
+
+
+def simulate_slab_command(
+    alpha: Annotated[float | None, typer.Option(min=0, max=1, help="Single-scattering albedo.")] = None,
+    sigma: Annotated[float | None, typer.Option(min=0, help="Extinction, per mm.")] = None,
+    g: Annotated[float, typer.Option(min=-1, max=1, help="Mean cosine of the Henyey-Greenstein phase function.")] = 0.0,
+    width: Annotated[float | None, typer.Option(min=0, help="Thickness, mm, or inf.")] = None,
+    layers: Annotated[str | None, typer.Option(help="Instead of one slab: JSON list of {sigma, alpha, beta, g1, g2, thickness_mm}, first layer lit.")] = None,
+    ior: Annotated[float, typer.Option(min=1, max=3, help="Index of refraction, used by boundaries thin and smooth.")] = 1.0,
+    boundary: Annotated[SlabBoundary, typer.Option(help="Optical boundary.")] = SlabBoundary.MATCHED,
+    source: Annotated[SlabSource, typer.Option(help="Light along the normal, or diffuse.")] = SlabSource.NORMAL,
+    rel_error: Annotated[float, typer.Option(min=1e-5, max=1, help="Relative standard error to reach.")] = 1e-3,
+    gradient: Annotated[bool, typer.Option("--gradient", help="Also the derivatives with their standard errors.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Reflectance and transmittance of a slab by the walk that the fit uses."""
+    from services.fit.slab.simulate import simulate_slab
+
+    stack = _read_layers(layers, {"alpha": alpha, "sigma": sigma, "width": width}, g)
+    result = simulate_slab(stack, ior=ior, boundary=boundary.value, source=source.value, rel_error=rel_error, gradient=gradient, seed=seed)
+    figures = result.as_json()
+    print(json.dumps(figures) if as_json else _table(figures))
+
+
+def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> tuple[Any, ...]:
+    """The layers from ``--layers``, or the one slab from its own options.
+
+    Raises:
+        SettingsError: both or neither given, not JSON, or a wrong value; the message names it.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    from services.fit.slab.simulate import Layer
+
+    given = [name for name, value in slab.items() if value is not None]
+    if text is None:
+        if missing := [f"--{name}" for name in slab if name not in given]:
+            raise SettingsError(f"A slab needs {' and '.join(missing)}; give them, or --layers.")
+        layers: Any = [{"sigma": slab["sigma"], "alpha": slab["alpha"], "g1": g, "thickness_mm": slab["width"]}]
+    elif given:
+        raise SettingsError(f"Option --layers describes the whole stack; leave out --{given[0]}.")
+    else:
+        try:
+            layers = json.loads(text)
+        except json.JSONDecodeError as problem:
+            raise SettingsError(
+                f'Option --layers is not JSON ({problem}); give a list such as \'[{{"sigma": 2, "alpha": 0.9, "thickness_mm": 1}}]\'.'
+            ) from problem
+    try:
+        return tuple(TypeAdapter(list[Layer]).validate_python(layers))
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        raise SettingsError(f"Option --layers, {'.'.join(str(part) for part in first['loc']) or 'value'}: {first['msg']}; correct it.") from problem
+
+
+def _table(figures: dict[str, Any]) -> str:
+    """One line per total, then per derivative, each with its standard error."""
+    lines = [f"{name:<4} {figures[name]:.6f} +- {figures[f'{name}_se']:.1e}" for name in ("R", "T")]
+    for name in ("dR", "dT"):
+        lines += [f"{name}/d{wrt:<8} {value:+.5e} +- {figures[f'{name}_se'][wrt]:.1e}" for wrt, value in (figures.get(name) or {}).items()]
+    return "\n".join(lines)

@@ -1,0 +1,66 @@
+"""Stages that publish tiny results, for tests of what surrounds stages; what they do is steered by files in the job's folder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+from services.core.errors import CaptureInputError, JobCancelledError
+from services.core.records import AssetManifest, JobSpec
+from services.core.stage import StageContext, StageEvent, StageName
+from services.core.store import StageWriter
+
+DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("capture", "prepare", "fit", "export")}
+
+
+def _publish(folder: str, context: StageContext) -> AssetManifest:
+    writer = StageWriter(context.root, folder, context.attempt)
+    (writer.folder / "by.txt").write_text(f"{context.attempt}\n")
+    record = AssetManifest(files=("by.txt",), held_out_error=0.04)
+    writer.publish(record)
+    return record
+
+
+def capture(_spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Lights a dome (a file) and darkens it on every exit; waits for ``hold-capture`` to go away."""
+    lit = context.root / "lit"
+    lit.touch()
+    try:
+        while (context.root / "hold-capture").exists():
+            context.raise_if_cancelled()
+            time.sleep(0.02)
+    except JobCancelledError:
+        time.sleep(0.2)
+        raise
+    finally:
+        lit.unlink()
+    return _publish("capture", context)
+
+
+def prepare(_spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Fails with a sentence while ``bad-input`` exists."""
+    if (context.root / "bad-input").exists():
+        raise CaptureInputError("Frame c0_l3.npy is missing from the capture; copy it there.")
+    return _publish("prepared", context)
+
+
+def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
+    for step in range(10):
+        context.report(StageEvent(stage="fit", kind="step", done=(step + 1) / 10, data={"step": step, "loss": 0.5**step, "held_out_error": 0.5**step}))
+        if step == 5 and ((context.root / "always-kill").exists() or ((context.root / "kill-fit").exists() and context.attempt == 1)):
+            os.kill(os.getpid(), signal.SIGKILL)
+        while (context.root / "deaf-fit").exists():
+            time.sleep(0.02)
+        while (context.root / "hold-fit").exists():
+            context.raise_if_cancelled()
+            time.sleep(0.02)
+        context.raise_if_cancelled()
+    return _publish("fit", context)
+
+
+def export(_spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Publishes an asset."""
+    (context.root / "report.html").write_text("<!doctype html><title>report</title>")
+    return _publish("asset", context)
