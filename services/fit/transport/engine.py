@@ -1,9 +1,24 @@
-"""The engine's door: one built scene, images and Jacobians on demand."""
+"""The engine's door: one built scene, images and Jacobians under all lights on demand."""
 
 from __future__ import annotations
 
-from services.fit.optics.parameters import Tissue
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import InputError, NonFiniteError
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+
+if TYPE_CHECKING:
+    from services.fit.transport.walk import Plan
+
+LANE_BUDGET = 24_000_000
+"""Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
+PART_NUMBER = {"enamel": 1, "dentin": 2}
 
 
 class Engine:
@@ -13,14 +28,132 @@ class Engine:
         """Build the scene. Selects the variant and thread count if none is set yet.
 
         Raises:
-            PlatformError: no usable libLLVM. MeshError: a surface cannot bound a medium.
+            PlatformError: no usable libLLVM. MeshError: a surface cannot bound a medium. InputError: no usable light.
         """
-        raise AttributeError
+        recipe.outer.require_solid("outer surface")
+        if recipe.dentin is not None:
+            recipe.dentin.base.require_solid("dentin surface")
+        if len(recipe.light_positions_mm) == 0:
+            raise InputError("The scene has no light; list at least one with a position and an intensity.")
+        if not np.isfinite(recipe.light_positions_mm).all() or not (np.isfinite(recipe.light_intensities) & (recipe.light_intensities > 0)).all():
+            raise InputError("Every light needs a finite position_mm and a positive intensity; correct the rig's calibration.")
+        if not math.isfinite(recipe.ior) or recipe.ior < 1:
+            raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
+        prepare_device(threads)
+        from services.fit.transport.geometry import MeshGeometry
+        from services.fit.transport.lights import PointLights
+
+        self.recipe = recipe
+        self._geometry = MeshGeometry(recipe)
+        self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities)
+        self._radius_mm = float(np.linalg.norm(recipe.outer.vertices_mm, axis=1).max())
+        self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
-        """Images under all lights. ``samples`` paths per pixel in ``batches`` independent batches; seeded by (seed, pixel, sample) alone."""
-        raise AttributeError
+        """Radiance of ``view``'s pixels under each light.
+
+        Args:
+            samples: paths per pixel, rounded up to a multiple of ``batches``.
+            seed: with pixel and sample number it fixes every random number.
+            batches: independent batches whose spread gives the variance.
+
+        Raises:
+            InputError: a parameter is outside its physical range, or the view lists no pixel. NonFiniteError: a result is NaN or infinite.
+        """
+        from services.fit.transport.walk import Plan
+
+        sums, _ = self._trace(tissue, view, Plan(), samples, seed, batches)
+        return StackEstimate(*_mean_and_variance(sums))
 
     def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
-        """Images and derivatives to the natural parameters ``names`` (see Tissue), both boundary terms included for ``shape.k``."""
-        raise AttributeError
+        """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
+
+        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms.
+
+        Raises:
+            As ``images``; InputError also for a name the scene does not have.
+        """
+        from services.fit.transport.media import Score
+        from services.fit.transport.walk import Plan
+
+        modes = self._geometry.modes
+        known = {f"{part}.{field}" for part in self._parts() for field in ("sigma", "alpha", "beta", "g1", "g2")} | {f"shape.{k}" for k in range(modes)}
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise InputError(f"Parameter {unknown[0]} does not exist in this scene; it has {', '.join(sorted(known))}.")
+        medium_names = [name for name in names if not name.startswith("shape.")]
+        scores = tuple(Score(PART_NUMBER[name.split(".")[0]], name.split(".")[1]) for name in medium_names)
+        plan = Plan(scores=scores, shape=any(name.startswith("shape.") for name in names))
+        sums, derivatives = self._trace(tissue, view, plan, samples, seed, batches)
+        mean, variance = _mean_and_variance(sums)
+        place = {name: k for k, name in enumerate(medium_names + [f"shape.{k}" for k in range(modes)])}
+        pairs = [_mean_and_variance(derivatives[place[name]]) for name in names]
+        empty = np.zeros((0, *mean.shape))
+        return JacobianEstimate(names, mean, variance, np.stack([p[0] for p in pairs]) if pairs else empty, np.stack([p[1] for p in pairs]) if pairs else empty)
+
+    def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> NDArray[np.float64]:
+        """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
+
+        An image is a polynomial in a common albedo with these as coefficients; paths end at the last edge.
+        """
+        from dataclasses import replace
+
+        from services.fit.transport.walk import Plan
+
+        white = Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
+        sums, _ = self._trace(white, view, Plan(order_edges=tuple(int(edge) for edge in bin_edges)), samples, seed, batches)
+        bins = len(bin_edges) - 1
+        _, count, slots = sums.shape
+        return np.moveaxis(sums.mean(axis=0).reshape(count, slots // bins, bins), (0, 1, 2), (2, 1, 0))
+
+    def _parts(self) -> tuple[str, ...]:
+        return ("enamel",) if self.recipe.dentin is None else ("enamel", "dentin")
+
+    def _trace(self, tissue: Tissue, view: View, plan: Plan, samples: int, seed: int, batches: int) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Means per batch, (batches, N, slots), of contributions and of each derivative."""
+        from services.fit.transport.media import Media, require_medium
+        from services.fit.transport.starts import CameraStart
+        from services.fit.transport.walk import Walk
+
+        if len(view) == 0:
+            raise InputError(f"Camera {view.camera.name} lists no pixel; its valid mask is empty.")
+        media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
+        for part, medium in zip(self._parts(), media, strict=True):
+            require_medium(part, medium)
+        if len(tissue.shape) != self._geometry.modes or not all(math.isfinite(c) for c in tissue.shape):
+            raise InputError(f"shape = {tissue.shape} must be {self._geometry.modes} finite blend weights, one per dentin mode.")
+        self._geometry.reshape(tissue.shape)
+
+        kernel_media = Media(media)
+        per_batch = -(-samples // batches)
+        slots = len(self.recipe.light_positions_mm) * max(len(plan.order_edges) - 1, 1)
+        tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)
+        slice_size = max(1, LANE_BUDGET // (batches * slots * tables))
+        pieces = []
+        for first in range(0, len(view), slice_size):
+            part = View(view.camera, view.pixels[first : first + slice_size])
+            start = CameraStart(part, batches, seed, self._radius_mm)
+            tally = Walk(self._geometry, kernel_media, self._lights, start, plan, self._ior).run(per_batch)
+            sums, derivatives = tally.arrays()
+            pieces.append([array.reshape(batches, len(part), slots) / per_batch for array in (sums, *derivatives)])
+        whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
+        _require_finite(whole, view)
+        return whole[0], whole[1:]
+
+
+def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean (L, N) over batches and the variance of that mean."""
+    count = len(batches)
+    variance = batches.var(axis=0, ddof=1) / count if count > 1 else np.full(batches.shape[1:], np.nan)
+    return batches.mean(axis=0).T, variance.T
+
+
+def _require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
+    bad = np.zeros(len(view), dtype=bool)
+    for array in arrays:
+        bad |= ~np.isfinite(array).all(axis=(0, 2))
+    if bad.any():
+        where = ", ".join(f"({x}, {y})" for x, y in view.pixels[bad][:3])
+        raise NonFiniteError(
+            f"{int(bad.sum())} of {len(view)} pixels of camera {view.camera.name} came out non-finite, first at {where}; report the parameters."
+        )

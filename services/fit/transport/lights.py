@@ -1,0 +1,143 @@
+"""Connections from scattering vertices to the lights: which light, through what, with which derivative."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.optics import fresnel
+from services.fit.transport.border import inverse_cosine
+from services.fit.transport.geometry import Geometry
+from services.fit.transport.media import Media, PhaseFunction
+
+CANDIDATES = 8
+"""Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
+ROULETTE_GAIN = 3.0
+ROULETTE_FLOOR = 0.02
+"""A shadow ray is cast with probability clip(gain x expected contribution, floor, 1)."""
+DARK_DEPTH = 40.0
+"""Optical depth past which a shadow ray stops: exp(-40) is below float32 resolution of any sum it could join."""
+
+
+class PointLights:
+    """All lights of a rig for one channel."""
+
+    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64]) -> None:
+        self.count = len(positions_mm)
+        self.positions = mi.Float(np.ascontiguousarray(positions_mm.reshape(-1), dtype=np.float32))
+        self.intensities = mi.Float(np.ascontiguousarray(intensities, dtype=np.float32))
+        dr.eval(self.positions, self.intensities)
+        self.inverse_irradiance = dr.opaque(mi.Float, float(1 / np.mean(intensities / np.sum(positions_mm**2, axis=1))))
+        edges = np.linspace(0, self.count, min(self.count, CANDIDATES) + 1).astype(int)
+        self.strata = tuple(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+    def choose(self, point: mi.Point3f, importance: LightImportance, rng: mi.PCG32, active: mi.Bool) -> ChosenLight:
+        """Pick one light out of stratified candidates in proportion to phase x intensity / distance^2 (resampled importance sampling)."""
+        total, chosen = mi.Float(0), ChosenLight(mi.UInt32(0), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
+        for first, last in self.strata:
+            size = last - first
+            index = mi.UInt32(first)
+            if size > 1:
+                index = first + dr.minimum(mi.UInt32(rng.next_float32() * size), size - 1)
+            towards = dr.gather(mi.Point3f, self.positions, index, active) - point
+            inverse = dr.rcp(dr.squared_norm(towards))
+            direction = towards * dr.sqrt(inverse)
+            strength = importance(direction) * dr.gather(mi.Float, self.intensities, index, active) * inverse
+            total += size * strength
+            take = rng.next_float32() * total < size * strength if len(self.strata) > 1 else mi.Bool(True)
+            chosen.index = dr.select(take, index, chosen.index)
+            chosen.direction = dr.select(take, direction, chosen.direction)
+            chosen.strength = dr.select(take, strength, chosen.strength)
+        chosen.total = total
+        return chosen
+
+
+class LightImportance:
+    """Phase function value towards a light, the light-dependent factor of a connection."""
+
+    def __init__(self, phase: PhaseFunction, omega: mi.Vector3f) -> None:
+        self.phase, self.omega = phase, omega
+
+    def __call__(self, direction: mi.Vector3f) -> mi.Float:
+        """Value for the propagation direction towards the light."""
+        return self.phase.density(self.omega, direction)
+
+
+@dataclass
+class ChosenLight:
+    """A light, the direction to it, its strength, and the total strength of all candidates."""
+
+    index: mi.UInt32
+    direction: mi.Vector3f
+    strength: mi.Float
+    total: mi.Float
+
+
+@dataclass
+class ShadowRay:
+    """A straight line on its way to a light."""
+
+    point: mi.Point3f
+    place: mi.UInt32
+    depth: mi.Float
+    """Optical depth so far."""
+    surface: mi.Float
+    """Transmittance of the faces crossed."""
+    lengths: list[mi.Float]
+    """Path length in mm inside each medium asked for."""
+    border: list[mi.Float]
+    """d ln T / dc per shape mode: (sigma_B - sigma_A) dt/dc per crossing (teeth 2018 Eq. 30-32)."""
+    alive: mi.Bool
+
+    def transmittance(self) -> mi.Float:
+        """T, zero where the line is too deep to matter."""
+        return dr.select(self.depth < DARK_DEPTH, self.surface * dr.exp(-self.depth), 0)
+
+
+def shadow(
+    geometry: Geometry,
+    media: Media,
+    point: mi.Point3f,
+    direction: mi.Vector3f,
+    place: mi.UInt32,
+    active: mi.Bool,
+    *,
+    measured: tuple[int, ...] = (),
+    shape: bool = False,
+    thin_ior: mi.Float | None = None,
+) -> ShadowRay:
+    """Follow straight lines to distant lights through all media.
+
+    Args:
+        measured: media whose path lengths are wanted.
+        shape: whether derivatives to the border's shape are wanted.
+        thin_ior: index of refraction of ``thin`` outer faces; None where they are index-matched.
+    """
+
+    def step(ray: ShadowRay, direction: mi.Vector3f) -> tuple[ShadowRay, mi.Vector3f]:
+        medium = geometry.medium(ray.place)
+        sigma = media.extinction(medium)
+        hit = geometry.intersect(ray.point, direction, ray.place, ray.alive)
+        length = dr.select(hit.valid, hit.distance, 0)
+        ray.depth = dr.fma(sigma, length, ray.depth)
+        ray.lengths = [total + dr.select(medium == k, length, 0) for k, total in zip(measured, ray.lengths, strict=True)]
+        behind = geometry.beyond(ray.place, direction, hit)
+        cosine = dr.dot(direction, hit.normal)
+        if shape:
+            jump = (media.extinction(geometry.medium(behind)) - sigma) * inverse_cosine(cosine)
+            ray.border = [dr.fma(speed, jump, total) for total, speed in zip(ray.border, geometry.velocity(hit, ray.alive), strict=True)]
+        if thin_ior is not None:
+            ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), thin_ior), 1)
+        ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)
+        ray.place = dr.select(hit.valid, behind, ray.place)
+        ray.alive &= hit.valid & (ray.depth < DARK_DEPTH)
+        return ray, direction
+
+    modes = geometry.modes if shape else 0
+    ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)], mi.Bool(active))
+    ray, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
+    return ray

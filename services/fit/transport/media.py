@@ -1,0 +1,113 @@
+"""Media as kernel inputs: opaque numbers, so that new values reuse the compiled kernel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from services.core.errors import InputError
+from services.fit.optics import phase
+from services.fit.optics.parameters import Medium
+
+
+def require_medium(name: str, medium: Medium) -> None:
+    """Refuse parameters outside their physical range, before any kernel.
+
+    Raises:
+        InputError: names parameter and value.
+    """
+    for field, low, high, rule in (
+        ("sigma", 0.0, math.inf, "must be positive, per mm"),
+        ("alpha", 0.0, 1.0, "must lie in 0 to 1"),
+        ("beta", 0.0, 1.0, "must lie in 0 to 1"),
+        ("g1", -1.0, 1.0, "must lie between -1 and 1, ends excluded"),
+        ("g2", -1.0, 1.0, "must lie between -1 and 1, ends excluded"),
+    ):
+        value = getattr(medium, field)
+        closed = field in {"alpha", "beta"}
+        inside = low <= value <= high if closed else low < value < high
+        if not math.isfinite(value) or not inside:
+            raise InputError(f"{name}.{field} = {value:g} {rule}; correct it.")
+
+
+@dataclass(frozen=True)
+class Score:
+    """One accumulated derivative: ``field`` of the medium numbered ``medium``."""
+
+    medium: int
+    field: str
+
+
+class Media:
+    """Parameters of media 1..M; index 0 is empty space."""
+
+    def __init__(self, media: Sequence[Medium]) -> None:
+        self.count = len(media)
+        self.two_lobes = any(m.beta < 1 for m in media)
+
+        def opaque(values: list[float]) -> list[mi.Float]:
+            return [dr.opaque(mi.Float, value) for value in values]
+
+        self.sigma = opaque([m.sigma for m in media])
+        self.sigma_s = opaque([m.sigma * m.alpha for m in media])
+        self.log_alpha = opaque([math.log(max(m.alpha, 1e-30)) for m in media])
+        self.inverse_alpha = opaque([1 / max(m.alpha, 1e-30) for m in media])
+        self.beta = opaque([m.beta for m in media])
+        self.g1 = opaque([m.g1 for m in media])
+        self.g2 = opaque([m.g2 for m in media])
+
+    def pick(self, values: list[mi.Float], index: mi.UInt32) -> mi.Float:
+        """Value of the medium an index names; the last one where it names empty space."""
+        result = values[-1]
+        for k in range(self.count - 2, -1, -1):
+            result = dr.select(index == k + 1, values[k], result)
+        return result
+
+    def extinction(self, index: mi.UInt32) -> mi.Float:
+        """Sigma of the medium, 0 in empty space."""
+        return dr.select(index == 0, 0, self.pick(self.sigma, index))
+
+
+class PhaseFunction:
+    """The phase function of each lane's medium: one or two lobes, as the scene needs."""
+
+    def __init__(self, media: Media, index: mi.UInt32) -> None:
+        self.two_lobes = media.two_lobes
+        self.g1 = media.pick(media.g1, index)
+        if self.two_lobes:
+            self.g2 = media.pick(media.g2, index)
+            self.beta = media.pick(media.beta, index)
+
+    def density(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
+        """Value, 1/sr."""
+        f1 = phase.density(self.g1, phase.deviation(self.g1, omega, omega_out))
+        if not self.two_lobes:
+            return f1
+        f2 = phase.density(self.g2, phase.deviation(self.g2, omega, omega_out))
+        return dr.lerp(f2, f1, self.beta)
+
+    def sample(self, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Float, v: mi.Float) -> mi.Vector3f:
+        """Direction distributed as the phase function."""
+        g = self.g1 if u_lobe is None else dr.select(u_lobe < self.beta, self.g1, self.g2)
+        return phase.turn(omega, g, phase.sample_deviation(g, u), v)
+
+    def scores(self, fields: frozenset[str], omega: mi.Vector3f, omega_out: mi.Vector3f) -> dict[str, mi.Float]:
+        """d ln(density) / d(field) for the lobe fields asked for (teeth 2018 Eq. 12, 13)."""
+        m1 = phase.deviation(self.g1, omega, omega_out)
+        if not self.two_lobes:
+            return {"g1": phase.score_g(self.g1, m1)} if "g1" in fields else {}
+        m2 = phase.deviation(self.g2, omega, omega_out)
+        f1, f2 = phase.density(self.g1, m1), phase.density(self.g2, m2)
+        inverse = dr.rcp(dr.lerp(f2, f1, self.beta))
+        terms = {}
+        if "beta" in fields:
+            terms["beta"] = (f1 - f2) * inverse
+        if "g1" in fields:
+            terms["g1"] = self.beta * f1 * inverse * phase.score_g(self.g1, m1)
+        if "g2" in fields:
+            terms["g2"] = (1 - self.beta) * f2 * inverse * phase.score_g(self.g2, m2)
+        return terms

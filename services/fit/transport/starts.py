@@ -1,0 +1,94 @@
+"""Where walks begin, and with which random numbers.
+
+Streams depend on (seed, pixel, sample) alone, never on block, batch or worker, so a result does not depend on how the work
+was cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from services.fit.optics import fresnel
+from services.fit.transport.recipe import View
+
+NEAR_MARGIN_MM = 1.0
+
+
+def stream(seed: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.PCG32:
+    """Counter-based generator: two rounds of the tiny encryption algorithm place a PCG32 stream."""
+    a, b = mi.sample_tea_32(seed, pixel)
+    c, d = mi.sample_tea_32(a ^ sample, b)
+    rng = mi.PCG32()
+    rng.state = (mi.UInt64(c) << 32) | mi.UInt64(d)
+    rng.inc = (mi.UInt64(b) << 33) | (mi.UInt64(a) << 1) | 1
+    return rng
+
+
+@dataclass
+class PathStart:
+    """State of a fresh path."""
+
+    rng: mi.PCG32
+    origin: mi.Point3f
+    omega: mi.Vector3f
+    place: mi.UInt32
+    weight: mi.Float
+
+
+class CameraStart:
+    """Walks from a view's pixels, box filter."""
+
+    def __init__(self, view: View, batches: int, seed: int, radius_mm: float) -> None:
+        camera = view.camera
+        width, _ = camera.size
+        x, y = view.pixels[:, 0].astype(np.uint32), view.pixels[:, 1].astype(np.uint32)
+        self.lanes = batches * len(view)
+        self._pixels = np.tile(y * width + x, batches)
+        self._batch = np.repeat(np.arange(batches, dtype=np.uint32), len(view))
+        self.pixel = mi.UInt32(self._pixels.astype(np.uint32))
+        self.batch = mi.UInt32(self._batch)
+        self.width = width
+        self.seed = dr.opaque(mi.UInt32, seed)
+        self.batches = batches
+        pose = np.asarray(camera.camera_from_world)
+        eye = -pose[:3, :3].T @ pose[:3, 3]
+        inverse = pose[:3, :3].T @ np.linalg.inv(np.asarray(camera.K))
+        self._eye = dr.opaque(mi.Point3f, eye.tolist())
+        self._columns = [dr.opaque(mi.Vector3f, inverse[:, k].tolist()) for k in range(3)]
+        self._near = dr.opaque(mi.Float, max(float(np.linalg.norm(eye)) - radius_mm - NEAR_MARGIN_MM, 0.0))
+        dr.eval(self.pixel, self.batch)
+
+    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
+        """A path through a random point of the lane's pixel; ``sample`` counts within the batch."""
+        pixel = dr.gather(mi.UInt32, self.pixel, lane, active)
+        batch = dr.gather(mi.UInt32, self.batch, lane, active)
+        rng = stream(self.seed, pixel, sample * self.batches + batch)
+        x = (pixel % self.width) + rng.next_float32()
+        y = (pixel // self.width) + rng.next_float32()
+        omega = dr.normalize(self._columns[0] * x + self._columns[1] * y + self._columns[2])
+        return PathStart(rng, dr.fma(omega, self._near, self._eye), omega, mi.UInt32(0), mi.Float(1))
+
+
+class SlabStart:
+    """Walks that enter a slab's lit face at z = 0: collimated and normal, or Lambertian."""
+
+    def __init__(self, lanes: int, seed: int, *, diffuse: bool, ior: float, bend: bool) -> None:
+        self.lanes, self.diffuse, self.bend = lanes, diffuse, bend
+        self.seed = dr.opaque(mi.UInt32, seed)
+        self.ior = dr.opaque(mi.Float, ior)
+        self.refractive = ior != 1
+
+    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
+        """A path just inside the lit face, weighted by the share that enters."""
+        rng = stream(self.seed, lane, sample)
+        cosine = mi.Float(1)
+        if self.diffuse:
+            cosine = dr.sqrt(1 - rng.next_float32())
+        weight = 1 - fresnel.reflectance(cosine, self.ior) if self.refractive else mi.Float(1)
+        inside = dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)) if self.bend else cosine
+        omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)
+        return PathStart(rng, mi.Point3f(0), omega, mi.UInt32(1), weight)

@@ -1,0 +1,389 @@
+"""The nested-media walk: free flights, crossings, scattering, connections to all lights, and the scores that make derivatives.
+
+One loop serves everything the project computes: camera walks in a tooth that connect to point lights, and walks in a flat
+slab that count what leaves either face. What a scene lacks is absent from its kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from services.fit.optics import fresnel
+from services.fit.transport.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
+from services.fit.transport.geometry import Geometry, Hit
+from services.fit.transport.lights import ROULETTE_FLOOR, ROULETTE_GAIN, ChosenLight, LightImportance, PointLights, shadow
+from services.fit.transport.media import Media, PhaseFunction, Score
+from services.fit.transport.starts import CameraStart, SlabStart
+from services.fit.transport.tally import Tally
+
+ROULETTE_WEIGHT = 0.1
+"""Paths below this fraction of their first weight survive in proportion to it."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What this kernel has to do; everything here is decided before compilation."""
+
+    scores: tuple[Score, ...] = ()
+    shape: bool = False
+    """Whether derivatives to the border's shape modes are wanted; they follow those of ``scores`` in the tally."""
+    faces: bool = False
+    """Count what leaves the slab's faces instead of connecting to lights."""
+    bend: bool = False
+    """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
+    order_edges: tuple[int, ...] = ()
+    """Split images by scattering order at these edges."""
+
+
+def one_minus_exp(x: mi.Float) -> mi.Float:
+    """1 - exp(-x), without cancellation for small x."""
+    return dr.select(x < 0.05, x * (1 - x / 2 * (1 - x / 3 * (1 - x / 4))), 1 - dr.exp(-x))
+
+
+def minus_log1m(p: mi.Float) -> mi.Float:
+    """-log(1 - p), without cancellation for small p."""
+    return dr.select(p < 0.02, p * (1 + p * (1 / 2 + p * (1 / 3 + p / 4))), -dr.log(1 - p))
+
+
+class Scores:
+    """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
+
+    def __init__(self, plan: Plan, media: Media) -> None:
+        self.plan, self.media = plan, media
+        self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
+        self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
+
+    def zero(self) -> list[mi.Float]:
+        """No score yet."""
+        return [mi.Float(0) for _ in self.plan.scores]
+
+    def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
+        """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
+        return [
+            dr.select(medium == s.medium, total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length, total)
+            if s.field == "sigma"
+            else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
+    def turn(self, sums: list[mi.Float], medium: mi.UInt32, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
+        """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
+        return [
+            dr.select(active & (medium == s.medium), total + terms[s.field], total) if s.field in terms else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
+    def complete(
+        self, sums: list[mi.Float], counts: list[mi.UInt32], medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
+    ) -> list[mi.Float]:
+        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
+        whole = []
+        for s, total in zip(self.plan.scores, sums, strict=True):
+            value = total
+            if s.field == "alpha":
+                value = mi.Float(counts[s.medium - 1]) * self.media.inverse_alpha[s.medium - 1]
+            elif s.field == "sigma":
+                value = total - lengths.get(s.medium, mi.Float(0))
+            elif s.field in terms:
+                value = total + dr.select(medium == s.medium, terms[s.field], 0)
+            whole.append(value)
+        return whole
+
+
+@dataclass
+class Walker:
+    """State of every lane: a path under way, what it has scored, and which sample of the lane it is."""
+
+    rng: mi.PCG32
+    origin: mi.Point3f
+    omega: mi.Vector3f
+    place: mi.UInt32
+    weight: mi.Float
+    """Throughput without the albedos, which are counted."""
+    reference: mi.Float
+    """Throughput against which roulette compares."""
+    counts: list[mi.UInt32]
+    """Scatters so far in each medium."""
+    sums: list[mi.Float]
+    border_sums: list[mi.Float]
+    kept: Crossing
+    secondary: mi.Bool
+    """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""
+    shape_factor: list[mi.Float]
+    """Of a secondary walk: dt_b of each mode relative to their sum, with the sign of the scattering difference."""
+    lane: mi.UInt32
+    sample: mi.UInt32
+    active: mi.Bool
+
+    def scatters_so_far(self) -> mi.UInt32:
+        """Scattering order."""
+        total = self.counts[0]
+        for count in self.counts[1:]:
+            total = total + count
+        return total
+
+
+@dataclass
+class Flight:
+    """What one step of the walk met."""
+
+    medium: mi.UInt32
+    sigma: mi.Float
+    hit: Hit
+    distance: mi.Float
+    scatters: mi.Bool
+    meets: mi.Bool
+    """A surface is reached ..."""
+    reflects: mi.Bool
+    """... and reflects, else it is crossed."""
+
+
+class Walk:
+    """The walk through one geometry under one plan. ``run`` is the only door."""
+
+    def __init__(self, geometry: Geometry, media: Media, lights: PointLights | None, start: CameraStart | SlabStart, plan: Plan, ior: float | None) -> None:
+        self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
+        self.ior = None if ior is None else dr.opaque(mi.Float, ior)
+        self.book = Scores(plan, media)
+        self.modes = geometry.modes if plan.shape else 0
+        self.slots = 2 if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
+
+    def run(self, samples: int) -> Tally:
+        """Trace ``samples`` paths in every lane; returns their sums, evaluated."""
+        tally = Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
+        limit = dr.opaque(mi.UInt32, samples)
+        lane = dr.arange(mi.UInt32, self.start.lanes)
+        path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
+
+        def zeros(count: int) -> list[mi.Float]:
+            return [mi.Float(0) for _ in range(count)]
+
+        walker = Walker(
+            rng=path.rng,
+            origin=path.origin,
+            omega=path.omega,
+            place=path.place,
+            weight=path.weight,
+            reference=mi.Float(path.weight),
+            counts=[mi.UInt32(0) for _ in range(self.media.count)],
+            sums=self.book.zero(),
+            border_sums=zeros(self.modes),
+            kept=no_crossing(self.modes),
+            secondary=mi.Bool(False),
+            shape_factor=zeros(self.modes),
+            lane=lane,
+            sample=mi.UInt32(0),
+            active=lane < self.start.lanes,
+        )
+        dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
+        tally.evaluate()
+        return tally
+
+    def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+        carried = self._carried(walker)
+        flight = self._fly_past_faces(walker, carried, tally) if self.plan.faces else self._fly(walker)
+        carried = self._carried(walker)
+        self._move(walker, flight, carried)
+        if not self.plan.faces:
+            self._connect(walker, flight, tally)
+        self._turn(walker, flight)
+        ended = self._end(walker, flight)
+        if self.plan.shape:
+            ended = self._start_secondary(walker, ended, tally)
+        self._renew(walker, ended, limit)
+        return walker
+
+    def _carried(self, walker: Walker) -> mi.Float:
+        # The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution.
+        exponent = mi.Float(0)
+        for count, log_alpha in zip(walker.counts, self.media.log_alpha, strict=True):
+            exponent = dr.fma(mi.Float(count), log_alpha, exponent)
+        return walker.weight * dr.exp(exponent)
+
+    def _fly(self, walker: Walker) -> Flight:
+        medium = self.geometry.medium(walker.place)
+        sigma = self.media.extinction(medium)
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
+        distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
+        scatters = walker.active & (distance < hit.distance)
+        meets = walker.active & ~scatters & hit.valid
+        reflects = mi.Bool(False)
+        if self.ior is not None:
+            # A thin face lets the camera's own ray in (its reflection is a highlight, masked) and reflects later ones by chance.
+            mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), self.ior)
+            entry = (walker.scatters_so_far() == 0) & (medium == 0) & ~walker.secondary
+            walker.weight *= dr.select(meets & hit.outer & entry, 1 - mirrored, 1)
+            reflects = meets & hit.outer & ~entry & (walker.rng.next_float32() < mirrored)
+        return Flight(medium, sigma, hit, distance, scatters, meets, reflects)
+
+    def _fly_past_faces(self, walker: Walker, carried: mi.Float, tally: Tally) -> Flight:
+        medium = self.geometry.medium(walker.place)
+        sigma = self.media.extinction(medium)
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
+        leaving = hit.valid & hit.outer
+        through = mi.Float(1)
+        if self.ior is not None:
+            through = 1 - fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), dr.rcp(self.ior) if self.plan.bend else self.ior)
+
+        # Count the share that leaves through an outer face.
+        collides = one_minus_exp(sigma * hit.distance)
+        face = dr.select(walker.omega.z > 0, mi.UInt32(1), mi.UInt32(0))
+        value = carried * (1 - collides) * through
+        lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.book.sigma_media}
+        primary = walker.active & leaving & ~walker.secondary
+        tally.add(walker.lane, face, value, primary)
+        for which, score in enumerate(self.book.complete(walker.sums, walker.counts, mi.UInt32(0), {}, lengths)):
+            tally.add_derivative(which, walker.lane, face, value * score, primary)
+        for mode in range(self.modes):
+            factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode])
+            tally.add_derivative(len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving)
+
+        # The rest collides before the face or is reflected by it.
+        remains = dr.select(leaving, collides + (1 - collides) * (1 - through), 1)
+        reflects = leaving & (walker.rng.next_float32() * remains >= collides)
+        distance = minus_log1m(walker.rng.next_float32() * dr.select(leaving, collides, 1)) / sigma
+        scatters = walker.active & dr.select(leaving, ~reflects, distance < hit.distance)
+        distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
+        first = scatters & (walker.scatters_so_far() == 0) & ~walker.secondary
+        walker.weight *= remains
+        walker.reference = dr.select(first, walker.weight, walker.reference)
+        return Flight(medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects)
+
+    def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
+        hit, omega = flight.hit, walker.omega
+        length = dr.select(flight.scatters, flight.distance, dr.select(flight.meets, hit.distance, 0))
+        walker.sums = self.book.flight(walker.sums, flight.medium, length, flight.scatters)
+        crosses = flight.meets & ~flight.reflects
+        behind = self.geometry.beyond(walker.place, omega, hit)
+        cosine = dr.dot(omega, hit.normal)
+        if self.plan.shape:
+            # Score the border's transmittance change, and offer the crossing for the scattering change.
+            shifts = [speed * inverse_cosine(cosine) for speed in self.geometry.velocity(hit, crosses)]
+            jump = dr.select(crosses, self.media.extinction(self.geometry.medium(behind)) - flight.sigma, 0)
+            walker.border_sums = [dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)]
+            at_border = crosses & ~hit.outer & ~walker.secondary
+            walker.kept = offer(
+                walker.kept, dr.fma(omega, hit.distance, walker.origin), omega, hit, walker.place, behind, carried, shifts, walker.rng.next_float32(), at_border
+            )
+        reached = self.geometry.advance(walker.origin, omega, hit, crosses)
+        walker.origin = dr.select(flight.scatters, dr.fma(omega, length, walker.origin), dr.select(flight.meets, reached, walker.origin))
+        walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
+        walker.place = dr.select(crosses, behind, walker.place)
+        walker.counts = [dr.select(flight.scatters & (flight.medium == k + 1), count + 1, count) for k, count in enumerate(walker.counts)]
+
+    def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
+        carried = self._carried(walker)
+        phase = PhaseFunction(self.media, flight.medium)
+        chosen = self.lights.choose(walker.origin, LightImportance(phase, walker.omega), walker.rng, flight.scatters)
+
+        # Cast the shadow ray with a probability in proportion to what it could bring.
+        chance = dr.clip(ROULETTE_GAIN * carried * chosen.strength * self.lights.inverse_irradiance, ROULETTE_FLOOR, 1)
+        casts = flight.scatters & (walker.rng.next_float32() < chance)
+
+        def cast(walker: Walker, medium: mi.UInt32, chosen: ChosenLight, weight: mi.Float, casts: mi.Bool) -> mi.Float:
+            ray = shadow(
+                self.geometry, self.media, walker.origin, chosen.direction, walker.place, casts,
+                measured=self.book.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
+            )  # fmt: skip
+            value = weight * ray.transmittance()
+            slot = self._slot(walker, chosen)
+            primary = casts & ~walker.secondary
+            tally.add(walker.lane, slot, value, primary)
+            terms = PhaseFunction(self.media, medium).scores(self.book.phase_fields, walker.omega, chosen.direction)
+            lengths = dict(zip(self.book.sigma_media, ray.lengths, strict=True))
+            for which, score in enumerate(self.book.complete(walker.sums, walker.counts, medium, terms, lengths)):
+                tally.add_derivative(which, walker.lane, slot, value * score, primary)
+            for mode in range(self.modes):
+                factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode] + ray.border[mode])
+                tally.add_derivative(len(self.plan.scores) + mode, walker.lane, slot, value * factor, casts)
+            return value
+
+        dr.if_stmt(
+            (walker, flight.medium, chosen, carried * chosen.total / chance, casts), casts, cast, lambda *arguments: mi.Float(0), label="connection",
+        )  # fmt: skip
+
+    def _slot(self, walker: Walker, chosen: ChosenLight) -> mi.UInt32:
+        edges = self.plan.order_edges
+        if not edges:
+            return chosen.index
+        order, bin_index = walker.scatters_so_far(), mi.UInt32(0)
+        for edge in edges[1:-1]:
+            bin_index += dr.select(order >= edge, mi.UInt32(1), mi.UInt32(0))
+        return chosen.index * (len(edges) - 1) + bin_index
+
+    def _turn(self, walker: Walker, flight: Flight) -> None:
+        phase, rng = PhaseFunction(self.media, flight.medium), walker.rng
+        u_lobe = rng.next_float32() if self.media.two_lobes else None
+        onward = phase.sample(walker.omega, u_lobe, rng.next_float32(), rng.next_float32())
+        walker.sums = self.book.turn(walker.sums, flight.medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters)
+        walker.omega = dr.select(flight.scatters, onward, walker.omega)
+
+    def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
+        # Paths that faded survive in proportion to what they carry; those that met nothing are gone.
+        share = self._carried(walker) / (ROULETTE_WEIGHT * walker.reference)
+        faded = (share < 1) & (walker.rng.next_float32() >= share)
+        walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
+        ended = walker.active & ((~flight.scatters & ~flight.meets) | faded)
+        if self.plan.order_edges:
+            ended |= walker.active & (walker.scatters_so_far() >= self.plan.order_edges[-1])
+        return ended
+
+    def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
+        """Send the kept crossing's secondary walk from paths that ended; returns those that are finished altogether."""
+        begins = ended & ~walker.secondary & (walker.kept.total > 0)
+
+        def begin(walker: Walker, begins: mi.Bool) -> Walker:
+            kept, rng = walker.kept, walker.rng
+            scattering = BorderScattering(self.geometry, self.media, kept)
+            size = sum((dr.abs(shift) for shift in kept.shifts), start=mi.Float(0))
+            strength = kept.throughput * kept.total / kept.importance * size
+            ratios = [shift / size for shift in kept.shifts]
+
+            # Light that the border point scatters directly.
+            if self.lights is not None:
+                chosen = self.lights.choose(kept.point, scattering, rng, begins)
+                point, place = scattering.point(chosen.direction), scattering.place(chosen.direction)
+                ray = shadow(self.geometry, self.media, point, chosen.direction, place, begins, thin_ior=self.ior)
+                value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
+                for mode, ratio in enumerate(ratios):
+                    tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)
+
+            # One walk for both sides' lobes, carrying their signed difference.
+            u_lobe = rng.next_float32() if self.media.two_lobes else None
+            omega = scattering.sample(rng.next_float32(), u_lobe, rng.next_float32(), rng.next_float32())
+            balance = scattering.balance(omega)
+            walker.origin, walker.place, walker.omega = scattering.point(omega), scattering.place(omega), omega
+            walker.weight = strength * (scattering.sigma_a + scattering.sigma_b) * dr.abs(balance)
+            walker.reference = mi.Float(walker.weight)
+            walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
+            walker.counts = [dr.zeros(mi.UInt32) for _ in walker.counts]
+            walker.secondary = mi.Bool(True)
+            walker.rng = rng
+            return walker
+
+        walker_after = dr.if_stmt((walker, begins), begins, begin, lambda walker, _: walker, label="secondary walk")
+        for field in ("rng", "origin", "omega", "place", "weight", "reference", "counts", "secondary", "shape_factor"):
+            setattr(walker, field, getattr(walker_after, field))
+        return (ended & ~begins) | (begins & (walker.weight == 0))
+
+    def _renew(self, walker: Walker, ended: mi.Bool, limit: mi.UInt32) -> None:
+        """Put the lane's next sample in place of finished paths."""
+
+        def renew(walker: Walker, ended: mi.Bool) -> Walker:
+            walker.sample = walker.sample + 1
+            path = self.start.begin(walker.lane, walker.sample, ended)
+            walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
+            walker.weight, walker.reference = path.weight, mi.Float(path.weight)
+            walker.counts = [mi.UInt32(0) for _ in walker.counts]
+            walker.sums = [mi.Float(0) for _ in walker.sums]
+            walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
+            walker.kept.total = mi.Float(0)
+            walker.secondary = mi.Bool(False)
+            walker.active = walker.sample < limit
+            return walker
+
+        renewed = dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
+        vars(walker).update(vars(renewed))
