@@ -70,6 +70,9 @@ class RigSpec(Record):
     settle_s: float = Field(default=0.002, ge=0, description="wait between light on and exposure")
     tracking_every: int = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
     black_frames: int = Field(default=2, ge=1, description="frames without light")
+    watchdog_s: float = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
+    light_exposure_limit_s: Positive = Field(default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment")
+    total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
 
