@@ -1,0 +1,159 @@
+"""A procedural upper central incisor after Wheeler's averages, with the enamel-thickness model of its labial face.
+
+Superellipse cross-sections, stacked along the tooth's axis: labiolingual diameter 6.0 mm at the cervix, 7.0 mm at 2.5 mm above it and 1.5 mm at the
+incisal edge, 10.5 mm above it; mesiodistal 7.0 mm at the cervix and 8.5 mm at the widest. Labial enamel is 0.35 mm + 0.75 z / 10.5 thick.
+Frame: x mesial, y buccal, z occlusal, mm, centred at the origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+
+Profile = tuple[NDArray[np.float64], ...]
+
+CROWN_MM = 10.5
+ROOT_STUB_MM = 3.0
+ROOT_ENAMEL_MM = 0.08
+"""Cover of the root stub: enough to keep the two surfaces apart."""
+EDGE_ROUNDING_MM = 0.45
+ROOT_ROUNDING_MM = 0.8
+DENTIN_EDGE_MM = 0.2
+"""Half the labiolingual thickness at which dentin ends below the incisal edge."""
+EXPONENT = 2.4
+
+HEIGHT_MM = (-ROOT_STUB_MM, 0.0, 2.5, 6.0, 9.0, CROWN_MM)
+LABIAL_MM = (2.75, 3.0, 3.40, 2.95, 1.75, 0.95)
+LABIOLINGUAL_MM = (5.5, 6.0, 7.0, 4.6, 2.35, 1.5)
+MESIODISTAL_MM = (6.5, 7.0, 7.6, 8.3, 8.5, 8.1)
+
+
+@dataclass(frozen=True)
+class Incisor:
+    """Nested closed surfaces: enamel outside, dentin inside, gums around the root."""
+
+    outer: Mesh
+    dentin: Mesh
+    gums: Mesh
+
+
+def enamel_thickness_mm(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Labial enamel thickness at a height above the cervical line; fades to the root's cover below it."""
+    crown = 0.35 + 0.75 * np.clip(height_mm, 0.0, CROWN_MM) / CROWN_MM
+    fade = np.clip(1.0 + height_mm / 1.0, 0.0, 1.0)
+    smooth = fade * fade * (3 - 2 * fade)
+    return ROOT_ENAMEL_MM + (crown - ROOT_ENAMEL_MM) * smooth
+
+
+def build_incisor(columns: int = 48) -> Incisor:
+    """Build the tooth.
+
+    Args:
+        columns: vertices around a cross-section; 48 gives about 5,000 triangles for the enamel surface.
+    """
+    crown = _stack(_outer_profile, (-ROOT_STUB_MM, CROWN_MM), (ROOT_ROUNDING_MM, EDGE_ROUNDING_MM), columns)
+    heights = np.linspace(0.0, CROWN_MM, 1000)
+    room = (_dentin_profile(heights)[1] >= DENTIN_EDGE_MM) & (heights + enamel_thickness_mm(heights) <= CROWN_MM)
+    core = _stack(_dentin_profile, (-ROOT_STUB_MM + ROOT_ENAMEL_MM, float(heights[room].max())), (ROOT_ROUNDING_MM, DENTIN_EDGE_MM / 2), columns)
+    shift = -(crown.vertices_mm.min(axis=0) + crown.vertices_mm.max(axis=0)) / 2
+    return Incisor(_moved(crown, shift), _moved(core, shift), _moved(_gum_collar(columns), shift))
+
+
+def cervix_height_mm() -> float:
+    """Height of the cervical line in the centred frame: add it to a height above the cervix."""
+    return -(CROWN_MM - ROOT_STUB_MM) / 2
+
+
+def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
+    # Half axes and the labial offset of the centre line, monotone between the measured heights so that no waist appears.
+    from scipy.interpolate import PchipInterpolator
+
+    labial, diameter, width = (PchipInterpolator(HEIGHT_MM, values)(height_mm) for values in (LABIAL_MM, LABIOLINGUAL_MM, MESIODISTAL_MM))
+    return width / 2, diameter / 2, labial - diameter / 2
+
+
+def _dentin_profile(height_mm: NDArray[np.float64]) -> Profile:
+    # Thickness is a distance along the normal; on an inclined wall the horizontal step is longer by the secant of its slope.
+    width, depth, centre = _outer_profile(height_mm)
+    thickness, step = enamel_thickness_mm(height_mm), 1e-3
+
+    def inset(wall: NDArray[np.float64], above: NDArray[np.float64]) -> NDArray[np.float64]:
+        return wall - thickness * np.sqrt(1 + ((above - wall) / step) ** 2)
+
+    width_above, depth_above, centre_above = _outer_profile(height_mm + step)
+    labial = inset(depth + centre, depth_above + centre_above)
+    lingual = inset(depth - centre, depth_above - centre_above)
+    return inset(width, width_above), (labial + lingual) / 2, (labial - lingual) / 2
+
+
+def _stack(profile: object, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], columns: int) -> Mesh:
+    # Rows: a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
+    assert callable(profile)
+    wall_rows, rim_rows = max(8, columns), max(4, columns // 8)
+    rows = []
+    for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
+        angle = np.linspace(np.pi / 2, 0, rim_rows + 1)[:-1]
+        height = np.full(rim_rows, end) - sign * rounding * (1 - np.sin(angle))
+        inset = rounding * (1 - np.cos(angle))
+        lid = [(end, rounding, scale) for scale in (1 / 3, 2 / 3)]
+        part = lid + [(float(z), float(i), 1.0) for z, i in zip(height, inset, strict=True)]
+        rows.append(part if sign < 0 else part[::-1])
+    wall = np.linspace(ends_mm[0] + rounding_mm[0], ends_mm[1] - rounding_mm[1], wall_rows)
+    sections = rows[0] + [(float(z), 0.0, 1.0) for z in wall] + rows[1]
+
+    rings = []
+    for height, inset, scale in sections:
+        half_x, half_y, centre = (float(value[0]) for value in profile(np.array([height])))
+        limit = 0.85 * min(half_x, half_y)
+        cut = min(inset, limit)
+        x, y = _superellipse(scale * (half_x - cut), scale * (half_y - cut), columns)
+        rings.append(np.stack([x, y + centre, np.full(columns, height)], axis=-1))
+    poles = [np.array([[0.0, float(profile(np.array([end]))[2][0]), end]]) for end in ends_mm]
+    return _close(np.concatenate([*rings, *poles]), len(rings), columns)
+
+
+def _superellipse(half_x: float, half_y: float, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Vertices at equal steps of arc length plus turning, counter-clockwise from +x: neighbouring rows stay aligned and tight bends stay round.
+    angle = np.linspace(0, 2 * np.pi, 64 * columns + 1)
+    radius = (np.abs(np.cos(angle) / half_x) ** EXPONENT + np.abs(np.sin(angle) / half_y) ** EXPONENT) ** (-1 / EXPONENT)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    measure = arc / arc[-1] + 0.5 * (heading - heading[0]) / (heading[-1] - heading[0])
+    at = np.linspace(measure[0], measure[-1], columns, endpoint=False)
+    return np.interp(at, measure, x), np.interp(at, measure, y)
+
+
+def _close(vertices: NDArray[np.float64], rows: int, columns: int) -> Mesh:
+    # Quads between rows split alternately, fans at the two poles.
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    a, b = row * columns + column, row * columns + (column + 1) % columns
+    c, d = a + columns, b + columns
+    even = ((row + column) % 2 == 0)[..., None]
+    first = np.where(even, np.stack([a, b, d], -1), np.stack([a, b, c], -1)).reshape(-1, 3)
+    second = np.where(even, np.stack([a, d, c], -1), np.stack([b, d, c], -1)).reshape(-1, 3)
+    ring = np.arange(columns)
+    after = (ring + 1) % columns
+    last = (rows - 1) * columns
+    bottom = np.stack([np.full(columns, rows * columns), after, ring], -1)
+    lid = np.stack([np.full(columns, rows * columns + 1), last + ring, last + after], -1)
+    return Mesh(vertices, np.concatenate([first, second, bottom, lid]).astype(np.int32))
+
+
+def _gum_collar(columns: int) -> Mesh:
+    # A block around the root whose top rises to papillae between the teeth; inside the tooth it is hidden by the enamel.
+    def profile(height_mm: NDArray[np.float64]) -> Profile:
+        return np.full_like(height_mm, 6.5), np.full_like(height_mm, 5.0), np.full_like(height_mm, 0.2)
+
+    block = _stack(profile, (-ROOT_STUB_MM - 1.0, 0.4), (0.8, 0.8), columns)
+    x, y, z = block.vertices_mm.T
+    papilla = 1.6 * np.exp(-(((np.abs(x) - 4.6) / 1.3) ** 2)) * np.clip((z + ROOT_STUB_MM) / ROOT_STUB_MM, 0, 1)
+    return Mesh(np.stack([x, y, z + papilla], axis=-1), block.faces)
+
+
+def _moved(mesh: Mesh, shift_mm: NDArray[np.float64]) -> Mesh:
+    return Mesh(mesh.vertices_mm + shift_mm, mesh.faces)

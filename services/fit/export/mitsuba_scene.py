@@ -1,0 +1,139 @@
+"""A tooth as a scene for stock Mitsuba: nested homogeneous media, point lights, pinhole cameras; one colour channel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera
+from services.core.records import Boundary
+from services.fit.optics.parameters import Medium, Tissue
+
+MAX_DEPTH = 5000
+ROULETTE_DEPTH = 100
+"""Russian roulette starts here: paths in enamel scatter hundreds of times, and an earlier start costs more variance than it saves."""
+
+SceneDict = dict[str, Any]
+
+
+def medium_dict(medium: Medium) -> SceneDict:
+    """A homogeneous medium; two lobes become a blended phase function."""
+    first: SceneDict = {"type": "hg", "g": medium.g1}
+    second: SceneDict = {"type": "hg", "g": medium.g2}
+    phase = first if medium.beta >= 1 else {"type": "blendphase", "weight": 1 - medium.beta, "first": first, "second": second}
+    return {"type": "homogeneous", "sigma_t": medium.sigma, "albedo": medium.alpha, "phase": phase}
+
+
+def sensor_dict(camera: Camera, samples: int = 64) -> SceneDict:
+    """A pinhole camera with a box filter, so that a pixel is the mean radiance over its area.
+
+    Raises:
+        CaptureInputError: Mitsuba's perspective camera has square pixels and no skew.
+    """
+    K, pose = np.asarray(camera.K), np.asarray(camera.camera_from_world)
+    if abs(K[0, 0] / K[1, 1] - 1) > 1e-4 or abs(K[0, 1]) > 1e-6 * K[0, 0]:
+        raise CaptureInputError(f"Camera {camera.name} has unequal focal lengths or skew, which Mitsuba cannot render; resample its images to square pixels.")
+    width, height = camera.size
+    # Mitsuba looks along +z with x to the left and y up; OpenCV has x right and y down.
+    world_from_camera = np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    return {
+        "type": "perspective",
+        "to_world": world_from_camera,
+        "fov": float(np.degrees(2 * np.arctan(width / (2 * K[0, 0])))),
+        "fov_axis": "x",
+        "principal_point_offset_x": float(0.5 - K[0, 2] / width),
+        "principal_point_offset_y": float(0.5 - K[1, 2] / height),
+        "near_clip": 1.0,
+        "far_clip": 1e5,
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "luminance",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent", "sample_count": samples},
+    }
+
+
+def boundary_dict(boundary: Boundary, ior: float) -> SceneDict:
+    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset."""
+    return {"type": "null"} if boundary == "matched" else {"type": "thin_boundary", "ior": ior}
+
+
+def nested_scene(
+    outer: Path,
+    dentin: Path | None,
+    tissue: Tissue,
+    cameras: tuple[Camera, ...],
+    light_mm: tuple[float, float, float],
+    intensity: float,
+    *,
+    boundary: Boundary = "matched",
+    ior: float = 1.631,
+    samples: int = 64,
+) -> SceneDict:
+    """Scene of one tooth under one point light, for ``mi.load_dict(..., optimize=False)`` in a mono variant.
+
+    Args:
+        outer, dentin: PLY files. ``enamel`` lies between them, ``dentin`` inside the inner one.
+    """
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
+        "medium_enamel": medium_dict(tissue.enamel),
+        "outer": {
+            "type": "ply",
+            "filename": str(outer),
+            "face_normals": True,
+            "bsdf": boundary_dict(boundary, ior),
+            "interior": {"type": "ref", "id": "medium_enamel"},
+        },
+        "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
+    }
+    if dentin is not None:
+        scene["medium_dentin"] = medium_dict(tissue.dentin)
+        scene["dentin"] = {
+            "type": "ply",
+            "filename": str(dentin),
+            "face_normals": True,
+            "bsdf": {"type": "null"},
+            "interior": {"type": "ref", "id": "medium_dentin"},
+            "exterior": {"type": "ref", "id": "medium_enamel"},
+        }
+    return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
+
+
+def load_scene(scene: SceneDict) -> Any:
+    """Build the Mitsuba scene; the variant must be set."""
+    import mitsuba as mi
+
+    return mi.load_dict(_with_transforms(scene), optimize=False)
+
+
+def _with_transforms(node: Any) -> Any:
+    # Dictionaries here hold plain arrays, so that they can be written as XML without Mitsuba; loading needs its own transform type.
+    import mitsuba as mi
+
+    if isinstance(node, dict):
+        return {key: _with_transforms(value) for key, value in node.items()}
+    return mi.ScalarTransform4f(node) if isinstance(node, np.ndarray) else node
+
+
+def render_batches(scene: Any, sensor: int, samples: int, seed: int, batches: int = 16) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Image (H, W) and the variance of its mean from independent batches of ``samples / batches`` paths per pixel."""
+    import drjit as dr
+    import mitsuba as mi
+
+    images = []
+    for batch in range(batches):
+        image = mi.render(scene, sensor=sensor, spp=max(1, samples // batches), seed=(seed * 1009 + batch) % 2**32)
+        dr.eval(image)
+        images.append(np.array(image, dtype=np.float64)[..., 0])
+    stack = np.stack(images)
+    return stack.mean(axis=0), stack.var(axis=0, ddof=1) / batches
