@@ -1,0 +1,100 @@
+"""What the capture asks of a dome, and the exposure budget every dome keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Protocol, Self
+
+from services.core.errors import ExposureLimitError
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class DomeStatus:
+    """A snapshot for people: preflight, dashboard."""
+
+    firmware: str
+    light_count: int
+    interlock_closed: bool
+    emergency_stop: bool
+    supply_on: bool
+    faults: tuple[str, ...]
+    lit: tuple[int, ...]
+    temperature_degc: tuple[float, ...]
+    current_ma: tuple[int, ...]
+
+
+class Dome(Protocol):
+    """A dome of lights around a face. Whatever raises, the lights are dark when the caller sees it."""
+
+    @property
+    def light_count(self) -> int:
+        """Lights fitted."""
+
+    def light(self, index: int | None, level: float, on_s: float) -> Rgb:
+        """Switch one light on, or all for None, every other off; returns the levels read back.
+
+        Args:
+            level: fraction of full scale, the same for R, G and B.
+            on_s: planned on-time in seconds, counted against the exposure limits before anything is sent.
+
+        Raises:
+            ExposureLimitError, InterlockError, ReadbackError, RigError.
+        """
+
+    def confirm(self) -> Rgb:
+        """Check that exactly the commanded light is emitting; returns the levels read back."""
+
+    def trigger(self) -> None:
+        """Pulse the cameras' trigger line."""
+
+    def dark(self) -> None:
+        """Switch every light off and check it."""
+
+    def status(self) -> DomeStatus:
+        """Read the controller's state."""
+
+    def __enter__(self) -> Self:
+        """Connect, check safety, arm the watchdog."""
+
+    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+        """Go dark, whatever happened."""
+
+
+@dataclass
+class ExposureBudget:
+    """Light dose so far and its limits, in level-seconds: level (fraction of full scale) times on-time in seconds.
+
+    Both limits follow from the rig's photobiological assessment (IEC 62471): radiance dose of one source, and of all.
+    """
+
+    light_limit_s: float
+    total_limit_s: float
+    spent_s: dict[int, float] = field(default_factory=dict)
+
+    def require(self, lights: range, level: float, on_s: float) -> None:
+        """Refuse what would pass a limit.
+
+        Raises:
+            ExposureLimitError: names the light, the dose and the limit.
+        """
+        dose_s = level * on_s
+        worst = max(lights, key=lambda light: self.spent_s.get(light, 0.0))
+        light_s = self.spent_s.get(worst, 0.0) + dose_s
+        total_s = sum(self.spent_s.values()) + dose_s * len(lights)
+        if light_s > self.light_limit_s:
+            raise ExposureLimitError(
+                f"Light {worst} would reach {light_s:.3g} level-seconds, over its limit of {self.light_limit_s:g}; lower rig.level or rig.exposure_s."
+            )
+        if total_s > self.total_limit_s:
+            raise ExposureLimitError(
+                f"All lights together would reach {total_s:.3g} level-seconds, over the limit of {self.total_limit_s:g}; "
+                "lower rig.level or rig.exposure_s, or use fewer lights."
+            )
+
+    def spend(self, lights: range, level: float, on_s: float) -> None:
+        """Record light that was emitted."""
+        for light in lights:
+            self.spent_s[light] = self.spent_s.get(light, 0.0) + level * on_s

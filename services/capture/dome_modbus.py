@@ -1,0 +1,286 @@
+"""The dome over Modbus TCP. Safety first: there is a face in the dome.
+
+* A light is on only between ``light`` and ``dark``; every exception, signal, cancel and process end goes through ``dark``.
+* The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when a light
+  has been on for its strobe time (a hung one).
+* Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType, TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.capture import registers as reg
+from services.capture.dome import DomeStatus, ExposureBudget, Rgb
+from services.capture.keepalive import KeepAlive
+from services.capture.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
+from services.core.errors import InterlockError, ReadbackError, RigError
+
+REPLY_TIMEOUT_S = 0.5
+HANG_MARGIN_S = 2.0
+FEEDS_PER_WATCHDOG = 5
+DARK_ATTEMPTS = 3
+
+
+class DomeObserver:
+    """Read-only eyes on the dome's light, over a connection of their own; never feeds the watchdog."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
+        self._lights = self._read(reg.LIGHT_COUNT)[0]
+
+    def outputs(self) -> NDArray[np.float64]:
+        """What each LED emits now, (light, 3) as fraction of full scale."""
+        return np.asarray(self._read(reg.OUTPUTS, 3 * self._lights), dtype=np.float64).reshape(-1, 3) / reg.FULL_SCALE
+
+    def trigger_count(self) -> int:
+        """Exposure triggers since power-on, modulo 65536."""
+        return self._read(reg.TRIGGER_COUNT)[0]
+
+    def faults(self) -> reg.FaultBit:
+        """Latched faults."""
+        return reg.FaultBit(self._read(reg.FAULTS)[0])
+
+    def close(self) -> None:
+        """Drop the connection."""
+        self._link.close()
+
+    def _read(self, register: reg.Register, count: int | None = None) -> list[int]:
+        try:
+            return self._link.read(register, count)
+        except LinkError as problem:
+            self._link.close()
+            raise RigError(f"The dome cannot be observed: {problem}; check its power and network.") from problem
+
+
+class ModbusDome:
+    """A ``Dome`` behind a Modbus TCP controller. Use as a context manager; see the module for what it guarantees."""
+
+    def __init__(self, host: str, port: int, budget: ExposureBudget, watchdog_s: float = 2.0) -> None:
+        self.address = f"{host}:{port}"
+        self.watchdog_s = watchdog_s
+        self._budget = budget
+        self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
+        self._keepalive = KeepAlive(ModbusLink(host, port, REPLY_TIMEOUT_S), watchdog_s / FEEDS_PER_WATCHDOG)
+        self._light_count = 0
+        self._lit: tuple[range, float, float] | None = None
+        self._previous_handlers: dict[int, object] = {}
+
+    def __enter__(self) -> Self:
+        try:
+            with self._dark_on_error():
+                self._identify()
+                self._require_safe()
+                self._write_checked(reg.WATCHDOG_MS, [round(1000 * self.watchdog_s)])
+                self._link.write(reg.FAULT_RESET, [1])
+                self._keepalive.start()
+                self._require_no_fault()
+                self.dark()
+        except BaseException:
+            self._keepalive.stop()
+            self._link.close()
+            raise
+        atexit.register(self._last_resort)
+        self._catch_signals()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            # An exception may have struck between a request and its answer: start from a clean connection.
+            if kind is not None:
+                self._link.close()
+            self.dark()
+        except RigError:
+            # A light that may still burn matters more than a cancel; another rig error has said it already.
+            if not isinstance(problem, RigError):
+                raise
+        finally:
+            self._keepalive.stop()
+            self._link.close()
+            atexit.unregister(self._last_resort)
+            self._release_signals()
+
+    @property
+    def light_count(self) -> int:
+        """Lights fitted."""
+        return self._light_count
+
+    def light(self, index: int | None, level: float, on_s: float) -> Rgb:
+        """Switch one light on, or all for None; see ``Dome.light``."""
+        lights = range(self._light_count) if index is None else range(index, index + 1)
+        with self._dark_on_error():
+            self._account()
+            if not lights or lights.stop > self._light_count or lights.start < 0:
+                raise RigError(f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the plan.")
+            self._budget.require(lights, level, on_s)
+            self._require_safe()
+            self._keepalive.require_alive()
+            strobe_ms = min(math.ceil(1000 * (on_s + HANG_MARGIN_S)), reg.FULL_SCALE)
+            active = reg.ALL_LIGHTS if index is None else index
+            self._lit = (lights, level, time.monotonic())
+            # Feeding here as well makes a light independent of when the thread last ran.
+            self._link.write(reg.KEEPALIVE, [1])
+            # Where the answer is lost or odd, the read-back decides whether the light was set; it is not sent again.
+            with suppress(NoReplyError, WrongReplyError):
+                self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
+            return self.confirm()
+
+    def confirm(self) -> Rgb:
+        """Check that exactly the commanded light is emitting; see ``Dome.confirm``."""
+        with self._dark_on_error():
+            self._require_safe()
+            self._require_no_fault()
+            wanted = np.zeros((self._light_count, 3), dtype=np.int64)
+            if self._lit is not None:
+                wanted[self._lit[0]] = reg.level_word(self._lit[1])
+            for register in (reg.LEVELS, reg.OUTPUTS):
+                held = self._rgb(register)
+                wrong = np.flatnonzero((held != wanted).any(axis=1))
+                if len(wrong):
+                    light = int(wrong[0])
+                    raise ReadbackError(
+                        f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
+                        "all lights were switched off, check that light and the controller."
+                    )
+            first = self._lit[0].start if self._lit else 0
+            return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
+
+    def trigger(self) -> None:
+        """Pulse the cameras' trigger line and check that the controller counted it."""
+        with self._dark_on_error():
+            before = self._link.read(reg.TRIGGER_COUNT)[0]
+            with suppress(NoReplyError, WrongReplyError):
+                self._link.write(reg.EXPOSURE_TRIGGER, [1])
+            if self._link.read(reg.TRIGGER_COUNT)[0] != (before + 1) & 0xFFFF:
+                raise RigError(f"The dome at {self.address} did not trigger the cameras; check the controller and run again.")
+
+    def dark(self) -> None:
+        """Switch every light off and check it. All-off alone is repeated: it can only make things safer."""
+        problem: Exception | None = None
+        for _ in range(DARK_ATTEMPTS):
+            try:
+                self._link.write(reg.ALL_OFF, [1])
+                emitting = np.flatnonzero(self._rgb(reg.OUTPUTS).any(axis=1))
+            except LinkError as failure:
+                self._link.close()
+                problem = failure
+                continue
+            if not len(emitting):
+                self._account()
+                return
+            problem = LinkError(f"light {int(emitting[0])} still emits after all-off")
+        # Starving the watchdog opens the supply relay, the last thing this side can do.
+        self._keepalive.stop()
+        self._account()
+        raise ReadbackError(
+            f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within {self.watchdog_s:g} s, switch the dome off."
+        ) from problem
+
+    def status(self) -> DomeStatus:
+        """Read the controller's state."""
+        with self._dark_on_error():
+            firmware = self._link.read(reg.FIRMWARE)[0]
+            closed, pressed, supply = self._link.read(reg.INTERLOCK_CLOSED, 3)
+            banks = -(-self._light_count // reg.LIGHTS_PER_BANK)
+            return DomeStatus(
+                firmware=f"{firmware >> 8}.{firmware & 0xFF}",
+                light_count=self._light_count,
+                interlock_closed=bool(closed),
+                emergency_stop=bool(pressed),
+                supply_on=bool(supply),
+                faults=_names(reg.FaultBit(self._link.read(reg.FAULTS)[0])),
+                lit=tuple(int(i) for i in np.flatnonzero(self._rgb(reg.OUTPUTS).any(axis=1))),
+                temperature_degc=tuple(tenths / 10 for tenths in self._link.read(reg.BANK_TEMPERATURE, banks)),
+                current_ma=tuple(self._link.read(reg.BANK_CURRENT, banks)),
+            )
+
+    @contextmanager
+    def _dark_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as problem:
+            with suppress(RigError):
+                self.dark()
+            if isinstance(problem, LinkError):
+                # An open interlock is why a controller refuses; say that rather than the code.
+                if isinstance(problem, RefusedError):
+                    with suppress(LinkError):
+                        self._require_safe()
+                        self._require_no_fault()
+                raise RigError(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
+            raise
+
+    def _identify(self) -> None:
+        if self._link.read(reg.IDENTITY)[0] != reg.IDENTITY_VALUE:
+            raise RigError(f"The device at {self.address} is no dome controller; correct rig.dome.")
+        firmware = self._link.read(reg.FIRMWARE)[0]
+        if firmware >> 8 != reg.FIRMWARE_MAJOR:
+            raise RigError(f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR}; update one of them.")
+        self._light_count = self._link.read(reg.LIGHT_COUNT)[0]
+        if not 1 <= self._light_count <= reg.MAX_LIGHTS:
+            raise RigError(f"The dome at {self.address} reports {self._light_count} lights, outside 1 to {reg.MAX_LIGHTS}; check its configuration.")
+
+    def _require_safe(self) -> None:
+        closed, pressed = self._link.read(reg.INTERLOCK_CLOSED, 2)
+        if pressed:
+            raise InterlockError(f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and run again.")
+        if not closed:
+            raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
+
+    def _require_no_fault(self) -> None:
+        faults = reg.FaultBit(self._link.read(reg.FAULTS)[0])
+        if faults:
+            raise RigError(f"The dome at {self.address} reports {' and '.join(_names(faults))}; remove the cause and run again.")
+
+    def _rgb(self, register: reg.Register) -> NDArray[np.int64]:
+        return np.asarray(self._link.read(register, 3 * self._light_count), dtype=np.int64).reshape(-1, 3)
+
+    def _write_checked(self, register: reg.Register, values: list[int]) -> None:
+        with suppress(NoReplyError, WrongReplyError):
+            self._link.write(register, values)
+        held = self._link.read(register)
+        if held != values:
+            raise ReadbackError(f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the controller.")
+
+    def _account(self) -> None:
+        if self._lit is not None:
+            lights, level, since_s = self._lit
+            self._budget.spend(lights, level, time.monotonic() - since_s)
+            self._lit = None
+
+    def _last_resort(self) -> None:
+        self._link.close()
+        with suppress(RigError):
+            self.dark()
+        self._keepalive.stop()
+
+    def _catch_signals(self) -> None:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    self._previous_handlers[number] = signal.signal(number, _unwind)
+
+    def _release_signals(self) -> None:
+        for number in self._previous_handlers:
+            signal.signal(number, signal.SIG_DFL)
+        self._previous_handlers.clear()
+
+
+def _names(faults: reg.FaultBit) -> tuple[str, ...]:
+    return tuple(bit.name.lower().replace("_", " ") for bit in reg.FaultBit if bit in faults and bit.name)
+
+
+def _unwind(number: int, _frame: FrameType | None) -> None:
+    """Turn a deadly signal into an exception, so that every context manager between here and the top runs."""
+    raise SystemExit(128 + number)

@@ -1,0 +1,165 @@
+"""Durable frames: what is acknowledged survives a crash, and the next attempt goes on from it.
+
+::
+
+    .capture.<attempt>/
+      capture.zarr/        (camera, frame, y, x, channel) uint16, one shard per camera and frame
+      journal.jsonl        line 1: what is captured (a fingerprint); then one line per acknowledged frame, with its
+                           FrameRecord and each shard's size and SHA-256
+
+A frame is acknowledged by its journal line: written and fsynced after the shards and their folders were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from services.core.errors import StoreError
+from services.core.geometry import Record
+from services.core.records import FrameRecord
+from services.core.store import StageWriter, create_array, write_atomic
+
+ARRAY = "capture.zarr"
+JOURNAL = "journal.jsonl"
+DIMENSIONS = ("camera", "frame", "y", "x", "channel")
+
+
+class Acknowledged(Record):
+    """One line of the journal."""
+
+    frame: FrameRecord
+    shards: tuple[tuple[str, int, str], ...]
+
+
+class FrameStore:
+    """The capture array being written, with the journal that says which frames count."""
+
+    def __init__(self, writer: StageWriter, shape: tuple[int, int, int, int, int], fingerprint: str) -> None:
+        """Open the attempt's folder, adopting the acknowledged frames of the newest attempt that captured the same.
+
+        Args:
+            shape: cameras, frames, height, width, channels; smaller cameras are padded with zeros.
+            fingerprint: equal for two captures exactly when their frames may be mixed.
+        """
+        self._writer, self._folder = writer, writer.folder
+        self._header = json.dumps({"fingerprint": fingerprint, "shape": shape})
+        lines: list[Acknowledged] = []
+        source = self._newest_leftover()
+        if source is not None:
+            lines = list(_intact(source, self._header))
+        if source != self._folder:
+            self._start(shape)
+            for line in lines:
+                _link_shards(source or self._folder, self._folder, line)
+        self._array = zarr.open_array(self._folder / ARRAY, mode="r+", config={"write_empty_chunks": True})
+        self.acknowledged = {line.frame.index: line.frame for line in lines}
+        text = "\n".join([self._header, *(line.model_dump_json() for line in lines)]) + "\n"
+        write_atomic(self._folder / JOURNAL, text.encode())
+
+    def store(self, frame: FrameRecord, images: Sequence[NDArray[np.uint16]]) -> None:
+        """Store one frame of all cameras; when this returns it survives a power cut.
+
+        Raises:
+            FencedError: a newer attempt owns the stage. StoreError: the disk does not take it.
+        """
+        self._writer.require_lease()
+        try:
+            for camera, image in enumerate(images):
+                padded = np.zeros(self._array.shape[2:], dtype=np.uint16)
+                padded[: image.shape[0], : image.shape[1]] = image
+                self._array[camera, frame.index] = padded
+            names = [f"c/{camera}/{frame.index}/0/0/0" for camera in range(len(images))]
+            shards = tuple((name, *_digest_durably(self._folder / ARRAY, name)) for name in names)
+            line = Acknowledged(frame=frame, shards=shards).model_dump_json() + "\n"
+            with (self._folder / JOURNAL).open("a") as journal:
+                journal.write(line)
+                journal.flush()
+                os.fsync(journal.fileno())
+        except OSError as problem:
+            raise StoreError(
+                f"Frame {frame.index} cannot be stored in {self._folder} ({problem.strerror}); free the disk and run the job again, it resumes there."
+            ) from problem
+        self.acknowledged[frame.index] = frame
+
+    def frames(self) -> tuple[FrameRecord, ...]:
+        """Acknowledged frames by index."""
+        return tuple(self.acknowledged[index] for index in sorted(self.acknowledged))
+
+    def remove_leftovers(self) -> None:
+        """Delete the folders of earlier attempts, once this one is published."""
+        for folder in self._attempts():
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _attempts(self) -> list[Path]:
+        prefix = f".{self._writer.stage}."
+        attempts = [p for p in self._writer.root.glob(f"{prefix}*") if p.name.removeprefix(prefix).isdigit()]
+        return sorted((p for p in attempts if int(p.name.removeprefix(prefix)) <= self._writer.attempt), key=lambda p: -int(p.name.removeprefix(prefix)))
+
+    def _newest_leftover(self) -> Path | None:
+        for folder in self._attempts():
+            journal = folder / JOURNAL
+            if journal.is_file() and journal.read_text().partition("\n")[0] == self._header:
+                return folder
+        return None
+
+    def _start(self, shape: tuple[int, int, int, int, int]) -> None:
+        shutil.rmtree(self._folder)
+        self._folder.mkdir()
+        create_array(self._folder, ARRAY, shape, (1, 1, *shape[2:]), "uint16", DIMENSIONS)
+
+
+def _intact(folder: Path, header: str) -> Iterator[Acknowledged]:
+    """Journal lines whose shards are as acknowledged; a torn last line and damaged frames are left out, to be captured again."""
+    text = (folder / JOURNAL).read_text()
+    assert text.startswith(header)
+    for row in text.split("\n")[1:-1]:
+        line = Acknowledged.model_validate_json(row)
+        if all(_digest(folder / ARRAY / name) == (size, sha256) for name, size, sha256 in line.shards):
+            yield line
+
+
+def _digest(path: Path) -> tuple[int, str] | None:
+    if not path.is_file():
+        return None
+    content = path.read_bytes()
+    return len(content), hashlib.sha256(content).hexdigest()
+
+
+def _digest_durably(array: Path, name: str) -> tuple[int, str]:
+    """Fsync a shard and every folder between it and the array; its size and SHA-256."""
+    path = array / name
+    for entry in [path, *path.parents[: len(Path(name).parts)]]:
+        descriptor = os.open(entry, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    content = path.read_bytes()
+    return len(content), hashlib.sha256(content).hexdigest()
+
+
+def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:
+    """Adopt a frame's shards without copying. A stalled older attempt replaces files and never changes them, so links are safe."""
+    for name, _, _ in line.shards:
+        path = target / ARRAY / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(source / ARRAY / name, path)
+        except OSError:
+            shutil.copyfile(source / ARRAY / name, path)
+        _digest_durably(target / ARRAY, name)
+
+
+def fingerprint(*parts: Any) -> str:
+    """SHA-256 over the JSON of what decides a frame's pixels."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()

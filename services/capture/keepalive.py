@@ -1,0 +1,46 @@
+"""The thread that tells the controller that the host is alive."""
+
+from __future__ import annotations
+
+import threading
+
+from services.capture.modbus_link import LinkError, ModbusLink
+from services.capture.registers import KEEPALIVE
+from services.core.errors import RigError
+
+
+class KeepAlive:
+    """Feeds the watchdog from a thread, over its own connection, so that a slow transaction elsewhere does not starve it."""
+
+    def __init__(self, link: ModbusLink, period_s: float) -> None:
+        self._link = link
+        self._period_s = period_s
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._problem: LinkError | None = None
+
+    def start(self) -> None:
+        """Feed once, then keep feeding."""
+        self._link.write(KEEPALIVE, [1])
+        self._thread = threading.Thread(target=self._feed, name="dome keep-alive", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop feeding; the controller goes dark within its watchdog period."""
+        self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._link.close()
+
+    def require_alive(self) -> None:
+        """Raise RigError when the last feed failed."""
+        if self._problem is not None or self._stop.is_set():
+            raise RigError(f"The dome's watchdog is no longer fed ({self._problem or 'stopped'}); check the network and run again.")
+
+    def _feed(self) -> None:
+        while not self._stop.wait(self._period_s):
+            try:
+                self._link.write(KEEPALIVE, [1])
+                self._problem = None
+            except LinkError as problem:
+                self._problem = problem

@@ -1,0 +1,84 @@
+"""What will be exposed, decided before anything is lit. Pure: a rig and its lights in, frames out.
+
+::
+
+    black ... black | tracking | light 0 ... light k-1 | tracking | light k ... | tracking
+
+A tracking frame has all lights on at 1/lights of the level, so that it is as bright as the mean single light and costs no more
+dose. The subject's motion is measured between tracking frames, whose light does not change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+from pydantic import Field
+
+from services.capture.dome import ExposureBudget
+from services.capture.registers import FULL_SCALE, level_word
+from services.core.errors import SettingsError
+from services.core.geometry import Record
+from services.core.records import RigSpec
+
+
+class PlannedFrame(Record):
+    """One exposure of all cameras."""
+
+    index: int = Field(ge=0, description="number in the plan, from 0")
+    kind: Literal["black", "tracking", "light"]
+    light: int | None = Field(description="index of the one light that is on; null for black and tracking frames")
+    level: float = Field(ge=0, le=1, description="fraction of full scale, a whole number of register steps")
+    exposure_s: float = Field(gt=0)
+    on_s: float = Field(ge=0, description="planned on-time of the light: settle and exposure")
+
+
+def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
+    """The frames of one capture, in order.
+
+    Args:
+        lights: lights to capture, indices 0 to lights - 1 of the dome.
+
+    Raises:
+        SettingsError: the level is below one register step. ExposureLimitError: the plan passes a dose limit.
+    """
+    frames = tuple(_frame(rig, lights, index, light) for index, light in enumerate(_order(rig, lights)))
+    require_exposure(frames, lights, rig)
+    return frames
+
+
+def require_exposure(frames: Sequence[PlannedFrame], lights: int, rig: RigSpec) -> None:
+    """Raise ExposureLimitError where the planned dose passes a limit of the rig."""
+    budget = ExposureBudget(rig.light_exposure_limit_s, rig.total_exposure_limit_s)
+    for frame in frames:
+        if frame.kind != "black":
+            on = range(lights) if frame.light is None else range(frame.light, frame.light + 1)
+            budget.require(on, frame.level, frame.on_s)
+            budget.spend(on, frame.level, frame.on_s)
+
+
+def _order(rig: RigSpec, lights: int) -> Iterator[int | Literal["black", "tracking"]]:
+    for _ in range(rig.black_frames):
+        yield "black"
+    for light in range(lights):
+        if rig.tracking_every and light % rig.tracking_every == 0:
+            yield "tracking"
+        yield light
+    if rig.tracking_every:
+        yield "tracking"
+
+
+def _frame(rig: RigSpec, lights: int, index: int, what: int | Literal["black", "tracking"]) -> PlannedFrame:
+    kind: Literal["black", "tracking", "light"] = "light" if isinstance(what, int) else what
+    wanted = {"black": 0.0, "tracking": rig.level / lights, "light": rig.level}[kind]
+    word = level_word(wanted)
+    if kind != "black" and word == 0:
+        raise SettingsError(f"rig.level {rig.level:g} is below one step of the dome's 16-bit levels in a {kind} frame; raise it.")
+    return PlannedFrame(
+        index=index,
+        kind=kind,
+        light=what if isinstance(what, int) else None,
+        level=word / FULL_SCALE,
+        exposure_s=rig.exposure_s,
+        on_s=rig.settle_s + rig.exposure_s if kind != "black" else 0.0,
+    )

@@ -1,0 +1,49 @@
+"""Checks in seconds, while the subject still sits there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from services.capture.camera import Cameras
+from services.capture.dome import Dome
+from services.capture.plan import PlannedFrame
+from services.capture.sequence import CLIPPED_FRACTION, clipped_fraction, expose
+from services.core.errors import RigError
+from services.core.records import RigSpec
+
+GLIMPSE_S = 0.005
+BLACK_TOLERANCE = 0.005
+
+
+def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec) -> tuple[str, ...]:
+    """Light every light for a moment, then expose one black and one lit frame.
+
+    Returns:
+        Sentences about what the operator may want to correct; empty when all is well.
+
+    Raises:
+        RigError: a light does not emit what it should, or the black level is wrong by more than 0.5 % of full scale.
+    """
+    for frame in plan:
+        if frame.light is not None:
+            dome.light(frame.light, frame.level, GLIMPSE_S)
+            dome.dark()
+
+    black = next(frame for frame in plan if frame.kind == "black")
+    full_scale = 2**cameras.bits - 1
+    for camera, image in enumerate(expose(black, dome, cameras, 0.0)[1]):
+        offset = abs(float(image.mean()) - cameras.black_level)
+        if offset > BLACK_TOLERANCE * full_scale:
+            raise RigError(
+                f"Camera {camera} reads {image.mean():.1f} counts in the dark instead of {cameras.black_level}; darken the room or correct the black level."
+            )
+
+    findings = []
+    lit = next((frame for frame in plan if frame.kind == "tracking"), plan[-1])
+    for camera, image in enumerate(expose(lit, dome, cameras, rig.settle_s)[1]):
+        fraction = clipped_fraction(image, cameras.bits)
+        if fraction > CLIPPED_FRACTION:
+            findings.append(f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or rig.exposure_s.")
+        if float(image.max()) - cameras.black_level < 2 * BLACK_TOLERANCE * full_scale:
+            findings.append(f"Camera {camera} sees no light in a {lit.kind} frame; open its shutter or check its aim.")
+    return tuple(findings)

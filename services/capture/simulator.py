@@ -1,0 +1,186 @@
+"""The simulated dome: a real Modbus TCP server around ``DomeModel``, with faults to order.
+
+Faults are ordered through the register ``fault_order``, so that any process can, and nothing below the registers is faked.
+Run alone (``serve_dome``), or as a process of its own that ends with its parent (``simulated_dome``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from pymodbus.constants import ExcCodes
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from services.capture import registers as reg
+from services.capture.dome_model import DomeModel
+from services.capture.modbus_link import UNIT, LinkError, ModbusLink
+from services.capture.registers import FaultKind, Space
+from services.core.errors import RigError
+
+START_TIMEOUT_S = 30.0
+_SPACES: dict[int, Space] = {
+    **dict.fromkeys((1, 5, 15), "coil"),
+    2: "discrete",
+    4: "input",
+    **dict.fromkeys((3, 6, 16, 22, 23), "holding"),
+}
+
+
+def serve_dome(host: str, port: int, lights: int, watchdog_s: float, announce: Callable[[str, int], None] | None = None) -> None:
+    """Serve one simulated dome until SIGINT or SIGTERM.
+
+    Args:
+        port: 0 picks a free one.
+        lights: RGB lights fitted, 1 to 155.
+        watchdog_s: watchdog period at power-on; a driver sets its own.
+        announce: told the address once requests are answered.
+
+    Raises:
+        RigError: the port cannot be opened, or no dome has so many lights.
+    """
+    if not 1 <= lights <= reg.MAX_LIGHTS:
+        raise RigError(f"A dome with {lights} lights cannot be simulated, the register map holds 1 to {reg.MAX_LIGHTS}; correct --lights.")
+    asyncio.run(_serve(host, port, DomeModel(lights, watchdog_s), announce, with_parent=False))
+
+
+@contextmanager
+def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1") -> Iterator[tuple[str, int]]:
+    """A simulated dome in a process of its own on a free port; yields its address. It ends when this process does."""
+    command = [sys.executable, "-m", "services.capture.simulator", json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s})]
+    # A session of its own: Ctrl-C must reach the driver, which still needs the dome to go dark.
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as process:  # noqa: S603
+        assert process.stdin is not None
+        assert process.stdout is not None
+        impatience = threading.Timer(START_TIMEOUT_S, process.kill)
+        impatience.start()
+        try:
+            line = process.stdout.readline()
+        finally:
+            impatience.cancel()
+        try:
+            if not line:
+                raise RigError("The simulated dome did not start; run 'dentine dome-sim' to see why.")
+            yield host, int(line)
+        finally:
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(START_TIMEOUT_S)
+            process.kill()
+
+
+def order_fault(host: str, port: int, kind: FaultKind, argument: int = 0, times: int = 1, on: reg.Register | None = None) -> None:
+    """Make the simulator at this address fail.
+
+    Args:
+        argument: a light's index, milliseconds of a delay, or a Modbus exception code, by kind.
+        times: requests that meet it; faults of the machine itself stay until ``FaultKind.NONE``.
+        on: only requests that touch this register's first address.
+    """
+    link = ModbusLink(host, port, timeout_s=2.0)
+    try:
+        link.write(reg.FAULT_ORDER, [kind, argument, times, reg.ANY_ADDRESS if on is None else on.address])
+    except LinkError as problem:
+        raise RigError(f"The fault cannot be ordered: {problem}; is a simulated dome running there?") from problem
+    finally:
+        link.close()
+
+
+class _Shell:
+    """Puts the model behind pymodbus: refreshes the registers before every request, and spoils requests as ordered."""
+
+    def __init__(self, model: DomeModel) -> None:
+        self._model = model
+        self._spoil_reply = FaultKind.NONE
+
+    async def action(self, function: int, start: int, address: int, count: int, registers: list[int], values: list[int] | list[bool] | None) -> ExcCodes | None:
+        """Called by pymodbus before each read and write."""
+        space, span = _SPACES[function], count if values is None else len(values)
+        is_order = space == "holding" and address == reg.FAULT_ORDER.address
+        fault = FaultKind.NONE if is_order else self._model.order.take(address, span)
+        if fault in {FaultKind.DROP_REPLY, FaultKind.DROP_REQUEST, FaultKind.WRONG_REPLY}:
+            self._spoil_reply = fault
+        if fault is FaultKind.DELAY:
+            await asyncio.sleep(self._model.order.argument / 1000)
+        if fault is FaultKind.EXCEPTION:
+            return ExcCodes(self._model.order.argument)
+        if fault is FaultKind.DROP_REQUEST:
+            return ExcCodes.DEVICE_BUSY
+        self._model.advance(asyncio.get_running_loop().time())
+        if values is not None:
+            refusal = self._model.write(space, address, [int(value) for value in values])
+            if refusal:
+                return ExcCodes(refusal)
+        self._refresh(space, start, registers)
+        return None
+
+    def packet(self, sending: bool, data: bytes) -> bytes:
+        """Called by pymodbus with every packet on the wire."""
+        if not sending or self._spoil_reply is FaultKind.NONE:
+            return data
+        spoil, self._spoil_reply = self._spoil_reply, FaultKind.NONE
+        if spoil is FaultKind.WRONG_REPLY:
+            return data[:-1] + bytes([data[-1] ^ 0x5A])
+        return b""
+
+    def _refresh(self, space: Space, start: int, registers: list[int]) -> None:
+        for register in (r for r in reg.TABLE if r.space == space):
+            values = self._model.values(register)
+            if space in {"coil", "discrete"}:
+                mask = 1 << register.address % 16
+                word = register.address // 16 - start
+                registers[word] = registers[word] | mask if values[0] else registers[word] & ~mask
+            else:
+                registers[register.address - start : register.end - start] = values
+
+
+async def _serve(host: str, port: int, model: DomeModel, announce: Callable[[str, int], None] | None, *, with_parent: bool) -> None:
+    shell, loop, stop = _Shell(model), asyncio.get_running_loop(), asyncio.Event()
+    coils, discretes = ([SimData(0, values=[False] * 16, datatype=DataType.BITS)] for _ in range(2))
+    holdings, inputs = (
+        [SimData(r.address, count=r.count, values=0, datatype=DataType.REGISTERS) for r in reg.TABLE if r.space == space] for space in ("holding", "input")
+    )
+    device = SimDevice(id=UNIT, simdata=(coils, discretes, holdings, inputs), action=shell.action)
+    server = ModbusTcpServer(device, address=(host, port), trace_packet=shell.packet)
+    try:
+        await server.serve_forever(background=True)
+    except RuntimeError as problem:
+        raise RigError(f"The simulated dome cannot listen on {host}:{port}; choose another port.") from problem
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+    if with_parent:
+        await loop.connect_read_pipe(lambda: _Parent(stop), sys.stdin)
+    if announce is not None:
+        announce(host, server.transport.sockets[0].getsockname()[1])
+    await stop.wait()
+    await server.shutdown()
+
+
+class _Parent(asyncio.Protocol):
+    """Notices the parent's death: the pipe on standard input closes."""
+
+    def __init__(self, stop: asyncio.Event) -> None:
+        self._stop = stop
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+        """End with the pipe."""
+        self._stop.set()
+
+
+def _main() -> None:
+    settings = json.loads(sys.argv[1])
+    model = DomeModel(settings["lights"], settings["watchdog_s"])
+    asyncio.run(_serve(settings["host"], 0, model, lambda _host, port: print(port, flush=True), with_parent=True))
+
+
+if __name__ == "__main__":
+    _main()
