@@ -7,6 +7,7 @@ Frame: x mesial, y buccal, z occlusal, mm, centred at the origin.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,9 +91,8 @@ def _dentin_profile(height_mm: NDArray[np.float64]) -> Profile:
     return inset(width, width_above), (labial + lingual) / 2, (labial - lingual) / 2
 
 
-def _stack(profile: object, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], columns: int) -> Mesh:
+def _stack(profile: Callable[[NDArray[np.float64]], Profile], ends_mm: tuple[float, float], rounding_mm: tuple[float, float], columns: int) -> Mesh:
     # Rows: a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
-    assert callable(profile)
     wall_rows, rim_rows = max(8, columns), max(4, columns // 8)
     rows = []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
@@ -106,12 +106,11 @@ def _stack(profile: object, ends_mm: tuple[float, float], rounding_mm: tuple[flo
     sections = rows[0] + [(float(z), 0.0, 1.0) for z in wall] + rows[1]
 
     rings = []
-    for height, inset, scale in sections:
-        half_x, half_y, centre = (float(value[0]) for value in profile(np.array([height])))
-        limit = 0.85 * min(half_x, half_y)
-        cut = min(inset, limit)
+    for row_height, row_inset, scale in sections:
+        half_x, half_y, centre = (float(value[0]) for value in profile(np.array([row_height])))
+        cut = min(row_inset, 0.85 * min(half_x, half_y))
         x, y = _superellipse(scale * (half_x - cut), scale * (half_y - cut), columns)
-        rings.append(np.stack([x, y + centre, np.full(columns, height)], axis=-1))
+        rings.append(np.stack([x, y + centre, np.full(columns, row_height)], axis=-1))
     poles = [np.array([[0.0, float(profile(np.array([end]))[2][0]), end]]) for end in ends_mm]
     return _close(np.concatenate([*rings, *poles]), len(rings), columns)
 

@@ -22,6 +22,8 @@ class Hits:
     """(N, 3) unit face normals, outward."""
     mesh: NDArray[np.int64]
     """(N,) index of the mesh that was hit, -1 for none."""
+    face: NDArray[np.int64]
+    """(N,) face within that mesh."""
 
 
 class RayScene:
@@ -65,7 +67,8 @@ class RayScene:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         mesh = np.where(hit, np.searchsorted(self._first_face, face, side="right") - 1, -1)
-        return Hits(hit, start + np.where(hit, distance, 0.0)[:, None] * directions, normals, mesh)
+        points = start + np.where(hit, distance, 0.0)[:, None] * directions
+        return Hits(hit, points, normals, mesh, face - self._first_face[np.maximum(mesh, 0)])
 
 
 def pixel_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

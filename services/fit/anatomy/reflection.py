@@ -1,0 +1,109 @@
+"""Light that never enters the tooth: the enamel's glossy reflection and the gums' diffuse one, per camera and point light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Light, Mesh
+from services.fit.anatomy.rays import RayScene, pixel_rays
+
+ROUGHNESS = 0.12
+"""GGX roughness of wet enamel at the scale of a pixel."""
+SUBPIXELS = 4
+GUM_REFLECTANCE = {"red": 0.50, "green": 0.24, "blue": 0.22}
+SHADOW_OFFSET_MM = 1e-3
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """Radiance (L, H, W, C) of one camera under each light, averaged over the pixel, and what share of a pixel shows enamel."""
+
+    highlight: NDArray[np.float64]
+    gums: NDArray[np.float64]
+    enamel_share: NDArray[np.float64]
+    """(H, W): of the pixel's rays that meet the tooth, the fraction not hidden by gums; 1 where none meets it."""
+    enamel_pixels: NDArray[np.bool_]
+    """(H, W) whether any ray of the pixel meets the tooth."""
+
+
+def reflect(outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float) -> Reflection:
+    """Shade each pixel on a 4 × 4 grid of rays, with shadows by tooth and gums."""
+    width, height = camera.size
+    normals_at = _SmoothNormals(outer)
+    everything = RayScene(outer) if gums is None else RayScene(outer, gums)
+    tooth_alone = RayScene(outer)
+    shape = (len(lights), height * width, len(channels))
+    highlight, diffuse = np.zeros(shape), np.zeros(shape)
+    visible, met = np.zeros(height * width), np.zeros(height * width)
+    gum_colour = np.array([GUM_REFLECTANCE[channel] for channel in channels])
+
+    for sub in range(SUBPIXELS**2):
+        offset = ((sub % SUBPIXELS + 0.5) / SUBPIXELS, (sub // SUBPIXELS + 0.5) / SUBPIXELS)
+        origin, directions = pixel_rays(camera, offset)
+        hits = everything.first_hits(origin, directions)
+        met += tooth_alone.first_hits(origin, directions).hit
+        visible += hits.mesh == 0
+        for part in (0, 1):
+            rows = np.flatnonzero(hits.mesh == part)
+            if rows.size == 0:
+                continue
+            points, flat, view = hits.points_mm[rows], hits.normals[rows], -directions[rows]
+            normals = normals_at(points, hits.face[rows]) if part == 0 else flat
+            for n, light in enumerate(lights):
+                towards = np.asarray(light.position_mm) - points
+                distance = np.linalg.norm(towards, axis=1)
+                towards /= distance[:, None]
+                cosine = (normals * towards).sum(axis=1)
+                lit = (cosine > 0) & ((flat * towards).sum(axis=1) > 0)
+                lit[lit] = ~everything.first_hits(points[lit] + SHADOW_OFFSET_MM * flat[lit], towards[lit]).hit
+                irradiance = np.where(lit, cosine, 0.0)[:, None] / distance[:, None] ** 2 * np.asarray(light.intensity)
+                if part == 0:
+                    highlight[n, rows] += irradiance * ggx_reflection(normals, towards, view, ROUGHNESS, ior)[:, None]
+                else:
+                    diffuse[n, rows] += irradiance * gum_colour / np.pi
+
+    count, image = SUBPIXELS**2, (len(lights), height, width, len(channels))
+    share = np.where(met > 0, visible / np.maximum(met, 1), 1.0)
+    return Reflection((highlight / count).reshape(image), (diffuse / count).reshape(image), share.reshape(height, width), (met > 0).reshape(height, width))
+
+
+def ggx_reflection(
+    normal: NDArray[np.float64], towards_light: NDArray[np.float64], towards_eye: NDArray[np.float64], roughness: float, ior: float
+) -> NDArray[np.float64]:
+    """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr; all directions unit and away from the surface."""
+    half = towards_light + towards_eye
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    n_l, n_v, n_h = (np.clip((normal * d).sum(axis=-1), 1e-6, 1.0) for d in (towards_light, towards_eye, half))
+    a2 = roughness**2
+    distribution = a2 / (np.pi * (n_h**2 * (a2 - 1) + 1) ** 2)
+    shadowing = 2 * n_l * n_v / (n_v * np.sqrt(a2 + (1 - a2) * n_l**2) + n_l * np.sqrt(a2 + (1 - a2) * n_v**2))
+    return np.asarray(distribution * shadowing * fresnel(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior) / (4 * n_l * n_v))
+
+
+def fresnel(cosine: NDArray[np.float64], ior: float) -> NDArray[np.float64]:
+    """Unpolarised reflectance from air onto a dielectric."""
+    inside = np.sqrt(1 - (1 - cosine**2) / ior**2)
+    s, p = (cosine - ior * inside) / (cosine + ior * inside), (ior * cosine - inside) / (ior * cosine + inside)
+    return np.asarray((s**2 + p**2) / 2)
+
+
+class _SmoothNormals:
+    # Area-weighted vertex normals, interpolated: a highlight shows every facet otherwise.
+    def __init__(self, mesh: Mesh) -> None:
+        self._mesh = mesh
+        a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+        weighted = np.cross(b - a, c - a)
+        self._normals = np.zeros_like(mesh.vertices_mm)
+        for k in range(3):
+            np.add.at(self._normals, mesh.faces[:, k], weighted)
+
+    def __call__(self, points_mm: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+        from trimesh.triangles import points_to_barycentric
+
+        index = self._mesh.faces[faces]
+        weights = np.clip(points_to_barycentric(self._mesh.vertices_mm[index], points_mm), 0, 1)
+        mixed = np.einsum("nk,nkx->nx", weights, self._normals[index])
+        return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
