@@ -130,31 +130,17 @@ class ModbusDome:
             active = reg.ALL_LIGHTS if index is None else index
             self._lit = (lights, level, time.monotonic())
             # Feeding here as well makes a light independent of when the thread last ran.
-            self._link.write(reg.KEEPALIVE, [1])
+            with suppress(NoReplyError, WrongReplyError):
+                self._link.write(reg.KEEPALIVE, [1])
             # Where the answer is lost or odd, the read-back decides whether the light was set; it is not sent again.
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
-            return self.confirm()
+            return self._confirmed()
 
     def confirm(self) -> Rgb:
         """Check that exactly the commanded light is emitting; see ``Dome.confirm``."""
         with self._dark_on_error():
-            self._require_safe()
-            self._require_no_fault()
-            wanted = np.zeros((self._light_count, 3), dtype=np.int64)
-            if self._lit is not None:
-                wanted[self._lit[0]] = reg.level_word(self._lit[1])
-            for register in (reg.LEVELS, reg.OUTPUTS):
-                held = self._rgb(register)
-                wrong = np.flatnonzero((held != wanted).any(axis=1))
-                if len(wrong):
-                    light = int(wrong[0])
-                    raise ReadbackError(
-                        f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
-                        "all lights were switched off, check that light and the controller."
-                    )
-            first = self._lit[0].start if self._lit else 0
-            return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
+            return self._confirmed()
 
     def trigger(self) -> None:
         """Pulse the cameras' trigger line and check that the controller counted it."""
@@ -220,6 +206,24 @@ class ModbusDome:
                         self._require_no_fault()
                 raise RigError(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
             raise
+
+    def _confirmed(self) -> Rgb:
+        self._require_safe()
+        self._require_no_fault()
+        wanted = np.zeros((self._light_count, 3), dtype=np.int64)
+        if self._lit is not None:
+            wanted[self._lit[0]] = reg.level_word(self._lit[1])
+        for register in (reg.LEVELS, reg.OUTPUTS):
+            held = self._rgb(register)
+            wrong = np.flatnonzero((held != wanted).any(axis=1))
+            if len(wrong):
+                light = int(wrong[0])
+                raise ReadbackError(
+                    f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
+                    "all lights were switched off, check that light and the controller."
+                )
+        first = self._lit[0].start if self._lit else 0
+        return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
 
     def _identify(self) -> None:
         if self._link.read(reg.IDENTITY)[0] != reg.IDENTITY_VALUE:

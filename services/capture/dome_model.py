@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from services.capture import registers as reg
-from services.capture.registers import FaultBit, FaultKind, Register
+from services.capture.registers import FaultBit, FaultKind, Register, Space
 
 ILLEGAL_VALUE = 3
 DEVICE_FAILURE = 4
@@ -24,16 +24,18 @@ FULL_LED_MA = 350.0
 
 @dataclass
 class FaultOrder:
-    """A fault that applies to the next ``times`` requests that touch ``address``."""
+    """A fault that applies to the next ``times`` requests that touch ``address`` of a space."""
 
     kind: FaultKind = FaultKind.NONE
     argument: int = 0
     times: int = 0
-    address: int = reg.ANY_ADDRESS
+    space: int = reg.ANY_SPACE
+    address: int = 0
 
-    def take(self, address: int, count: int) -> FaultKind:
+    def take(self, space: Space, address: int, count: int) -> FaultKind:
         """The fault this request meets, if any, and one time less."""
-        if self.times == 0 or not (self.address == reg.ANY_ADDRESS or address <= self.address < address + count):
+        meant = self.space == reg.ANY_SPACE or (self.space == reg.SPACE_CODE[space] and address <= self.address < address + count)
+        if self.times == 0 or not meant:
             return FaultKind.NONE
         self.times -= 1
         return self.kind

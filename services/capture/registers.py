@@ -11,6 +11,8 @@ from enum import IntEnum, IntFlag
 from typing import Literal
 
 Space = Literal["coil", "discrete", "holding", "input"]
+SPACE_CODE: dict[Space, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+ANY_SPACE = 0
 
 MAX_LIGHTS = 155
 LIGHTS_PER_BANK = 16
@@ -20,7 +22,6 @@ IDENTITY_VALUE = 0xDE17
 FIRMWARE_MAJOR = 1
 NO_LIGHT = 0xFFFF
 ALL_LIGHTS = 0xFFFE
-ANY_ADDRESS = 0xFFFF
 
 
 class FaultBit(IntFlag):
@@ -99,7 +100,14 @@ ACTIVE_LIGHT = Register(
 )
 ACTIVE_LEVEL = Register("active_level", "holding", 18, 3, "1/65535", "R, G, B of the fast path; written in one transaction with active_light")
 LEVELS = Register("levels", "holding", 1000, 3 * MAX_LIGHTS, "1/65535", "commanded R, G, B of light 0, of light 1, ...")
-FAULT_ORDER = Register("fault_order", "holding", 9000, 4, "1", "simulator only: kind, argument, times, address of the requests meant (65535 any)")
+FAULT_ORDER = Register(
+    "fault_order",
+    "holding",
+    9000,
+    5,
+    "1",
+    "simulator only: kind, argument, times; space (1 coil, 2 discrete, 3 holding, 4 input, 0 any) and address of the requests meant",
+)
 
 TABLE: tuple[Register, ...] = (
     IDENTITY, FIRMWARE, LIGHT_COUNT, FAULTS, TRIGGER_COUNT, BANK_TEMPERATURE, BANK_CURRENT, OUTPUTS,

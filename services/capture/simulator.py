@@ -86,8 +86,9 @@ def order_fault(host: str, port: int, kind: FaultKind, argument: int = 0, times:
         on: only requests that touch this register's first address.
     """
     link = ModbusLink(host, port, timeout_s=2.0)
+    place = [reg.ANY_SPACE, 0] if on is None else [reg.SPACE_CODE[on.space], on.address]
     try:
-        link.write(reg.FAULT_ORDER, [kind, argument, times, reg.ANY_ADDRESS if on is None else on.address])
+        link.write(reg.FAULT_ORDER, [kind, argument, times, *place])
     except LinkError as problem:
         raise RigError(f"The fault cannot be ordered: {problem}; is a simulated dome running there?") from problem
     finally:
@@ -105,7 +106,7 @@ class _Shell:
         """Called by pymodbus before each read and write."""
         space, span = _SPACES[function], count if values is None else len(values)
         is_order = space == "holding" and address == reg.FAULT_ORDER.address
-        fault = FaultKind.NONE if is_order else self._model.order.take(address, span)
+        fault = FaultKind.NONE if is_order else self._model.order.take(space, address, span)
         if fault in {FaultKind.DROP_REPLY, FaultKind.DROP_REQUEST, FaultKind.WRONG_REPLY}:
             self._spoil_reply = fault
         if fault is FaultKind.DELAY:
