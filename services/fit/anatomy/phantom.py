@@ -194,7 +194,7 @@ def _render_mitsuba(out: Path, tooth: Tooth, camera: Camera, lights: tuple[Light
 
     folder = teeth_folder(out, tooth.fdi)
     inner = folder / "dentin.ply" if tooth.dentin is not None else None
-    scene = load_scene(nested_scene(folder / "outer.ply", inner, tissue, (camera,), lights[0].position_mm, 1.0))
+    scene = load_scene(nested_scene({str(tooth.fdi): (folder / "outer.ply", inner)}, tissue, (camera,), lights[0].position_mm, 1.0))
     params = mi.traverse(scene)
     images = []
     for n, light in enumerate(lights):

@@ -32,7 +32,7 @@ class Reflection:
 def reflect(outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float) -> Reflection:
     """Shade each pixel on a 4 × 4 grid of rays, with shadows by tooth and gums."""
     width, height = camera.size
-    normals_at = _SmoothNormals(outer)
+    normals_at = [_SmoothNormals(mesh) for mesh in (outer, gums) if mesh is not None]
     everything = RayScene(outer) if gums is None else RayScene(outer, gums)
     tooth_alone = RayScene(outer)
     shape = (len(lights), height * width, len(channels))
@@ -51,7 +51,7 @@ def reflect(outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light,
             if rows.size == 0:
                 continue
             points, flat, view = hits.points_mm[rows], hits.normals[rows], -directions[rows]
-            normals = normals_at(points, hits.face[rows]) if part == 0 else flat
+            normals = normals_at[part](points, hits.face[rows])
             for n, light in enumerate(lights):
                 towards = np.asarray(light.position_mm) - points
                 distance = np.linalg.norm(towards, axis=1)

@@ -1,11 +1,30 @@
-"""The asset: a folder that stock Mitsuba renders, with the measured numbers beside it."""
+"""The asset: a folder that stock Mitsuba renders, with the measured numbers beside it.
+
+::
+
+    scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
+    teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
+    rig.json                   cameras, lights and channels by name
+    parameters.json            per channel: value, se, unit, determined
+    errors.json                fitted and held-out image error
+    render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for boundary thin
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
-from services.core.geometry import Camera, Light, Tooth
-from services.core.records import Boundary, FitReport
+from services.core.geometry import Camera, Light, Tooth, teeth_folder
+from services.core.meshfiles import write_mesh
+from services.core.records import Boundary, Estimate, FitReport
+from services.core.store import write_atomic
+from services.fit.export.mitsuba_scene import nested_scene
+from services.fit.export.scene_xml import SceneParameter, write_scene
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+
+SHIPPED = Path(__file__).parent / "shipped"
 
 
 def write_asset(
@@ -24,5 +43,66 @@ def write_asset(
     Args:
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
         lights: ``intensity`` in the order of ``channels``.
+
+    Raises:
+        CaptureInputError: a camera that Mitsuba cannot render.
     """
-    raise NotImplementedError
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {}
+    for tooth in teeth:
+        place = teeth_folder(Path(), tooth.fdi)
+        files[str(tooth.fdi)] = (place / "outer.ply", place / "dentin.ply" if tooth.dentin is not None else None)
+        write_mesh(folder / place / "outer.ply", tooth.outer)
+        if tooth.dentin is not None:
+            write_mesh(folder / place / "dentin.ply", tooth.dentin)
+
+    first = lights[0]
+    position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
+    for index, channel in enumerate(channels):
+        intensity = SceneParameter("intensity", first.intensity[index])
+        tissue = tissue_of(report.parameters[channel])
+        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256))
+        write_scene(folder / f"scene_{channel}.xml", scene)
+
+    rig = {
+        "units": "mm",
+        "boundary": boundary,
+        "channels": list(channels),
+        "cameras": [camera.name for camera in cameras],
+        "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
+    }
+    _write_json(folder / "rig.json", rig)
+    _write_json(folder / "parameters.json", parameters_json(report))
+    _write_json(folder / "errors.json", errors_json(report))
+    for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
+        write_atomic(folder / name, (SHIPPED / name).read_bytes())
+    return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
+
+
+def tissue_of(table: dict[str, Estimate]) -> Tissue:
+    """The tissue that a table of estimates describes; a part that was not modelled is empty."""
+    parts = {}
+    for part in ("enamel", "dentin"):
+        values = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
+        parts[part] = Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
+    return Tissue(parts["enamel"], parts["dentin"])
+
+
+def parameters_json(report: FitReport) -> dict[str, Any]:
+    """Per channel and name: value, se, unit, determined."""
+    return {channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in report.parameters.items()}
+
+
+def errors_json(report: FitReport) -> dict[str, Any]:
+    """Relative image errors per channel, and whether they are those of a converged fit."""
+    return {
+        "unit": "1",
+        "fit_error": report.fit_error,
+        "held_out_error": report.held_out_error,
+        "converged": report.converged,
+        "advice": report.advice,
+    }
+
+
+def _write_json(path: Path, value: object) -> None:
+    write_atomic(path, (json.dumps(value, indent=1) + "\n").encode())

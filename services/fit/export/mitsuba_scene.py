@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def medium_dict(medium: Medium) -> SceneDict:
     return {"type": "homogeneous", "sigma_t": medium.sigma, "albedo": medium.alpha, "phase": phase}
 
 
-def sensor_dict(camera: Camera, samples: int = 64) -> SceneDict:
+def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
     """A pinhole camera with a box filter, so that a pixel is the mean radiance over its area.
 
     Raises:
@@ -66,47 +67,43 @@ def boundary_dict(boundary: Boundary, ior: float) -> SceneDict:
     return {"type": "null"} if boundary == "matched" else {"type": "thin_boundary", "ior": ior}
 
 
+TeethFiles = Mapping[str, tuple[Path, Path | None]]
+"""By name of the tooth: PLY files of its enamel's outer surface and of its dentin, if any."""
+
+
 def nested_scene(
-    outer: Path,
-    dentin: Path | None,
+    teeth: TeethFiles,
     tissue: Tissue,
     cameras: tuple[Camera, ...],
-    light_mm: tuple[float, float, float],
-    intensity: float,
+    light_mm: Sequence[Any],
+    intensity: Any,
     *,
     boundary: Boundary = "matched",
     ior: float = 1.631,
-    samples: int = 64,
+    samples: Any = 64,
 ) -> SceneDict:
-    """Scene of one tooth under one point light, for ``mi.load_dict(..., optimize=False)`` in a mono variant.
+    """Scene of teeth of one tissue under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
 
-    Args:
-        outer, dentin: PLY files. ``enamel`` lies between them, ``dentin`` inside the inner one.
+    Enamel lies between a tooth's two surfaces, dentin inside the inner one.
     """
     scene: SceneDict = {
         "type": "scene",
         "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
         "medium_enamel": medium_dict(tissue.enamel),
-        "outer": {
-            "type": "ply",
-            "filename": str(outer),
-            "face_normals": True,
-            "bsdf": boundary_dict(boundary, ior),
-            "interior": {"type": "ref", "id": "medium_enamel"},
-        },
         "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
     }
-    if dentin is not None:
+    if any(dentin is not None for _, dentin in teeth.values()):
         scene["medium_dentin"] = medium_dict(tissue.dentin)
-        scene["dentin"] = {
-            "type": "ply",
-            "filename": str(dentin),
-            "face_normals": True,
-            "bsdf": {"type": "null"},
-            "interior": {"type": "ref", "id": "medium_dentin"},
-            "exterior": {"type": "ref", "id": "medium_enamel"},
-        }
+    enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
+    for name, (outer, dentin) in teeth.items():
+        scene[f"outer_{name}"] = _surface(outer, boundary_dict(boundary, ior)) | {"interior": enamel}
+        if dentin is not None:
+            scene[f"dentin_{name}"] = _surface(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
+
+
+def _surface(path: Path, bsdf: SceneDict) -> SceneDict:
+    return {"type": "ply", "filename": path.as_posix(), "face_normals": True, "bsdf": bsdf}
 
 
 def load_scene(scene: SceneDict) -> Any:

@@ -1,0 +1,45 @@
+"""Render the measured tooth with Mitsuba 3: ``python render.py --camera c0 --light l0 --spp 256 --out tooth.exr``.
+
+Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one number.
+"""
+
+import argparse
+import importlib
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+
+def render(folder: Path, camera: str, light: str, spp: int, seed: int = 0, variant: str = "llvm_ad_mono") -> np.ndarray:
+    """Linear radiance (H, W, C) of one camera under one light."""
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+    rig = json.loads((folder / "rig.json").read_text())
+    if rig["boundary"] == "thin":
+        importlib.import_module("thin_boundary").register()
+    x, y, z = rig["lights"][light]["position_mm"]
+    planes = []
+    for channel, intensity in zip(rig["channels"], rig["lights"][light]["intensity"], strict=True):
+        scene = mi.load_file(str(folder / f"scene_{channel}.xml"), optimize=False, light_x=x, light_y=y, light_z=z, intensity=intensity)
+        planes.append(np.array(mi.render(scene, sensor=rig["cameras"].index(camera), spp=spp, seed=seed))[..., 0])
+    return np.stack(planes, axis=-1)
+
+
+def main() -> None:
+    """Read the command line, render, write an image."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--camera", default=None, help="name in rig.json; default the first")
+    parser.add_argument("--light", default=None, help="name in rig.json; default the first")
+    parser.add_argument("--spp", type=int, default=256, help="paths per pixel")
+    parser.add_argument("--out", type=Path, default=Path("tooth.exr"), help="EXR file")
+    options = parser.parse_args()
+    folder = Path(__file__).resolve().parent
+    rig = json.loads((folder / "rig.json").read_text())
+    image = render(folder, options.camera or rig["cameras"][0], options.light or next(iter(rig["lights"])), options.spp)
+    mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(options.out))
+
+
+if __name__ == "__main__":
+    main()
