@@ -1,0 +1,117 @@
+"""Which surface each pixel of a camera sees: an exact z-buffer of the scanned meshes, no ray tracer needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Mesh
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+# Candidate (triangle, sample) pairs held at once; 64 bytes each, so about 130 MB
+BATCH = 2_000_000
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What one camera sees of the meshes. Arrays are (height, width); ``mesh`` is the tooth's number, -1 where none is seen."""
+
+    mesh: NDArray[np.int16]
+    depth_mm: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    covered: BoolArray
+
+    def points_mm(self, camera: Camera, rows: slice) -> NDArray[np.float32]:
+        """World positions (rows, width, 3) of the visible surface; NaN where nothing is hit."""
+        height, width = self.mesh.shape
+        y, x = np.mgrid[0:height, 0:width][:, rows]
+        pose = np.asarray(camera.camera_from_world)
+        local = np.stack([x + 0.5, y + 0.5, np.ones_like(x, dtype=float)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
+        local *= np.where(self.mesh[rows] >= 0, self.depth_mm[rows], np.nan)[..., None]
+        return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float32)
+
+
+def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()) -> Footprint:
+    """Project teeth into a camera; ``occluders`` hide them.
+
+    A pixel is ``covered`` where its centre and its four corners see a tooth, so that no light from beside the teeth enters it.
+    """
+    width, height = camera.size
+    meshes = (*teeth, *occluders)
+    mesh, depth, normal = _rasterise(camera, meshes, (height, width), 0.5)
+    mesh[mesh >= len(teeth)] = -1
+    corner = _rasterise(camera, meshes, (height + 1, width + 1), 0.0)[0]
+    corners = (corner >= 0) & (corner < len(teeth))
+    covered = corners[:-1, :-1] & corners[:-1, 1:] & corners[1:, :-1] & corners[1:, 1:] & (mesh >= 0)
+    return Footprint(mesh, depth, normal, covered)
+
+
+def vertex_normals(mesh: Mesh) -> FloatArray:
+    """Area-weighted unit normals (V, 3)."""
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    normals = np.zeros_like(mesh.vertices_mm)
+    for k in range(3):
+        for axis in range(3):
+            normals[:, axis] += np.bincount(mesh.faces[:, k], weighted[:, axis], minlength=len(normals))
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300), dtype=np.float64)
+
+
+def _rasterise(
+    camera: Camera, meshes: Sequence[Mesh], shape: tuple[int, int], offset_px: float
+) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]:
+    """Nearest mesh, its depth and its smooth normal at sample points (column + offset, row + offset)."""
+    rows, columns = shape
+    nearness = np.zeros(rows * columns)
+    label = np.full(rows * columns, -1, dtype=np.int16)
+    normal = np.zeros((rows * columns, 3), dtype=np.float32)
+    for index, mesh in enumerate(meshes):
+        image, depth = camera.project(mesh.vertices_mm)
+        if not (depth > 0).all():
+            continue
+        normals = vertex_normals(mesh)
+        corners = image[mesh.faces] - offset_px
+        # Keep triangles that face the camera (y points down, so their area is negative) and touch the image
+        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        area = edge1[:, 0] * edge2[:, 1] - edge1[:, 1] * edge2[:, 0]
+        low = np.maximum(np.ceil(corners.min(axis=1)), 0).astype(np.int64)
+        high = np.minimum(np.floor(corners.max(axis=1)), [columns - 1, rows - 1]).astype(np.int64)
+        span = np.maximum(high - low + 1, 0)
+        count = np.where(area < 0, span[:, 0] * span[:, 1], 0)
+        kept = np.flatnonzero(count)
+        for batch in _batches(kept, count):
+            # Enumerate every sample inside each triangle's box
+            triangle = np.repeat(batch, count[batch])
+            step = np.arange(len(triangle)) - np.repeat(np.cumsum(count[batch]) - count[batch], count[batch])
+            x, y = low[triangle, 0] + step % span[triangle, 0], low[triangle, 1] + step // span[triangle, 0]
+            # Barycentric coordinates; edges count as inside so that neighbours leave no gap
+            to_sample = np.stack([x, y], axis=1) - corners[triangle, 0]
+            b1 = (to_sample[:, 0] * edge2[triangle, 1] - to_sample[:, 1] * edge2[triangle, 0]) / area[triangle]
+            b2 = (edge1[triangle, 0] * to_sample[:, 1] - edge1[triangle, 1] * to_sample[:, 0]) / area[triangle]
+            barycentric = np.stack([1 - b1 - b2, b1, b2], axis=1)
+            inside = (barycentric >= -1e-9).all(axis=1)
+            triangle, barycentric, sample = triangle[inside], barycentric[inside], (y * columns + x)[inside]
+            # 1/depth is linear on the image, so weights over depth are perspective-correct
+            weights = barycentric / depth[mesh.faces[triangle]]
+            inverse = weights.sum(axis=1)
+            # Of the candidates for one sample keep the nearest: sorted by nearness, the last write wins
+            nearer = np.flatnonzero(inverse > nearness[sample])
+            nearer = nearer[np.argsort(inverse[nearer], kind="stable")]
+            sample = sample[nearer]
+            nearness[sample] = inverse[nearer]
+            label[sample] = index
+            normal[sample] = np.einsum("nk,nkd->nd", weights[nearer], normals[mesh.faces[triangle[nearer]]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    with np.errstate(divide="ignore"):
+        depth_mm = (1 / nearness).astype(np.float32)
+    return label.reshape(shape), depth_mm.reshape(shape), normal.reshape(rows, columns, 3)
+
+
+def _batches(triangles: NDArray[np.intp], count: NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """Split triangles so that no part enumerates many more than BATCH samples."""
+    total = np.cumsum(count[triangles])
+    return [part for part in np.split(triangles, np.flatnonzero(np.diff(total // BATCH)) + 1) if len(part)]

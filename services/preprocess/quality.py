@@ -1,0 +1,72 @@
+"""What the preparation did, in numbers and small pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from services.core.geometry import Record
+from services.core.records import MaskBit
+from services.preprocess.source import Image
+
+PICTURE_PX = 480
+# Blue, green, red: highlights red, saturated yellow, moved violet, not finite cyan, shadow blue, unlit grey, by hand green
+COLOURS = {
+    MaskBit.HIGHLIGHT: (60, 60, 230),
+    MaskBit.SATURATED: (60, 220, 230),
+    MaskBit.MOTION: (200, 60, 160),
+    MaskBit.NOT_FINITE: (220, 200, 60),
+    MaskBit.SHADOW: (200, 100, 40),
+    MaskBit.MANUAL: (80, 180, 80),
+}
+
+
+class ImageQuality(Record):
+    """One image."""
+
+    camera: str
+    light: str
+    motion_px: float | None = Field(description="median displacement removed; null where not measured")
+    tooth_pixels: int = Field(description="pixels whose whole footprint is tooth")
+    valid_pixels: int
+    masked: dict[str, float] = Field(description="mask bit -> fraction of the tooth pixels")
+
+
+class QualityReport(Record):
+    """``quality.json`` of a prepared store."""
+
+    images: tuple[ImageQuality, ...]
+
+
+def assess(camera: str, light: str, bits: NDArray[np.uint16], covered: NDArray[np.bool_], motion_px: float | None) -> ImageQuality:
+    """Count what was masked among the tooth's pixels."""
+    pixels = int(np.count_nonzero(covered))
+    masked = {bit.name.lower(): float(np.count_nonzero(bits[covered] & np.uint16(bit)) / max(pixels, 1)) for bit in MaskBit if bit.name is not None}
+    return ImageQuality(
+        camera=camera,
+        light=light,
+        motion_px=motion_px,
+        tooth_pixels=pixels,
+        valid_pixels=int(np.count_nonzero(bits == 0)),
+        masked={name: share for name, share in masked.items() if share > 0},
+    )
+
+
+def write_picture(path: Path, radiance: Image, bits: NDArray[np.uint16]) -> None:
+    """Write a PNG of the image, masked tooth pixels in colour and everything beside the teeth dimmed."""
+    import cv2
+
+    step = max(1, -(-max(bits.shape) // PICTURE_PX))
+    small, why = radiance[::step, ::step], bits[::step, ::step]
+    grey = small[..., ::-1] if small.shape[-1] == 3 else np.repeat(small.mean(axis=-1, keepdims=True), 3, axis=-1)
+    inside = why & np.uint16(MaskBit.OUTSIDE) == 0
+    peak = float(np.quantile(grey[inside], 0.99)) if inside.any() else 1.0
+    picture = 255 * np.clip(grey / max(peak, 1e-30), 0, 1) ** (1 / 2.2)
+    picture[~inside] *= 0.4
+    for bit, colour in COLOURS.items():
+        picture[inside & (why & np.uint16(bit) > 0)] = colour
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), picture.astype(np.uint8))

@@ -1,0 +1,97 @@
+"""A captured rig: counts become radiance, and every frame is brought to where the teeth were at first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.records import CaptureManifest, FrameRecord, MaskBit
+from services.core.store import reading
+from services.preprocess.motion import ViewMotion, jaws
+from services.preprocess.projection import Footprint
+from services.preprocess.radiometry import Merge, Radiometry
+from services.preprocess.source import Image, LightImage, require_consistent
+from services.preprocess.stabilise import warp
+
+# Below this, resampling would blur more than it aligns
+STILL_PX = 0.1
+# A frame whose interpolated motion is less certain than this is not used
+UNCERTAIN_PX = 0.5
+BLACK_FRAMES = 8
+
+Counts = Callable[[FrameRecord], NDArray[np.uint16]]
+
+
+class RigSource:
+    """Reads a published capture."""
+
+    held_out: tuple[tuple[str, str], ...] = ()
+    measures_motion = True
+
+    def __init__(self, root: Path, manifest: CaptureManifest) -> None:
+        """Check the frame table.
+
+        Raises:
+            CaptureInputError: no black frame, or a light without a frame.
+        """
+        self.root, self._manifest, self.description = root, manifest, manifest.description
+        require_consistent(self.description, f"Capture {root}")
+        self._black = [frame for frame in manifest.frames if frame.kind == "black"][:BLACK_FRAMES]
+        if not self._black:
+            raise CaptureInputError(f"Capture {root} has no black frame, so its zero is unknown; capture it again with at least one.")
+        self._frames: list[list[FrameRecord]] = []
+        for light in self.description.lights:
+            own = [frame for frame in manifest.frames if frame.kind == "light" and frame.light == light.name and frame.level > 0]
+            if not own:
+                raise CaptureInputError(f"Capture {root} has no lit frame of light {light.name}; capture that light again.")
+            self._frames.append(own)
+
+    def lights_of(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
+        """See ``Source``; every camera sees every light."""
+        return tuple(range(len(self._frames)))
+
+    def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
+        """See ``Source``: one frame at a time, its radiance and its variance."""
+        width, height = self.description.cameras[camera].size
+        with reading(self.root / "capture.zarr") as array:
+
+            def counts(frame: FrameRecord) -> NDArray[np.uint16]:
+                return np.asarray(array[camera, frame.index, :height, :width])
+
+            black = np.zeros((height, width, len(self.description.channels)), dtype=np.float32)
+            for frame in self._black:
+                black += counts(frame) / np.float32(len(self._black))
+            radiometry = Radiometry(black, len(self._black), self._manifest)
+
+            def brightness(frame: FrameRecord) -> Image:
+                return np.asarray(radiometry.radiance(counts(frame), frame)[0].mean(axis=-1), dtype=np.float32)
+
+            view = self.description.cameras[camera].name
+            motion = ViewMotion(footprint, jaws(sorted(self._manifest.fdi)), self._manifest.frames, brightness, view)
+            for light, frames in enumerate(self._frames):
+                yield light, _image(frames, radiometry, motion, counts)
+
+
+def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion, counts: Counts) -> LightImage:
+    merged = Merge(radiometry.black.shape)
+    moves = [motion.at(frame) for frame in frames]
+    warped = False
+    for frame, move in zip(frames, moves, strict=True):
+        radiance, variance, saturated = radiometry.radiance(counts(frame), frame)
+        if move.median_px > STILL_PX:
+            # Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right
+            field = motion.field(move)
+            radiance, variance, saturated = warp(radiance, field), warp(variance, field), warp(saturated, field) > 0
+            saturated |= (variance <= 0).any(axis=-1)
+            warped = True
+        merged.add(radiance, variance, saturated)
+    radiance, variance, lost = merged.result()
+    bits = np.where(lost, MaskBit.SATURATED, 0).astype(np.uint16)
+    if max(move.error_px for move in moves) > UNCERTAIN_PX:
+        bits |= np.uint16(MaskBit.MOTION)
+    farthest = max(moves, key=lambda move: move.median_px)
+    return LightImage(radiance, variance, bits, motion.stored(farthest), farthest.median_px, warped)

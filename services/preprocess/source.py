@@ -1,0 +1,89 @@
+"""What the preparation reads: one image per camera and light, from a folder or from a captured rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.records import FolderCapture
+from services.preprocess.projection import Footprint
+
+Image = NDArray[np.float32]
+Bits = NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class LightImage:
+    """One camera's view under one light.
+
+    Attributes:
+        radiance, variance: (H, W, C); where a value is not finite it is 0 and flagged.
+        bits: (H, W), what the source knows: saturated, moved, not finite.
+        displacement: (h, w, 2), pixels, every ``motion_step``-th; None where motion is not measured.
+        motion_px: median over the teeth; None where motion is not measured.
+        warped: whether the pixels were resampled.
+    """
+
+    radiance: Image
+    variance: Image
+    bits: Bits
+    displacement: Image | None = None
+    motion_px: float | None = None
+    warped: bool = False
+
+
+class Source(Protocol):
+    """A capture to prepare."""
+
+    @property
+    def root(self) -> Path:
+        """Folder that holds ``teeth/``."""
+
+    @property
+    def description(self) -> FolderCapture:
+        """Cameras, lights, channels."""
+
+    @property
+    def held_out(self) -> tuple[tuple[str, str], ...]:
+        """(camera, light) pairs that the source itself keeps from the fit."""
+
+    @property
+    def measures_motion(self) -> bool:
+        """Whether images carry a displacement."""
+
+    def lights_of(self, camera: int) -> tuple[int, ...]:
+        """Indices of the lights this camera has an image of."""
+
+    def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
+        """Light index and image, one at a time.
+
+        Raises:
+            CaptureInputError: names the file or frame, camera and light.
+        """
+
+
+def require_consistent(description: FolderCapture, origin: str) -> None:
+    """Refuse a description whose names or channels contradict each other.
+
+    Raises:
+        CaptureInputError: names the first contradiction.
+    """
+    for what, names in (("camera", [c.name for c in description.cameras]), ("light", [light.name for light in description.lights])):
+        if not names:
+            raise CaptureInputError(f"{origin} lists no {what}; add at least one.")
+        repeated = {name for name in names if names.count(name) > 1}
+        if repeated:
+            raise CaptureInputError(f"{origin} lists {what} {min(repeated)} twice; give each its own name.")
+    if not description.channels:
+        raise CaptureInputError(f"{origin} lists no channel; name each colour channel of the images.")
+    for light in description.lights:
+        if len(light.intensity) != len(description.channels):
+            raise CaptureInputError(
+                f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)} channels; give one per channel."
+            )

@@ -1,0 +1,221 @@
+"""How the subject moved between two frames of a camera, and the frame as if it had not.
+
+Only tooth pixels are kept, and teeth of one jaw are one rigid body of known shape. Its image moves by a smooth field: a shift, a
+linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment (Lucas & Kanade 1981, with the
+parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus parallax, 1996) finds those few
+coefficients from all pixels at once. Dense flow, which has two unknowns per pixel, follows shading and reflections instead of the
+tooth; README.md has the comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.preprocess.projection import Footprint
+
+Image = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+# 1, x, y, relief, x², xy, y²; the ridge is relative to the mean curvature of the cost
+TERMS = 7
+Feature = Literal["texture", "edges"]
+RIDGE: dict[Feature, tuple[float, ...]] = {
+    # Same light: contrast fixes every term, the ridge only tames those a flat or small region leaves open
+    "texture": (0, 1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2),
+    # Another light: edges of the lit side alone are left, so all but the shift is held
+    "edges": (0, 10, 10, 100, 100, 100, 100),
+}
+SOLVE_PIXELS = 1_500_000
+BAND_PX = 6
+
+
+class SurfaceFlow:
+    """Displacement fields that one rigid body can have in one camera's image.
+
+    Args:
+        footprint: what the camera sees at the reference time.
+        meshes: indices of the body's meshes in the footprint.
+    """
+
+    def __init__(self, footprint: Footprint, meshes: Sequence[int]) -> None:
+        import cv2
+
+        seen = np.isin(footprint.mesh, list(meshes))
+        self.seen = seen
+        if not seen.any():
+            return
+        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        self._centre_px = np.array([columns.mean(), rows.mean()])
+        self._scale_px = max(1.0, 0.5 * max(np.ptp(columns), np.ptp(rows)))
+        # Relief is depth in standard deviations, continued beyond the outline so that the outline itself can be matched
+        depth = np.where(seen, footprint.depth_mm, 0).astype(np.float32)
+        mean, spread = float(footprint.depth_mm[seen].mean()), max(float(footprint.depth_mm[seen].std()), 1e-6)
+        weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), BAND_PX)
+        beyond = cv2.GaussianBlur(depth, (0, 0), BAND_PX) / np.maximum(weight, 1e-6)
+        beyond = np.where(weight > 1e-3, beyond, mean)
+        self._relief = ((np.where(seen, depth, beyond) - mean) / spread).astype(np.float32)
+        self.extent_px = float(min(np.ptp(columns), np.ptp(rows)) + 1)
+
+    def terms(self, relief: Image, x_px: Image, y_px: Image) -> Image:
+        """Basis values (..., TERMS) at pixel indices."""
+        x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
+        return np.stack([np.ones_like(relief), x, y, relief, x * x, x * y, y * y], axis=-1).astype(np.float32)
+
+    def field(self, coefficients: FloatArray, rows: slice = slice(None), step: int = 1) -> Image:
+        """Displacement (rows, width, 2) in pixels from the reference to the frame, every ``step`` pixels."""
+        height, width = self._relief.shape
+        y, x = np.mgrid[0:height, 0:width][:, rows][:, ::step, ::step].astype(np.float32)
+        return np.asarray(self.terms(self._relief[rows][::step, ::step], x, y) @ coefficients.astype(np.float32), dtype=np.float32)
+
+    def reduced(self, factor: int) -> tuple[BoolArray, Image]:
+        """Region used for matching and basis (h, w, TERMS), both reduced by ``factor``."""
+        import cv2
+
+        height, width = self._relief.shape
+        size = (max(1, width // factor), max(1, height // factor))
+        relief = self._relief if factor == 1 else cv2.resize(self._relief, size, interpolation=cv2.INTER_AREA)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BAND_PX + 1, 2 * BAND_PX + 1))
+        seen = self.seen.astype(np.uint8)
+        region = cv2.dilate(seen if factor == 1 else cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST), disc) > 0
+        y, x = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float32)
+        return region, self.terms(relief, (x + 0.5) * (width / size[0]) - 0.5, (y + 0.5) * (height / size[1]) - 0.5)
+
+
+@dataclass(frozen=True)
+class _Level:
+    feature: Image
+    region: BoolArray
+    terms: Image
+    pixel_px: float
+
+
+class Aligner:
+    """Aligns frames of one camera to its reference frame, for one body.
+
+    Args:
+        flow: the body's possible displacements.
+        reference: (H, W) linear brightness of the reference frame.
+        feature: ``texture`` between frames under the same light, ``edges`` between different lights.
+    """
+
+    def __init__(self, flow: SurfaceFlow, reference: Image, feature: Feature) -> None:
+        self._feature: Feature = feature
+        self._factor = int(np.ceil(np.sqrt(reference.size / SOLVE_PIXELS)))
+        region, terms = flow.reduced(self._factor)
+        self._levels = []
+        for number, image in enumerate(_pyramid(reference, self._factor, feature)):
+            if number:
+                region, terms = _halve(region.astype(np.float32)) > 0.5, np.stack([_halve(terms[..., k]) for k in range(TERMS)], axis=-1)
+            self._levels.append(_Level(image, region, terms, float(self._factor * 2**number)))
+
+    def solve(self, frame: Image, iterations: int = 30) -> FloatArray:
+        """Coefficients (TERMS, 2) of the displacement from the reference to the frame, coarse to fine."""
+        import cv2
+
+        coefficients = np.zeros((TERMS, 2))
+        ridge = np.tile(RIDGE[self._feature], 2)
+        for level, moving in reversed(list(zip(self._levels, _pyramid(frame, self._factor, self._feature), strict=True))):
+            y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
+            basis = level.terms[level.region] / level.pixel_px
+            fixed_x, fixed_y = _gradient(level.feature)
+            for _ in range(iterations):
+                # Sample the frame where the reference pixel has gone; the gradient is the mean of both images'
+                shift = level.terms @ coefficients.astype(np.float32) / level.pixel_px
+                warped = cv2.remap(moving, x + shift[..., 0], y + shift[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                moved_x, moved_y = _gradient(warped)
+                slope = 0.5 * np.stack([fixed_x + moved_x, fixed_y + moved_y], axis=-1)[level.region]
+                residual = (warped - level.feature)[level.region]
+                # Geman-McClure weights at one robust standard deviation: reflections and lips do not vote
+                scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+                weight = 1 / (1 + (residual / scale) ** 2) ** 2
+                jacobian = np.concatenate([slope[:, :1] * basis, slope[:, 1:] * basis], axis=1).astype(np.float64)
+                hessian = (jacobian * weight[:, None]).T @ jacobian
+                damping = ridge * np.trace(hessian) / (2 * TERMS) + 1e-12
+                gradient = (jacobian * weight[:, None]).T @ residual + damping * coefficients.T.ravel()
+                update = -np.linalg.solve(hessian + np.diag(damping), gradient).reshape(2, TERMS).T
+                coefficients = coefficients + update
+                if np.abs(update).max() < 2e-3 * level.pixel_px:
+                    break
+        return coefficients
+
+
+def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+    """Values at ``time`` by the cubic through the four nearest knots, and an error estimate.
+
+    The estimate is the difference to the parabola through the three nearest, which bounds the cubic's error where motion is smooth; with
+    fewer than three knots it is zero, since nothing is known.
+
+    Args:
+        times: (K,) distinct. values: (K, ...).
+    """
+    nearest = np.argsort(np.abs(times - time), kind="stable")[:4]
+    full = _lagrange(times[nearest], values[nearest], time)
+    if len(nearest) < 3:
+        return full, np.zeros_like(full)
+    return full, np.abs(full - _lagrange(times[nearest[:-1]], values[nearest[:-1]], time))
+
+
+def _lagrange(times: FloatArray, values: FloatArray, time: float) -> FloatArray:
+    total = np.zeros_like(values[0])
+    for k, knot in enumerate(times):
+        others = np.delete(times, k)
+        total = total + values[k] * np.prod((time - others) / (knot - others))
+    return total
+
+
+def warp(image: NDArray[np.generic], displacement: Image) -> Image:
+    """Sample an image (H, W) or (H, W, C) at each pixel plus its displacement, linearly; zero beyond the border."""
+    import cv2
+
+    height, width = displacement.shape[:2]
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    x += displacement[..., 0]
+    y += displacement[..., 1]
+    return np.asarray(cv2.remap(np.asarray(image, dtype=np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)).reshape(image.shape)
+
+
+def _features(image: Image, feature: Feature) -> Image:
+    """What of an image survives the change of light between the frames compared.
+
+    ``texture``: local mean and contrast removed, so that slow shading counts little and outlines and stains count alike.
+    ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the size of an edge matters.
+    """
+    import cv2
+
+    peak = float(image.max()) or 1.0
+    if feature == "edges":
+        slope = np.hypot(*_gradient(cv2.GaussianBlur(image, (0, 0), 1)))
+        return np.asarray(slope / (cv2.GaussianBlur(slope, (0, 0), 3) + 2.5e-4 * peak), dtype=np.float32)
+    detail = image - cv2.GaussianBlur(image, (0, 0), 2)
+    contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2) + (0.02 * peak) ** 2)
+    return np.asarray(detail / contrast, dtype=np.float32)
+
+
+def _pyramid(image: Image, factor: int, feature: Feature) -> list[Image]:
+    """Features of the image reduced by ``factor``, then halved while their shorter side has 40 pixels."""
+    import cv2
+
+    if factor > 1:
+        image = cv2.resize(image, (max(1, image.shape[1] // factor), max(1, image.shape[0] // factor)), interpolation=cv2.INTER_AREA)
+    levels = [_features(np.asarray(image, dtype=np.float32), feature)]
+    while min(levels[-1].shape) >= 40:
+        levels.append(_halve(levels[-1]))
+    return levels
+
+
+def _halve(image: Image) -> Image:
+    import cv2
+
+    return np.asarray(cv2.pyrDown(np.ascontiguousarray(image)), dtype=np.float32)
+
+
+def _gradient(image: Image) -> tuple[Image, Image]:
+    import cv2
+
+    return cv2.Scharr(image, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(image, cv2.CV_32F, 0, 1) / 32

@@ -1,0 +1,160 @@
+"""The prepare stage: a capture in, the published ``prepared`` store out."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from services.core.errors import CaptureInputError, SettingsError
+from services.core.geometry import teeth_folder
+from services.core.meshfiles import read_mesh, read_teeth
+from services.core.records import CaptureManifest, JobSpec, MaskBit, PreparedManifest
+from services.core.stage import StageContext, StageEvent
+from services.core.store import MANIFEST, StageWriter, create_array, open_stage, write_record
+
+if TYPE_CHECKING:
+    from services.preprocess.source import Source
+
+
+def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
+    """Prepare ``spec.capture``, or the job's own published capture, and publish ``prepared``.
+
+    Streams: one frame with its radiance and variance is held, whatever the capture's size.
+
+    Raises:
+        CaptureInputError: a file, frame, camera or light is missing or malformed. MeshError: a surface cannot bound a medium.
+        SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged. JobCancelledError.
+    """
+    import numpy as np
+
+    from services.preprocess.motion import stored_step
+    from services.preprocess.projection import project
+    from services.preprocess.quality import QualityReport, assess, write_picture
+    from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
+
+    # Check everything that needs no pixel
+    source = _open_source(spec, context.root)
+    cameras, lights, channels = source.description.cameras, source.description.lights, source.description.channels
+    held_out = _held_out(spec, source)
+    if unknown := set(spec.channels or ()) - set(channels):
+        raise SettingsError(f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it.")
+    teeth = read_teeth(source.root)
+    gums = [read_mesh(source.root / "gums.ply")] if (source.root / "gums.ply").exists() else []
+    require_plausible_scale(cameras, lights, teeth)
+
+    writer = StageWriter(context.root, "prepared", context.attempt)
+    shutil.rmtree(writer.folder)
+    writer.folder.mkdir()
+    images_in_all = sum(len(source.lights_of(k)) for k in range(len(cameras)))
+    context.report(StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras."))
+
+    # One chunk per image, so that each is written once
+    height, width = max(c.size[1] for c in cameras), max(c.size[0] for c in cameras)
+    planes, stack = (len(cameras), len(lights), height, width), ("camera", "light", "y", "x")
+    store = writer.folder / "prepared.zarr"
+    radiance, variance = (
+        create_array(store, name, (*planes, len(channels)), (1, 1, height, width, len(channels)), "float32", (*stack, "channel"))
+        for name in ("radiance", "variance")
+    )
+    valid = create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
+    motion = None
+    if source.measures_motion:
+        step = stored_step((height, width))
+        grid = (-(-height // step), -(-width // step))
+        motion = create_array(store, "motion", (len(cameras), len(lights), *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
+        motion.attrs["step_px"] = step
+
+    reports, done = [], 0
+    for k, camera in enumerate(cameras):
+        context.raise_if_cancelled()
+        w, h = camera.size
+        footprint = project(camera, [tooth.outer for tooth in teeth], gums)
+        require_seen(footprint, camera)
+        for j in set(range(len(lights))) - set(source.lights_of(k)):
+            valid[k, j] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
+        for j, image in source.images(k, footprint):
+            context.raise_if_cancelled()
+            bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
+            bits[:h, :w] = valid_bits(image, footprint, camera, lights[j])
+            radiance[k, j, :h, :w], variance[k, j, :h, :w], valid[k, j] = image.radiance, image.variance, bits
+            if motion is not None and image.displacement is not None:
+                motion[k, j, : image.displacement.shape[0], : image.displacement.shape[1]] = image.displacement
+            quality = assess(camera.name, lights[j].name, bits[:h, :w], footprint.covered, image.motion_px)
+            reports.append(quality)
+            write_picture(writer.folder / "quality" / f"{camera.name}_{lights[j].name}.png", image.radiance, bits[:h, :w])
+            done += 1
+            context.report(
+                StageEvent(
+                    stage="prepare",
+                    kind="progress",
+                    message=f"Camera {camera.name}, light {lights[j].name}: {quality.valid_pixels} valid pixels.",
+                    done=done / images_in_all,
+                    data=quality.model_dump(),
+                )
+            )
+            if quality.valid_pixels == 0:
+                reasons = ", ".join(f"{name} {share:.0%}" for name, share in sorted(quality.masked.items(), key=lambda item: -item[1]))
+                context.report(
+                    StageEvent(stage="prepare", kind="log", message=f"Camera {camera.name}, light {lights[j].name} has no valid pixel left ({reasons}).")
+                )
+
+    valid_pixels = sum(report.valid_pixels for report in reports)
+    if valid_pixels == 0:
+        raise CaptureInputError(f"No image of {source.root} has a valid tooth pixel; look at its exposure, noise and masks.")
+    write_record(writer.folder / "quality.json", QualityReport(images=tuple(reports)))
+    fdi = tuple(tooth.fdi for tooth in teeth)
+    _copy_meshes(source.root, writer.folder, fdi)
+    motions = [report.motion_px for report in reports if report.motion_px is not None]
+    manifest = PreparedManifest(
+        channels=channels,
+        cameras=cameras,
+        lights=lights,
+        held_out=held_out,
+        fdi=fdi,
+        dentin_known=tuple(tooth.fdi for tooth in teeth if tooth.dentin is not None),
+        median_motion_px=float(np.median(motions)) if motions else None,
+        valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
+    )
+    writer.publish(manifest)
+    context.report(StageEvent(stage="prepare", kind="finished", message=f"{valid_pixels} valid pixels in {done} images.", done=1.0))
+    return manifest
+
+
+def _open_source(spec: JobSpec, root: Path) -> Source:
+    """The folder or store that ``spec.capture`` names, or else the job's published capture."""
+    from services.preprocess.folder import FolderSource
+    from services.preprocess.rig import RigSource
+
+    job, stage = root, "capture"
+    if spec.capture is not None:
+        if (spec.capture / "capture.json").is_file() or not spec.capture.is_dir():
+            return FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)
+        if (spec.capture / MANIFEST).is_file():
+            job, stage = spec.capture.parent, spec.capture.name
+        elif (spec.capture / "capture" / MANIFEST).is_file():
+            job = spec.capture
+        else:
+            raise CaptureInputError(f"{spec.capture} holds neither capture.json nor a published capture; check option 'capture'.")
+    return RigSource(*open_stage(job, stage, CaptureManifest))
+
+
+def _held_out(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...]:
+    """(camera, light) pairs kept from the fit: as the job says, else as the capture marks, else every fourth light."""
+    names = [light.name for light in source.description.lights]
+    if spec.held_out_lights is None and source.held_out:
+        return source.held_out
+    chosen = spec.held_out_lights if spec.held_out_lights is not None else tuple(names[3::4])
+    if unknown := [name for name in chosen if name not in names]:
+        raise SettingsError(f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it.")
+    if set(chosen) == set(names):
+        raise SettingsError("Option 'held_out_lights' keeps every light from the fit; leave at least one to it.")
+    return tuple((camera.name, names[j]) for k, camera in enumerate(source.description.cameras) for j in source.lights_of(k) if names[j] in chosen)
+
+
+def _copy_meshes(source: Path, target: Path, fdi: tuple[int, ...]) -> None:
+    wanted = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
+    for relative in [*wanted, Path("gums.ply"), Path("cavity.ply")]:
+        if (source / relative).is_file():
+            (target / relative).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / relative, target / relative)

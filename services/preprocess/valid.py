@@ -1,0 +1,71 @@
+"""Which pixels the fit may use, and why not the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera, Light, Tooth
+from services.core.records import MaskBit
+from services.preprocess.highlights import half_angles, highlight_mask
+from services.preprocess.projection import Footprint
+from services.preprocess.source import LightImage
+
+
+def valid_bits(image: LightImage, footprint: Footprint, camera: Camera, light: Light) -> NDArray[np.uint16]:
+    """Mask bits (H, W); 0 is a pixel to fit.
+
+    Shading is no reason to mask: a tooth glows where its surface turns from the light. OUTSIDE keeps pixels whose whole footprint is
+    tooth, and one pixel less along the outline where the image was resampled, which mixes it with its surroundings.
+    """
+    import cv2
+
+    inside = footprint.covered
+    if image.warped:
+        inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    bits = image.bits | np.where(inside, 0, MaskBit.OUTSIDE).astype(np.uint16)
+    usable = footprint.covered & (image.bits & ~np.uint16(MaskBit.MOTION) == 0)
+    highlight = highlight_mask(image.radiance, image.variance, usable, half_angles(camera, light, footprint), footprint.normal, light.intensity)
+    return np.asarray(bits | np.where(highlight, MaskBit.HIGHLIGHT, 0).astype(np.uint16), dtype=np.uint16)
+
+
+def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ...], teeth: tuple[Tooth, ...]) -> None:
+    """Refuse poses whose unit is not the meshes' millimetre: someone stands inside the teeth, or sees them as a point.
+
+    Raises:
+        CaptureInputError: names the camera or light.
+    """
+    vertices = np.concatenate([tooth.outer.vertices_mm for tooth in teeth])
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
+    for camera in cameras:
+        pose = np.asarray(camera.camera_from_world)
+        distance = float(np.linalg.norm(pose[:3, :3] @ centre + pose[:3, 3]))
+        if distance <= radius:
+            raise CaptureInputError(
+                f"Camera {camera.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm radius; "
+                "its pose must be in millimetres like the meshes."
+            )
+        size_px = 2 * radius / distance * camera.K[0][0]
+        if size_px < 4:
+            raise CaptureInputError(
+                f"The teeth span {size_px:.2g} px in camera {camera.name}, {distance:.3g} mm away; its pose must be in millimetres like the meshes."
+            )
+    for light in lights:
+        distance = float(np.linalg.norm(np.asarray(light.position_mm) - centre))
+        if distance <= radius:
+            raise CaptureInputError(
+                f"Light {light.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm radius; "
+                "its position must be in millimetres like the meshes."
+            )
+
+
+def require_seen(footprint: Footprint, camera: Camera) -> None:
+    """Refuse a camera that sees no tooth.
+
+    Raises:
+        CaptureInputError: names the camera.
+    """
+    if not footprint.covered.any():
+        raise CaptureInputError(f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are in millimetres.")
