@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.core.errors import RigError, SettingsError
+from services.core.errors import CaptureInputError, RigError, SettingsError
 from services.core.records import CaptureManifest, FolderCapture, JobSpec, RigSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, read_record
@@ -40,7 +40,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     if spec.rig is None:
         raise SettingsError("The capture stage needs option [rig]; add it, or give 'capture' and start from the prepare stage.")
     rig = spec.rig
-    description = read_record(rig.mouth / "capture.json", FolderCapture)
+    description = _read_description(rig.mouth / "capture.json")
     names = tuple(light.name for light in description.lights)
     plan = plan_capture(rig, len(names))
     teeth = read_teeth(rig.mouth)
@@ -80,6 +80,18 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     store.remove_leftovers()
     context.report(StageEvent(stage="capture", kind="finished", message=f"{len(manifest.frames)} frames captured.", done=1.0))
     return manifest
+
+
+def _read_description(path: Path) -> FolderCapture:
+    description = read_record(path, FolderCapture)
+    parts = {"camera": [c.name for c in description.cameras], "light": [light.name for light in description.lights], "channel": list(description.channels)}
+    for part, names in parts.items():
+        if not names:
+            raise CaptureInputError(f"{path} lists no {part}; describe the rig in it.")
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise CaptureInputError(f"{path} lists {part} '{twice}' twice; give each its own name.")
+    return description
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from services.capture.dome import Dome, ExposureBudget
-from services.capture.dome_modbus import DomeObserver, ModbusDome
+from services.capture.dome_modbus import HANG_MARGIN_S, DomeObserver, ModbusDome
 from services.capture.registers import FULL_SCALE
 from services.capture.simulator import simulated_dome
 from services.core.errors import ExposureLimitError, RigError
@@ -82,6 +82,13 @@ class DomeContract:
 
         with pytest.raises(problem):
             interrupted()
+        assert not observer.outputs().any()
+
+    def test_a_hung_caller_does_not_leave_a_light_on(self, dome: Dome, observer: DomeObserver) -> None:
+        asked_s = time.monotonic()
+        dome.light(3, LEVEL, ON_S)
+        assert observer.outputs().any()
+        time.sleep(max(0.0, asked_s + ON_S + HANG_MARGIN_S + 0.1 - time.monotonic()))
         assert not observer.outputs().any()
 
     def test_stays_lit_longer_than_the_watchdog_while_the_driver_lives(self, make: type[Dome], observer: DomeObserver) -> None:

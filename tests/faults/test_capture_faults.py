@@ -14,7 +14,7 @@ from services.capture import registers as reg
 from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import DomeObserver, ModbusDome
 from services.capture.registers import FaultKind
-from services.capture.simulator import order_fault, simulated_dome
+from services.capture.simulator import order_fault, serve_dome, simulated_dome
 from services.core.errors import InterlockError, ReadbackError, RigError
 
 WATCHDOG_S = 1.0
@@ -160,6 +160,16 @@ def test_a_dome_that_falls_silent_is_reported_as_not_confirmed_dark(address: Add
     gave_up_s = time.monotonic()
     order_fault(*address, FaultKind.NONE)
     require_dark_within_watchdog(observer, gave_up_s)
+
+
+def test_a_taken_port_is_an_error_that_names_it(address: Address) -> None:
+    with pytest.raises(RigError, match=f"cannot listen on {address[0]}:{address[1]}"):
+        serve_dome(*address, lights=4, watchdog_s=1.0)
+
+
+def test_a_dome_larger_than_the_register_map_is_refused() -> None:
+    with pytest.raises(RigError, match="156 lights"):
+        serve_dome("127.0.0.1", 0, lights=156, watchdog_s=1.0)
 
 
 SIGNALLED = """
