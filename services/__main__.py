@@ -52,7 +52,7 @@ def build_app() -> typer.Typer:
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
-    for command in (serve, dome_sim, capture, run, submit, watch, cancel, export, phantom, bench):
+    for command in (serve, dome_sim, capture, run, submit, watch, cancel, retry, export, phantom, bench):
         app.command()(command)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
@@ -129,9 +129,10 @@ def _run_one(stage: Any, spec: Any, out: Path, *, again: bool) -> None:
 @contextmanager
 def cancelling_on_signals(out: Path) -> Iterator[None]:
     """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
-    from services.api.pipeline import request_cancel
+    from services.api.pipeline import request_cancel, withdraw_cancel
 
     asked = False
+    withdraw_cancel(out)
 
     def ask(_signal: int, _frame: FrameType | None) -> None:
         nonlocal asked
@@ -226,16 +227,22 @@ def submit(
             _watch(client, created["id"])
 
 
-def watch(job_id: Annotated[str, typer.Argument(metavar="ID", help="Number that submit printed.")], server: Server = None, as_json: Json = False) -> None:
+def watch(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None, as_json: Json = False) -> None:
     """Watch a job until it ends; the exit status is the job's."""
     with _client(server) as client:
         _watch(client, job_id, as_json=as_json)
 
 
-def cancel(job_id: Annotated[str, typer.Argument(metavar="ID", help="Number that submit printed.")], server: Server = None) -> None:
+def cancel(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None) -> None:
     """Cancel a job; the lights go off first and what is published is kept."""
     with _client(server) as client:
         print(client.cancel(job_id)["state"])
+
+
+def retry(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None) -> None:
+    """Queue a failed or cancelled job again; it resumes from what it had published."""
+    with _client(server) as client:
+        print(client.retry(job_id)["state"])
 
 
 def _client(server: str | None) -> Any:
@@ -255,7 +262,7 @@ def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
     job = client.get(job_id)
     print(json.dumps(job) if as_json else job["state"])
     if job["state"] == "CANCELLED":
-        raise JobCancelledError(f"Job {job_id} was cancelled; submit it again to resume from what it had published.")
+        raise JobCancelledError(f"Job {job_id} was cancelled; dentine retry {job_id} resumes it.")
     if failure := job["failure"]:
         print(f"dentine: {failure['message']}", file=sys.stderr)
         raise typer.Exit(failure["exit_status"])

@@ -135,7 +135,25 @@ class EventLog:
         """The job's events with an id above ``after``, oldest first."""
         query = sql.select(event_table).where(event_table.c.job == self.job, event_table.c.id > after).order_by(event_table.c.id).limit(limit)
         with self._engine.connect() as connection:
-            return [JobEvent(**{**row, "data": json.loads(row["data"])}) for row in connection.execute(query).mappings()]
+            return [_event(row) for row in connection.execute(query).mappings()]
+
+    def latest(self) -> list[JobEvent]:
+        """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""
+        of_stage = (
+            sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == self.job, event_table.c.stage.is_not(None)).group_by(event_table.c.stage)
+        )
+        earlier = event_table.alias()
+        last_done = (
+            sql.select(earlier.c.done)
+            .where(earlier.c.job == event_table.c.job, earlier.c.stage == event_table.c.stage, earlier.c.attempt == event_table.c.attempt)
+            .where(earlier.c.done.is_not(None))
+            .order_by(earlier.c.id.desc())
+            .limit(1)
+            .scalar_subquery()
+        )
+        query = sql.select(event_table, last_done.label("last_done")).where(event_table.c.id.in_(of_stage)).order_by(event_table.c.id)
+        with self._engine.connect() as connection:
+            return [_event(row, done=row["last_done"]) for row in connection.execute(query).mappings()]
 
     def newest_id(self) -> int:
         """Id of the job's last event, 0 before the first."""
@@ -145,3 +163,7 @@ class EventLog:
     def _newest_attempt(self, connection: sql.Connection, stage: StageName) -> int:
         query = sql.select(sql.func.max(event_table.c.attempt)).where(event_table.c.job == self.job, event_table.c.stage == stage)
         return connection.scalar(query) or 0
+
+
+def _event(row: Any, **changes: Any) -> JobEvent:
+    return JobEvent(**{name: row[name] for name in JobEvent.model_fields} | {"data": json.loads(row["data"])} | changes)

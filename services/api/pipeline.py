@@ -98,7 +98,6 @@ def run_stages(
     root = root.resolve()
     with _sole_owner(root):
         _claim_folder(root, spec)
-        (root / CANCEL_FLAG).unlink(missing_ok=True)
         address = events or EventAddress(root / EVENTS_FILE, "local")
         todo = tuple(stage for stage in stages if again or not is_published(root, _PUBLISHED_AS[stage]))
         with address.open() as log:
@@ -112,6 +111,11 @@ def run_stages(
 def request_cancel(root: Path) -> None:
     """Ask whoever runs the job in this folder to stop between two frames or steps."""
     (root / CANCEL_FLAG).touch()
+
+
+def withdraw_cancel(root: Path) -> None:
+    """Forget an earlier cancel request; call before a job is started again."""
+    (root / CANCEL_FLAG).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,9 @@
     ├── InputError            bad input: names the thing and the remedy
     │   ├── SettingsError     unknown option, wrong type, impossible combination
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
-    │   └── CaptureInputError a frame or file is missing or malformed
+    │   ├── CaptureInputError a frame or file is missing or malformed
+    │   ├── UnknownJobError   no such job or artifact
+    │   └── JobStateError     the job's state does not allow what was asked
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
     │   ├── CorruptStoreError a shard is missing, truncated or altered
@@ -64,6 +66,18 @@ class CaptureInputError(InputError):
     """A capture lacks a frame or holds one that cannot be read."""
 
     code = "bad-capture"
+
+
+class UnknownJobError(InputError):
+    """There is no such job, or it has no such artifact."""
+
+    code = "job-unknown"
+
+
+class JobStateError(InputError):
+    """The job's state, or an earlier submission, does not allow what was asked."""
+
+    code = "job-state"
 
 
 class StoreError(DentineError):

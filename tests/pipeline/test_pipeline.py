@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from services.api.events import EVENTS_FILE, EventAddress, JobEvent
-from services.api.pipeline import request_cancel, run_job, stages_of
+from services.api.pipeline import request_cancel, run_job, stages_of, withdraw_cancel
 from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, WorkerLostError
 from services.core.records import JobSpec, RigSpec
 from services.core.stage import StageEvent
@@ -83,6 +83,7 @@ def test_cancel_frees_workers_that_do_not_listen(tmp_path: Path, monkeypatch: py
     with pytest.raises(JobCancelledError):
         run(FOLDER, tmp_path, lambda event: request_cancel(tmp_path) if event.stage == "fit" else None)
     (tmp_path / "deaf-fit").unlink()
+    withdraw_cancel(tmp_path)
     assert ran(run(FOLDER, tmp_path)) == [("fit", 2), ("export", 1)]
 
 

@@ -1,0 +1,103 @@
+"""A typed client of the REST API, as the command line uses it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Self
+
+from services.api.events import JobEvent
+from services.core.errors import DentineError, InputError, JobStateError, PlatformError, UnknownJobError
+from services.core.records import JobSpec
+
+RECONNECT_S = 1.0
+RECONNECT_TRIES = 30
+
+
+class Client:
+    """Speaks to one server; a context manager."""
+
+    def __init__(self, server: str) -> None:
+        try:
+            import httpx
+        except ModuleNotFoundError as problem:
+            raise PlatformError("The client's packages are not installed; install dentine[api].") from problem
+        self._server = server
+        self._http = httpx.Client(base_url=f"{server.rstrip('/')}/v1", timeout=httpx.Timeout(10.0, read=60.0), trust_env=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+        self._http.close()
+
+    def submit(self, spec: JobSpec, key: str | None = None) -> dict[str, Any]:
+        """Submit a job; the same key and options give the same job."""
+        headers = {"Idempotency-Key": key} if key is not None else {}
+        return self._ask("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True), headers=headers)
+
+    def get(self, job_id: str) -> dict[str, Any]:
+        """One job with its stages."""
+        return self._ask("GET", f"/jobs/{job_id}")
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Ask a job to stop."""
+        return self._ask("POST", f"/jobs/{job_id}/cancel")
+
+    def retry(self, job_id: str) -> dict[str, Any]:
+        """Queue a failed or cancelled job again."""
+        return self._ask("POST", f"/jobs/{job_id}/retry")
+
+    def events(self, job_id: str, after: int = 0) -> Iterator[JobEvent]:
+        """A job's events until it ends; survives a restart of the server without loss or repetition."""
+        import httpx
+
+        tries = 0
+        while True:
+            try:
+                for event in self._stream(job_id, after):
+                    if event is None:
+                        return
+                    after, tries = event.id, 0
+                    yield event
+            except httpx.TransportError as problem:
+                tries += 1
+                if tries > RECONNECT_TRIES:
+                    raise PlatformError(f"Server {self._server} no longer answers; start it again, the job is kept.") from problem
+            time.sleep(RECONNECT_S)
+
+    def _stream(self, job_id: str, after: int) -> Iterator[JobEvent | None]:
+        """Events of one connection; None when the job has ended."""
+        with self._http.stream("GET", f"/jobs/{job_id}/events", headers={"Last-Event-ID": str(after)}) as response:
+            if response.is_error:
+                response.read()
+                raise _error(response)
+            is_end = False
+            for line in response.iter_lines():
+                field, _, value = line.partition(": ")
+                if field == "event":
+                    is_end = value == "end"
+                elif field == "data":
+                    yield None if is_end else JobEvent.model_validate_json(value)
+
+    def _ask(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+        import httpx
+
+        try:
+            response = self._http.request(method, path, **options)
+        except httpx.HTTPError as problem:
+            raise PlatformError(f"Server {self._server} does not answer ({problem}); start it with dentine serve or give --server.") from problem
+        if response.is_error:
+            raise _error(response)
+        answer: dict[str, Any] = response.json()
+        return answer
+
+
+def _error(response: Any) -> DentineError:
+    """The error that a problem document tells of."""
+    try:
+        detail = str(response.json()["detail"])
+    except (ValueError, KeyError):
+        detail = f"The server answered {response.status_code}; is it a dentine server?"
+    return {404: UnknownJobError, 409: JobStateError, 422: InputError}.get(response.status_code, DentineError)(detail)

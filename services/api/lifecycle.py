@@ -1,0 +1,110 @@
+"""A job's life as a pure state machine: (state, trigger) -> (state, instruction). No I/O; the repository persists, the runner obeys.
+
+==========  =====================  ==================  ==================  =====================  =================
+state       cancel                 start               succeed             fail                   lose
+==========  =====================  ==================  ==================  =====================  =================
+SUBMITTED   CANCELLED              -                   -                   FAILED                 QUEUED, launch
+QUEUED      CANCELLED              RUNNING             -                   FAILED                 QUEUED, launch
+RUNNING     CANCELLING, stop       -                   SUCCEEDED           FAILED                 QUEUED, launch
+CANCELLING  CANCELLING             -                   SUCCEEDED           FAILED                 CANCELLED
+==========  =====================  ==================  ==================  =====================  =================
+
+Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch.
+``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from what it had
+published. A job that ends before it notices a cancel has succeeded: the state tells what happened, not what was wished.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+
+from services.core.errors import JobStateError
+
+
+class JobState(StrEnum):
+    """Where a job is in its life."""
+
+    SUBMITTED = "SUBMITTED"
+    QUEUED = "QUEUED"
+    RUNNING = "RUNNING"
+    CANCELLING = "CANCELLING"
+    CANCELLED = "CANCELLED"
+    SUCCEEDED = "SUCCEEDED"
+    FAILED = "FAILED"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether nothing will happen to the job by itself."""
+        return self in {JobState.CANCELLED, JobState.SUCCEEDED, JobState.FAILED}
+
+
+class Trigger(StrEnum):
+    """What can happen to a job."""
+
+    QUEUE = "queue"
+    START = "start"
+    CANCEL = "cancel"
+    STOPPED = "stopped"
+    SUCCEED = "succeed"
+    FAIL = "fail"
+    LOSE = "lose"
+    RETRY = "retry"
+
+
+class Instruction(StrEnum):
+    """What whoever applied the transition must now do."""
+
+    NOTHING = "nothing"
+    LAUNCH = "launch"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The state reached and what to do about it."""
+
+    state: JobState
+    instruction: Instruction = Instruction.NOTHING
+
+
+_QUEUED = Transition(JobState.QUEUED, Instruction.LAUNCH)
+
+TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
+    {
+        (JobState.SUBMITTED, Trigger.QUEUE): _QUEUED,
+        (JobState.SUBMITTED, Trigger.CANCEL): Transition(JobState.CANCELLED),
+        (JobState.SUBMITTED, Trigger.FAIL): Transition(JobState.FAILED),
+        (JobState.SUBMITTED, Trigger.LOSE): _QUEUED,
+        (JobState.QUEUED, Trigger.START): Transition(JobState.RUNNING),
+        (JobState.QUEUED, Trigger.CANCEL): Transition(JobState.CANCELLED),
+        (JobState.QUEUED, Trigger.FAIL): Transition(JobState.FAILED),
+        (JobState.QUEUED, Trigger.LOSE): _QUEUED,
+        (JobState.RUNNING, Trigger.CANCEL): Transition(JobState.CANCELLING, Instruction.STOP),
+        (JobState.RUNNING, Trigger.SUCCEED): Transition(JobState.SUCCEEDED),
+        (JobState.RUNNING, Trigger.FAIL): Transition(JobState.FAILED),
+        (JobState.RUNNING, Trigger.LOSE): _QUEUED,
+        (JobState.CANCELLING, Trigger.CANCEL): Transition(JobState.CANCELLING),
+        (JobState.CANCELLING, Trigger.STOPPED): Transition(JobState.CANCELLED),
+        (JobState.CANCELLING, Trigger.SUCCEED): Transition(JobState.SUCCEEDED),
+        (JobState.CANCELLING, Trigger.FAIL): Transition(JobState.FAILED),
+        (JobState.CANCELLING, Trigger.LOSE): Transition(JobState.CANCELLED),
+        (JobState.FAILED, Trigger.RETRY): _QUEUED,
+        (JobState.CANCELLED, Trigger.RETRY): _QUEUED,
+    }
+)
+
+
+def apply(state: JobState, trigger: Trigger) -> Transition:
+    """The transition that a trigger causes.
+
+    Raises:
+        JobStateError: the state does not know the trigger.
+    """
+    try:
+        return TABLE[state, trigger]
+    except KeyError:
+        allowed = ", ".join(sorted(known for at, known in TABLE if at is state)) or "nothing"
+        raise JobStateError(f"A job that is {state} does not take '{trigger}'; it takes {allowed}.") from None

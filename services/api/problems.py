@@ -1,0 +1,85 @@
+"""Errors as RFC 9457 problem documents; ``code`` is the DentineError's own."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Self
+
+from pydantic import Field
+
+from services.core.errors import DentineError, InputError, JobStateError, PlatformError, UnknownJobError
+from services.core.geometry import Record
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+    from fastapi import FastAPI, Request, Response
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(Record):
+    """A problem document."""
+
+    type: str = Field(description="urn:dentine:problem:<code>")
+    title: str
+    status: int
+    detail: str = Field(description="one sentence that names the thing and the remedy")
+    instance: str = Field(description="path of the request")
+    code: str = Field(description="stable and machine-readable")
+
+    @classmethod
+    def of(cls, status: HTTPStatus, code: str, detail: str, instance: str) -> Self:
+        """The document for a status and one of our codes."""
+        return cls(type=f"urn:dentine:problem:{code}", title=status.phrase, status=status, detail=detail, instance=instance, code=code)
+
+
+_STATUS = {
+    UnknownJobError: HTTPStatus.NOT_FOUND,
+    JobStateError: HTTPStatus.CONFLICT,
+    InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    PlatformError: HTTPStatus.SERVICE_UNAVAILABLE,
+    DentineError: HTTPStatus.INTERNAL_SERVER_ERROR,
+}
+
+
+def status_of(problem: DentineError) -> HTTPStatus:
+    """The HTTP status that an error means."""
+    return next(status for kind, status in _STATUS.items() if isinstance(problem, kind))
+
+
+def install(app: FastAPI) -> None:
+    """Answer every error of the application with a problem document."""
+    from fastapi.exceptions import RequestValidationError
+    from fastapi.responses import Response
+    from starlette.exceptions import HTTPException
+
+    def answer(request: Request, status: HTTPStatus, code: str, detail: str, headers: Any = None) -> Response:
+        return Response(Problem.of(status, code, detail, request.url.path).model_dump_json(), status, headers, MEDIA_TYPE)
+
+    @app.exception_handler(DentineError)
+    def _dentine(request: Request, problem: DentineError) -> Response:
+        return answer(request, status_of(problem), problem.code, problem.message)
+
+    @app.exception_handler(RequestValidationError)
+    def _request(request: Request, problem: RequestValidationError) -> Response:
+        return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", _sentence(problem.errors()))
+
+    @app.exception_handler(HTTPException)
+    def _http(request: Request, problem: HTTPException) -> Response:
+        status = HTTPStatus(problem.status_code)
+        return answer(request, status, status.phrase.lower().replace(" ", "-"), f"{problem.detail}.", problem.headers)
+
+    @app.exception_handler(Exception)
+    def _unexpected(request: Request, _problem: Exception) -> Response:
+        return answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, "internal-error", "The server failed on this request; its log says why.")
+
+
+def _sentence(errors: Sequence[Any]) -> str:
+    """The first validation error, by the option's name."""
+    first = errors[0]
+    name = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
+    if first["type"] == "extra_forbidden":
+        return f"Unknown option '{name}'; GET /v1/options lists the known ones."
+    return f"'{name}': {first['msg'].removeprefix('Value error, ')}; correct it."

@@ -1,0 +1,125 @@
+"""The REST routes below ``/v1``. Annotations are evaluated here, because FastAPI reads them and they name local dependencies."""
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import Field
+
+from services.api.artifacts import Artifact, artifact_response, list_artifacts, open_artifact
+from services.api.feed import EventFeed, follow
+from services.api.jobs import Jobs, StageProgress
+from services.api.lifecycle import JobState
+from services.api.problems import MEDIA_TYPE, Problem
+from services.api.repository import Job
+from services.core.errors import PlatformError
+from services.core.geometry import Record
+from services.core.records import JobSpec
+
+FREE_BYTES_NEEDED = 256 * 2**20
+"""Below this the server is not ready: a stage could not publish."""
+
+
+class JobPage(Record):
+    """Some jobs, newest first."""
+
+    jobs: list[Job]
+    next_before: int | None = Field(description="give as 'before' to get the next page; null on the last")
+
+
+class JobDetail(Job):
+    """A job and how far each of its stages is."""
+
+    stages: list[StageProgress]
+
+
+class Health(Record):
+    """What the server has checked."""
+
+    status: str
+    free_bytes: int | None = None
+
+
+def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
+    """Routes over the given jobs."""
+    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 422)}
+    router = APIRouter(prefix="/v1", responses=failures)
+
+    def find_job(job_id: str) -> Job:
+        return jobs.repository.get(job_id)
+
+    def detail(job: Job) -> JobDetail:
+        return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job))
+
+    Found = Annotated[Job, Depends(find_job)]
+
+    @router.post("/jobs", status_code=201, tags=["jobs"])
+    def submit(spec: JobSpec, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
+        """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200."""
+        creation = jobs.submit(spec, idempotency_key)
+        response.status_code = 201 if creation.is_new else 200
+        response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
+        return creation.job
+
+    @router.get("/jobs", tags=["jobs"])
+    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: int | None = None, state: JobState | None = None) -> JobPage:
+        """List jobs, newest first."""
+        found = jobs.repository.page(limit + 1, before, state)
+        return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
+
+    @router.get("/jobs/{job_id}", tags=["jobs"])
+    def get(job: Found) -> JobDetail:
+        """One job with its stages."""
+        return detail(job)
+
+    @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"])
+    def cancel(job: Found) -> Job:
+        """Cancel a job. The lights go off first; what it has published is kept."""
+        return jobs.cancel(job.id)
+
+    @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"])
+    def retry(job: Found) -> Job:
+        """Queue a failed or cancelled job again; it resumes from what it had published."""
+        return jobs.retry(job.id)
+
+    @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, tags=["jobs"])
+    async def events(job: Found, last_event_id: Annotated[int | None, Header()] = None) -> AsyncIterator[ServerSentEvent]:
+        """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
+        async for event in follow(jobs.repository, feed, job.id, last_event_id or 0):
+            if isinstance(event, JobState):
+                yield ServerSentEvent(event="end", data=event)
+            else:
+                yield ServerSentEvent(id=str(event.id), data=event)
+
+    @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"])
+    def artifacts(job: Found) -> list[Artifact]:
+        """List the job's files."""
+        return list_artifacts(jobs.folder(job.id))
+
+    @router.get("/jobs/{job_id}/artifacts/{path:path}", response_class=Response, tags=["artifacts"])
+    def artifact(job: Found, path: str, request: Request) -> Response:
+        """One file; takes Range and If-None-Match."""
+        return artifact_response(request, open_artifact(jobs.folder(job.id), path))
+
+    @router.get("/options", tags=["options"])
+    def options() -> dict[str, Any]:
+        """JSON schema of a job's options with defaults, units and help."""
+        return JobSpec.model_json_schema()
+
+    @router.get("/health/live", tags=["health"])
+    def live() -> Health:
+        """Whether the process answers."""
+        return Health(status="live")
+
+    @router.get("/health/ready", tags=["health"], responses={503: failures[404]})
+    def ready() -> Health:
+        """Whether a submitted job would run: database, runner and disk."""
+        jobs.repository.newest_event()
+        if not jobs.is_running():
+            raise PlatformError("Jobs are not being run; restart the server and read its log.")
+        if (free := jobs.free_bytes()) < FREE_BYTES_NEEDED:
+            raise PlatformError(f"Only {free // 2**20} MiB of disk are free; free at least {FREE_BYTES_NEEDED // 2**20} MiB.")
+        return Health(status="ready", free_bytes=free)
+
+    return router

@@ -1,0 +1,62 @@
+"""``dentine serve``: one process with the API, the dashboard, the database and the jobs' workers."""
+
+from __future__ import annotations
+
+import fcntl
+import signal
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from services.api.app import STATIC, create_app, run_locally
+from services.api.jobs import RunJob
+from services.core.errors import PlatformError
+from services.core.settings import ServerSettings
+
+
+def serve(settings: ServerSettings, run: RunJob = run_locally) -> None:
+    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens.
+
+    Raises:
+        PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
+    """
+    try:
+        import uvicorn
+    except ModuleNotFoundError as problem:
+        raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
+
+    with _sole_server(settings.data), closing(_listen(settings)) as listener:
+        if not (STATIC / "app.js").exists():
+            print("The dashboard is not built; run make dashboard. The API works without it.", file=sys.stderr)
+        host, port = listener.getsockname()[:2]
+        print(f"http://{host}:{port}", flush=True)
+        server = uvicorn.Server(uvicorn.Config(create_app(settings, run), log_level="warning", access_log=False, timeout_graceful_shutdown=1))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
+        server.run(sockets=[listener])
+
+
+def _listen(settings: ServerSettings) -> socket.socket:
+    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+        listener.listen()
+    except OSError as problem:
+        listener.close()
+        raise PlatformError(f"Cannot listen on {settings.host}:{settings.port} ({problem.strerror}); choose another --port.") from problem
+    return listener
+
+
+@contextmanager
+def _sole_server(data: Path) -> Iterator[None]:
+    """Hold the data folder's lock; the system drops it however this process ends."""
+    data.mkdir(parents=True, exist_ok=True)
+    with (data / ".lock").open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise PlatformError(f"Another server uses the data folder {data}; stop it or choose another --data.") from None
+        yield

@@ -1,0 +1,202 @@
+"""The REST API in process, with toy stages on real workers where a job must run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from httpx import Client
+
+from services.api.app import create_app
+from services.api.events import EventAddress
+from services.core.errors import CaptureInputError, DentineError
+from services.core.records import JobSpec
+from services.core.settings import ServerSettings
+from tests.support.live_server import serving
+
+
+def write_results(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
+    """The least that a job does: an event and files."""
+    with events.open() as log:
+        log.begin_stage("fit")
+    (folder / "asset").mkdir(parents=True)
+    (folder / "asset" / "scene.xml").write_bytes(bytes(range(100)))
+    (folder / "report.html").write_text("<!doctype html>")
+    for hidden in (".lock", "cancel", "fit.lease"):
+        (folder / hidden).touch()
+    (folder / "prepared.zarr").mkdir()
+    (folder / "prepared.zarr" / "zarr.json").write_text("{}")
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Callable[..., Client]]:
+    with ExitStack() as stack:
+        yield lambda run=write_results: stack.enter_context(serving(create_app(ServerSettings(data=tmp_path / "data"), run)))
+
+
+@pytest.fixture
+def capture_folder(tmp_path: Path) -> str:
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    return str(folder)
+
+
+def submit(client: Client, capture: str, key: str | None = None, **options: Any) -> Any:
+    return client.post("/v1/jobs", json={"capture": capture, **options}, headers={"Idempotency-Key": key} if key else {})
+
+
+def finish(client: Client, job_id: str) -> str:
+    """Read the event stream to its end."""
+    return client.get(f"/v1/jobs/{job_id}/events").text
+
+
+def test_a_job_is_created_runs_and_tells_its_events(serve: Any, capture_folder: str) -> None:
+    client = serve()
+    answer = submit(client, capture_folder)
+    assert answer.status_code == 201
+    job_id = answer.json()["id"]
+    assert answer.headers["location"] == f"/v1/jobs/{job_id}"
+    stream = finish(client, job_id)
+    assert stream.count('event: end\ndata: "SUCCEEDED"') == 1
+    job = client.get(f"/v1/jobs/{job_id}").json()
+    assert job["state"] == "SUCCEEDED"
+    assert [stage["stage"] for stage in job["stages"]] == ["prepare", "fit", "export"]
+    ids = [line.removeprefix("id: ") for line in stream.splitlines() if line.startswith("id: ")]
+    replayed = client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": ids[-2]}).text
+    assert [line for line in replayed.splitlines() if line.startswith("id: ")] == [f"id: {ids[-1]}"]
+
+
+def test_an_idempotency_key_makes_one_job(serve: Any, capture_folder: str) -> None:
+    client = serve()
+    first, second = (submit(client, capture_folder, key="k1") for _ in range(2))
+    assert (first.status_code, second.status_code) == (201, 200)
+    assert first.json()["id"] == second.json()["id"]
+    other = submit(client, capture_folder, key="k1", seed=2)
+    assert other.status_code == 409
+    assert other.json()["code"] == "job-state"
+
+
+def test_pages_follow_each_other(serve: Any, capture_folder: str) -> None:
+    client = serve()
+    ids = [submit(client, capture_folder, seed=seed).json()["id"] for seed in range(5)]
+    seen, before = [], None
+    while True:
+        page = client.get("/v1/jobs", params={"limit": 2} | ({"before": before} if before else {})).json()
+        seen += [job["id"] for job in page["jobs"]]
+        before = page["next_before"]
+        if before is None:
+            break
+    assert seen == ids[::-1]
+
+
+@pytest.mark.parametrize(
+    ("body", "named"),
+    [
+        ({"capture": "relative/folder"}, "'capture': relative/folder is relative"),
+        ({"capture": "/no/such/folder"}, "/no/such/folder does not exist"),
+        ({"capture": "/", "sead": 1}, "Unknown option 'sead'"),
+        ({"capture": "/", "ior": 9}, "'ior'"),
+        ({}, "give exactly one of 'capture'"),
+    ],
+)
+def test_bad_options_are_a_problem_document_that_names_them(serve: Any, body: dict[str, Any], named: str) -> None:
+    answer = serve().post("/v1/jobs", json=body)
+    problem = answer.json()
+    assert answer.status_code == problem["status"] == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert problem["type"] == "urn:dentine:problem:bad-settings"
+    assert named in problem["detail"]
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs/none", "/v1/jobs/none/events", "/v1/jobs/none/artifacts", "/v1/nothing"])
+def test_what_is_not_there_is_a_problem_document(serve: Any, path: str) -> None:
+    answer = serve().get(path)
+    assert answer.status_code == 404
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(("problem", "code"), [(CaptureInputError("Frame 3 is missing; copy it."), "bad-capture"), (ZeroDivisionError("x"), "internal-error")])
+def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: str, problem: Exception, code: str) -> None:
+    problems = [problem]
+
+    def run(*_: object) -> None:
+        if problems:
+            raise problems.pop()
+
+    client = serve(run)
+    job_id = submit(client, capture_folder).json()["id"]
+    finish(client, job_id)
+    failure = client.get(f"/v1/jobs/{job_id}").json()["failure"]
+    assert failure["code"] == code
+    assert str(problem) in failure["message"]
+    assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 202
+    finish(client, job_id)
+    job = client.get(f"/v1/jobs/{job_id}").json()
+    assert (job["state"], job["failure"]) == ("SUCCEEDED", None)
+    assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
+
+
+def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str) -> None:
+    client = serve()
+    job_id = submit(client, capture_folder).json()["id"]
+    finish(client, job_id)
+    base = f"/v1/jobs/{job_id}/artifacts"
+    assert [artifact["path"] for artifact in client.get(base).json()] == ["asset/scene.xml", "report.html"]
+    whole = client.get(f"{base}/asset/scene.xml")
+    assert whole.content == bytes(range(100))
+    part = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=10-19"})
+    assert (part.status_code, part.content, part.headers["content-range"]) == (206, bytes(range(10, 20)), "bytes 10-19/100")
+    assert client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=-5"}).content == bytes(range(95, 100))
+    assert client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=200-"}).status_code == 416
+    assert client.get(f"{base}/asset/scene.xml", headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
+    stale = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=0-1", "If-Range": '"old"'})
+    assert (stale.status_code, len(stale.content)) == (200, 100)
+    assert "sandbox" in client.get(f"{base}/report.html").headers["content-security-policy"]
+
+
+@pytest.mark.parametrize(
+    "path", ["..%2f..%2fdentine.sqlite", "%2e%2e/%2e%2e/dentine.sqlite", "%2fetc%2fpasswd", ".lock", "cancel", "fit.lease", "asset", "link", "a%00b"]
+)
+def test_no_path_leads_out_of_the_artifacts(serve: Any, capture_folder: str, tmp_path: Path, path: str) -> None:
+    client = serve()
+    job_id = submit(client, capture_folder).json()["id"]
+    finish(client, job_id)
+    (tmp_path / "data" / "jobs" / job_id / "link").symlink_to("/etc/passwd")
+    assert client.get(f"/v1/jobs/{job_id}/artifacts/{path}").status_code == 404
+
+
+def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str) -> None:
+    client = serve()
+    foreign = client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": "http://elsewhere.example"})
+    assert (foreign.status_code, foreign.json()["code"]) == (403, "foreign-origin")
+    assert client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": str(client.base_url).rstrip("/")}).status_code == 201
+    assert client.get("/v1/jobs", headers={"Host": "elsewhere.example"}).status_code == 400
+
+
+def test_pages_carry_a_strict_policy(serve: Any) -> None:
+    headers = serve().get("/").headers
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert "unsafe" not in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_health_and_options(serve: Any) -> None:
+    client = serve()
+    assert client.get("/v1/health/live").json()["status"] == "live"
+    assert client.get("/v1/health/ready").json()["status"] == "ready"
+    assert client.get("/v1/options").json()["properties"]["ior"]["default"] == 1.631
+    assert set(client.get("/v1/openapi.json").json()["paths"]) >= {"/v1/jobs", "/v1/jobs/{job_id}/events"}
+
+
+def test_every_error_has_a_status() -> None:
+    from services.api.problems import status_of
+
+    def below(kind: type[DentineError]) -> Iterator[type[DentineError]]:
+        yield kind
+        for child in kind.__subclasses__():
+            yield from below(child)
+
+    assert {status_of(kind("x")) // 100 for kind in below(DentineError)} == {4, 5}

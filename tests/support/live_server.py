@@ -1,0 +1,58 @@
+"""A real HTTP server in a thread of the test, and as a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import uvicorn
+from fastapi import FastAPI
+
+
+def connect(address: str) -> httpx.Client:
+    """A client of one server, whatever proxies the environment names."""
+    return httpx.Client(base_url=address, trust_env=False, timeout=60)
+
+
+@contextmanager
+def serving(app: FastAPI) -> Iterator[httpx.Client]:
+    """Serve an application on a free loopback port for the time of the block."""
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="critical", timeout_graceful_shutdown=1))
+    started = threading.Event()
+    startup = server.startup
+
+    async def tell_started(sockets: list[object] | None = None) -> None:
+        await startup(sockets)
+        started.set()
+
+    server.startup = tell_started
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        assert started.wait(30)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        with connect(f"http://127.0.0.1:{port}") as client:
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+@contextmanager
+def toy_server(data: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+    """The server with toy stages as a process of its own, ended by SIGTERM unless the block ended it."""
+    command = [sys.executable, "-m", "tests.support.toy_server", str(data)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as process:
+        try:
+            assert process.stdout is not None
+            with connect(process.stdout.readline().strip()) as client:
+                yield client, process
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                assert process.wait(30) == 0

@@ -1,0 +1,82 @@
+"""Properties of the job's state machine over every sequence of triggers."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.api import lifecycle
+from services.api.lifecycle import TABLE, Instruction, JobState, Trigger, apply
+from services.core.errors import JobStateError
+
+triggers = st.lists(st.sampled_from(Trigger), max_size=30)
+
+
+def walk(sequence: list[Trigger]) -> list[tuple[JobState, Trigger, lifecycle.Transition]]:
+    state, taken = JobState.SUBMITTED, []
+    for trigger in sequence:
+        try:
+            transition = apply(state, trigger)
+        except JobStateError:
+            continue
+        taken.append((state, trigger, transition))
+        state = transition.state
+    return taken
+
+
+@given(triggers)
+def test_a_launch_always_leads_to_queued_and_only_queued_jobs_start(sequence: list[Trigger]) -> None:
+    for state, trigger, transition in walk(sequence):
+        assert (transition.instruction is Instruction.LAUNCH) == (transition.state is JobState.QUEUED)
+        assert (trigger is Trigger.START) == (transition.state is JobState.RUNNING)
+        if trigger is Trigger.START:
+            assert state is JobState.QUEUED
+
+
+@given(triggers)
+def test_an_end_is_left_only_by_retry_and_success_never(sequence: list[Trigger]) -> None:
+    for state, trigger, _ in walk(sequence):
+        if state.is_final:
+            assert trigger is Trigger.RETRY
+            assert state is not JobState.SUCCEEDED
+
+
+@given(triggers)
+def test_a_cancelled_wish_never_runs_again_by_itself(sequence: list[Trigger]) -> None:
+    for state, trigger, transition in walk(sequence):
+        if state is JobState.CANCELLING:
+            assert transition.state.is_final or trigger is Trigger.CANCEL
+
+
+@given(triggers)
+def test_success_comes_from_work_alone(sequence: list[Trigger]) -> None:
+    for state, trigger, transition in walk(sequence):
+        if transition.state is JobState.SUCCEEDED:
+            assert trigger is Trigger.SUCCEED
+            assert state in {JobState.RUNNING, JobState.CANCELLING}
+
+
+def test_every_unfinished_state_survives_a_crash_and_every_state_is_reachable() -> None:
+    assert {state for state, trigger in TABLE if trigger is Trigger.LOSE} == {state for state in JobState if not state.is_final}
+    assert {transition.state for transition in TABLE.values()} | {JobState.SUBMITTED} == set(JobState)
+
+
+def test_the_refusal_names_what_the_state_takes() -> None:
+    with pytest.raises(JobStateError, match=r"SUCCEEDED does not take 'cancel'; it takes nothing"):
+        apply(JobState.SUCCEEDED, Trigger.CANCEL)
+
+
+def test_the_docstring_draws_the_table() -> None:
+    header, *rows = [line.split("  ") for line in lifecycle.__doc__.splitlines() if line[:1].isupper() and "  " in line] or [[]]
+    columns = [Trigger.CANCEL, Trigger.START, Trigger.SUCCEED, Trigger.FAIL, Trigger.LOSE]
+    drawn = {}
+    for row in [header, *rows]:
+        state, *cells = [cell.strip() for cell in row if cell.strip()]
+        drawn |= {(state, trigger): cell for trigger, cell in zip(columns, cells, strict=True) if cell != "-"}
+    told = {
+        (state, trigger): transition.state + (f", {transition.instruction}" if transition.instruction is not Instruction.NOTHING else "")
+        for (state, trigger), transition in TABLE.items()
+        if trigger in columns
+    }
+    assert drawn == told
