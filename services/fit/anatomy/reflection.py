@@ -79,7 +79,7 @@ def ggx_reflection(
     n_l, n_v, n_h = (np.clip((normal * d).sum(axis=-1), 1e-6, 1.0) for d in (towards_light, towards_eye, half))
     a2 = roughness**2
     distribution = a2 / (np.pi * (n_h**2 * (a2 - 1) + 1) ** 2)
-    shadowing = 2 * n_l * n_v / (n_v * np.sqrt(a2 + (1 - a2) * n_l**2) + n_l * np.sqrt(a2 + (1 - a2) * n_v**2))
+    shadowing = np.prod([2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2)) for c in (n_l, n_v)], axis=0)
     return np.asarray(distribution * shadowing * fresnel(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior) / (4 * n_l * n_v))
 
 
