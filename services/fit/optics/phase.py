@@ -25,7 +25,7 @@ def density(g: mi.Float, m: mi.Float) -> mi.Float:
 
 
 def score_g(g: mi.Float, m: mi.Float) -> mi.Float:
-    """d ln(density) / dg (teeth 2018 Eq. 13 in propagation directions)."""
+    """Derivative d ln(density) / dg (teeth 2018 Eq. 13 in propagation directions)."""
     a = dr.abs(g)
     d = dr.fma(2 * a, m, dr.square(1 - a))
     return dr.mulsign(-2 * a / ((1 - a) * (1 + a)) + 3 * ((1 - a) - m) / d, g)

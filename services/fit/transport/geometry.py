@@ -62,7 +62,7 @@ class MeshGeometry:
 
     def __init__(self, recipe: SceneRecipe) -> None:
         self.recipe = recipe
-        self.shape: DentinShape | None = recipe.dentin
+        self.shape = recipe.dentin
         self.outer_faces = len(recipe.outer.faces)
         self._outer_vertices = len(recipe.outer.vertices_mm)
         self.modes = 0 if self.shape is None else len(self.shape.modes_mm)
@@ -72,7 +72,7 @@ class MeshGeometry:
         self._faces = np.concatenate(faces).astype(np.uint32)
         self._current: tuple[float, ...] | None = None
         self._build((0.0,) * self.modes)
-        if self.modes:
+        if self.shape is not None:
             self._mode_tables = [mi.Float(np.ascontiguousarray(mode[self.shape.base.faces].reshape(-1), dtype=np.float32)) for mode in self.shape.modes_mm]
         self.epsilon = RAY_EPSILON * (1 + float(np.abs(recipe.outer.vertices_mm).max()))
 
@@ -129,7 +129,7 @@ class MeshGeometry:
         return dr.fma(direction, hit.distance, origin) + hit.normal * offset
 
     def velocity(self, hit: Hit, active: mi.Bool) -> list[mi.Float]:
-        """n . (B_m - B0) at the hit, interpolated over its triangle; zero on the outer surface."""
+        """Normal speed n . (B_m - B0) at the hit, interpolated over its triangle; zero on the outer surface."""
         active = active & ~hit.outer & hit.valid
         face = (hit.primitive - self.outer_faces) * 3
         weights = (1 - hit.uv.x - hit.uv.y, hit.uv.x, hit.uv.y)

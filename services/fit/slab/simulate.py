@@ -1,0 +1,228 @@
+"""Total reflectance and transmittance of flat layers, with derivatives, to a requested error.
+
+Runs the fit's own walk (``services.fit.transport.walk``) between planes instead of meshes; light that leaves either face is
+counted instead of connected to lamps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from services.core.errors import InputError, NonFiniteError
+from services.core.geometry import Record
+from services.fit.optics.parameters import Medium
+from services.fit.transport.platform import prepare_device
+
+LANES = 8192
+FIRST_SAMPLES = 32
+GRADIENT_ERROR = 0.003
+"""Standard error of a derivative, as a fraction of its value or of ``GRADIENT_FLOOR`` of the largest beside it."""
+GRADIENT_FLOOR = 1e-3
+MOST_SAMPLES = 4096
+MOST_PATHS = 2**37
+
+
+class Layer(Record):
+    """One layer; the first one is lit."""
+
+    sigma: float = Field(description="extinction, per mm")
+    alpha: float = Field(description="single-scattering albedo")
+    beta: float = Field(default=1.0, description="weight of the first lobe")
+    g1: float = Field(default=0.0, description="mean cosine of the first lobe")
+    g2: float = Field(default=0.0, description="mean cosine of the second lobe")
+    thickness_mm: float = Field(description="thickness; the last layer may be infinite")
+
+    model_config = Record.model_config | {"allow_inf_nan": True}
+
+
+class SlabResult(Record):
+    """Totals per incident flux. R includes the specular reflection of the lit face, T the unscattered beam."""
+
+    R: float
+    T: float
+    R_se: float
+    T_se: float
+    dR: dict[str, float] = {}
+    dT: dict[str, float] = {}
+    dR_se: dict[str, float] = {}
+    dT_se: dict[str, float] = {}
+    paths: int = Field(description="number of walks")
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values for printing."""
+        return self.model_dump()
+
+
+@dataclass
+class Sums:
+    """Float64 sums over lanes; rows are the totals and then each derivative, columns R and T."""
+
+    rows: int
+    specular: float
+    """Share of the incident flux that the lit face reflects, known exactly."""
+    first: NDArray[np.float64] = field(init=False)
+    second: NDArray[np.float64] = field(init=False)
+    lanes: int = 0
+    samples: int = 0
+    passes: int = 0
+
+    def __post_init__(self) -> None:
+        self.first, self.second = np.zeros((self.rows, 2)), np.zeros((self.rows, 2))
+
+    def add(self, table: NDArray[np.float64], samples: int) -> None:
+        """Add a pass: sums (lanes, rows, 2) over ``samples`` paths per lane."""
+        if not np.isfinite(table).all():
+            raise NonFiniteError(f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the parameters.")
+        self.first += table.sum(axis=0)
+        self.second += (table**2).sum(axis=0) / samples
+        self.lanes += len(table)
+        self.samples += len(table) * samples
+        self.passes += 1
+
+    def mean(self) -> NDArray[np.float64]:
+        """Totals and derivatives (rows, 2)."""
+        mean = self.first / self.samples
+        mean[0, 0] += self.specular
+        return mean
+
+    def standard_error(self) -> NDArray[np.float64]:
+        """Standard errors (rows, 2) from the spread between lanes."""
+        spread = np.maximum(self.second - self.first**2 / self.samples, 0) / max(self.lanes - 1, 1)
+        return np.sqrt(spread / self.samples)
+
+
+def simulate_slab(
+    layers: tuple[Layer, ...],
+    *,
+    ior: float = 1.0,
+    boundary: Literal["matched", "thin", "smooth"] = "matched",
+    source: Literal["normal", "diffuse"] = "normal",
+    rel_error: float = 1e-3,
+    gradient: bool = False,
+    seed: int = 1,
+) -> SlabResult:
+    """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as sure as asked.
+
+    Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1, beta1,
+    g1a, g1b, sigma2, ..., c`` for layers, c the depth of the first inner border at fixed total depth. A derivative's standard
+    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger.
+
+    Raises:
+        InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not finite.
+    """
+
+    def shortfall(sums: Sums) -> float:
+        mean, error = sums.mean(), sums.standard_error()
+        worst = max(error[0, 0] / (max(mean[0, 0], 1e-30) * rel_error), error[0, 1] / (max(mean[0, 1], 1e-3) * rel_error))
+        if gradient:
+            values = np.abs(mean[1:])
+            allowed = GRADIENT_ERROR * np.maximum(values, GRADIENT_FLOOR * values.max())
+            worst = max(worst, np.max(error[1:] / np.maximum(allowed, 1e-30)))
+        return float(worst)
+
+    if not 0 < rel_error < 1:
+        raise InputError(f"rel-error = {rel_error:g} must lie between 0 and 1; 1e-3 is usual.")
+    names, sums = accumulate(layers, shortfall, ior=ior, boundary=boundary, source=source, gradient=gradient, seed=seed)
+    mean, error = sums.mean(), sums.standard_error()
+    columns = [dict(zip(names, column[1:].tolist(), strict=True)) for column in (*mean.T, *error.T)]
+    return SlabResult(
+        R=mean[0, 0], T=mean[0, 1], R_se=error[0, 0], T_se=error[0, 1], dR=columns[0], dT=columns[1], dR_se=columns[2], dT_se=columns[3], paths=sums.samples
+    )
+
+
+def accumulate(
+    layers: tuple[Layer, ...],
+    shortfall: Callable[[Sums], float],
+    *,
+    ior: float = 1.0,
+    boundary: str = "matched",
+    source: str = "normal",
+    gradient: bool = False,
+    seed: int = 1,
+) -> tuple[tuple[str, ...], Sums]:
+    """Trace until ``shortfall``, the largest ratio of a standard error to what is asked of it, is at most 1.
+
+    Returns:
+        Names of the derivatives, and the sums: rows are the totals and then each derivative, columns R and T.
+    """
+    ior = _checked(layers, ior, boundary, source)
+    prepare_device()
+    from services.fit.transport.geometry import SlabGeometry
+    from services.fit.transport.media import Media, Score
+    from services.fit.transport.starts import SlabStart
+    from services.fit.transport.walk import Plan, Walk
+
+    names, scores = _derivatives(layers) if gradient else ((), ())
+    border = gradient and len(layers) == 2
+    geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
+    media = Media([_medium(layer) for layer in layers])
+    plan = Plan(scores=tuple(Score(*score) for score in scores), shape=border, faces=True, bend=boundary == "smooth")
+    sums = Sums(1 + len(scores) + border, _specular(ior, source))
+    samples, missing = FIRST_SAMPLES, math.inf
+    while missing > 1 and sums.samples < MOST_PATHS:
+        start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend)
+        totals, derivatives = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
+        sums.add(np.stack([totals, *derivatives], axis=1), samples)
+        missing = shortfall(sums)
+        samples = int(np.clip(sums.samples * (missing**2 * 1.05 - 1) / LANES, FIRST_SAMPLES, min(4 * samples, MOST_SAMPLES)))
+    return (*names, "c") if border else names, sums
+
+
+def _checked(layers: tuple[Layer, ...], ior: float, boundary: str, source: str) -> float:
+    if boundary not in {"matched", "thin", "smooth"}:
+        raise InputError(f"boundary = {boundary} is not known; choose matched, thin or smooth.")
+    if source not in {"normal", "diffuse"}:
+        raise InputError(f"source = {source} is not known; choose normal or diffuse.")
+    if not math.isfinite(ior) or not 1 <= ior <= 4:
+        raise InputError(f"ior = {ior:g} must lie in 1 to 4; enamel has 1.631.")
+    if not layers:
+        raise InputError("The slab has no layer; give at least one.")
+    from services.fit.transport.media import require_medium
+
+    for number, layer in enumerate(layers, 1):
+        require_medium(f"layer {number}", _medium(layer))
+        last = number == len(layers)
+        if not layer.thickness_mm > 0 or (math.isinf(layer.thickness_mm) and not last):
+            raise InputError(f"layer {number}.thickness_mm = {layer.thickness_mm:g} must be positive, and only the last layer may be infinite.")
+    if math.isinf(layers[-1].thickness_mm) and layers[-1].alpha == 1 and sum(layer.alpha < 1 for layer in layers) == 0:
+        raise InputError("A half space without absorption never lets its light go; give alpha below 1 or a finite width.")
+    return 1.0 if boundary == "matched" else ior
+
+
+def _medium(layer: Layer) -> Medium:
+    return Medium(layer.sigma, layer.alpha, layer.beta, layer.g1, layer.g2)
+
+
+def _derivatives(layers: tuple[Layer, ...]) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
+    """Names as printed, and (medium, field) of each score."""
+    if len(layers) == 1 and layers[0].beta == 1:
+        return ("sigma", "alpha", "g"), ((1, "sigma"), (1, "alpha"), (1, "g1"))
+    pairs = []
+    for number, layer in enumerate(layers, 1):
+        fields = ("sigma", "alpha", "beta", "g1", "g2") if layer.beta < 1 else ("sigma", "alpha", "g1")
+        printed = {"g1": f"g{number}a", "g2": f"g{number}b"}
+        pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in fields]
+    return tuple(name for name, _ in pairs), tuple(score for _, score in pairs)
+
+
+def _specular(ior: float, source: str) -> float:
+    """Share of the incident flux that the lit face reflects; Lambertian light by Gauss-Legendre in float64."""
+    if source == "normal":
+        return ((ior - 1) / (ior + 1)) ** 2
+    nodes, weights = np.polynomial.legendre.leggauss(400)
+    cosine = 0.5 * (nodes + 1)
+    transmitted = np.sqrt(1 - (1 - cosine**2) / ior**2)
+    s = (cosine - ior * transmitted) / (cosine + ior * transmitted)
+    p = (ior * cosine - transmitted) / (ior * cosine + transmitted)
+    return float(np.sum(weights * cosine * 0.5 * (s**2 + p**2)))
+
+
+def _pass_seed(seed: int, number: int) -> int:
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
