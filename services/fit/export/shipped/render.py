@@ -4,8 +4,8 @@ Each colour channel is its own scene, because scattering differs per channel and
 """
 
 import argparse
-import importlib
 import json
+import runpy
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,7 +18,7 @@ def render(folder: Path, camera: str, light: str, spp: int, seed: int = 0, varia
         mi.set_variant(variant)
     rig = json.loads((folder / "rig.json").read_text())
     if rig["boundary"] == "thin":
-        importlib.import_module("thin_boundary").register()
+        runpy.run_path(str(folder / "thin_boundary.py"))["register"]()
     x, y, z = rig["lights"][light]["position_mm"]
     planes = []
     for channel, intensity in zip(rig["channels"], rig["lights"][light]["intensity"], strict=True):

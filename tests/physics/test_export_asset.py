@@ -1,0 +1,149 @@
+"""The asset, rendered by stock Mitsuba through its own script, shows what the engine shows."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera, Light, Tooth
+from services.core.records import Boundary, Estimate, FitReport
+from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.export.asset import tissue_of, write_asset
+from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.platform import prepare_device
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+
+TISSUE = Tissue(Medium(2.5, 0.97, 0.9, 0.6, -0.1), Medium(6.0, 0.93, 1.0, 0.5, 0.0))
+"""Paths of some tens of scatters: the comparison costs seconds."""
+CHANNELS = ("red", "green")
+
+
+def report_of(tissue: Tissue) -> FitReport:
+    table = {
+        f"{part}.{field}": Estimate(value=getattr(getattr(tissue, part), field), se=0.01, unit="1", determined=True)
+        for part in ("enamel", "dentin")
+        for field in MEDIUM_FIELDS
+    }
+    errors = dict.fromkeys(CHANNELS, 0.03)
+    parameters = dict.fromkeys(CHANNELS, table)
+    return FitReport(converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0)
+
+
+class Rig:
+    def __init__(self) -> None:
+        incisor = build_incisor(24)
+        self.tooth = Tooth(11, incisor.outer, incisor.dentin)
+        self.cameras: tuple[Camera, ...] = dome_cameras(2, 1.2, (incisor.outer,))
+        self.lights: tuple[Light, ...] = dome_lights(4, CHANNELS, seed=2)
+
+    def write(self, folder: Path, boundary: Boundary) -> tuple[str, ...]:
+        return write_asset(folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary, ior=1.631)
+
+    def engine_image(self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+        dentin = self.tooth.dentin
+        assert dentin is not None
+        shape = DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
+        recipe = SceneRecipe(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
+        width, height = camera.size
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.int32)
+        estimate = Engine(recipe).images(TISSUE, View(camera, pixels), samples=samples, seed=11)
+        return estimate.mean[0].reshape(height, width), estimate.variance[0].reshape(height, width)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return Rig()
+
+
+@pytest.mark.parametrize("boundary", ["matched", "thin"])
+def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, boundary: Boundary, tmp_path: Path) -> None:
+    prepare_device()
+    rig.write(tmp_path, boundary)
+    render = runpy.run_path(str(tmp_path / "render.py"))["render"]
+    light, camera = rig.lights[2], rig.cameras[1]
+    stack = np.stack([render(tmp_path, camera.name, light.name, 64, seed=seed) for seed in range(16)])
+    assert stack.shape[1:] == (camera.size[1], camera.size[0], 2)
+    mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(stack)
+    scores = []
+    for channel in range(2):
+        ours, ours_variance = rig.engine_image(boundary, camera, light, channel, samples=2048)
+        assert ours.sum() > 1
+        for rows in np.array_split(np.arange(camera.size[1]), 4):
+            noise = variance[rows, :, channel].sum() + ours_variance[rows].sum()
+            scores.append((mean[rows, :, channel] - ours[rows]).sum() / np.sqrt(noise))
+            # The bands are resolved: one standard error is at most 3 % of a band that carries light.
+            if ours[rows].sum() > 0.1 * ours.sum():
+                assert np.sqrt(noise) < 0.03 * ours[rows].sum()
+    # Eight values: |z| <= 4.5 fails one correct run in 10,000.
+    assert np.abs(scores).max() <= 4.5
+
+
+def test_the_folder_is_complete_and_self_contained(rig: Rig, tmp_path: Path) -> None:
+    files = rig.write(tmp_path / "thin", "thin")
+    assert set(files) == {
+        "scene_red.xml", "scene_green.xml", "teeth/11/outer.ply", "teeth/11/dentin.ply", "rig.json",
+        "parameters.json", "errors.json", "render.py", "thin_boundary.py",
+    }  # fmt: skip
+    assert "thin_boundary.py" not in rig.write(tmp_path / "matched", "matched")
+    for name in ("render.py", "thin_boundary.py"):
+        assert "services" not in (tmp_path / "thin" / name).read_text()
+    assert str(tmp_path) not in (tmp_path / "thin/scene_red.xml").read_text()
+    parameters = json.loads((tmp_path / "thin/parameters.json").read_text())
+    assert parameters["red"]["enamel.sigma"] == {"value": 2.5, "se": 0.01, "unit": "1", "determined": True}
+    assert json.loads((tmp_path / "thin/errors.json").read_text())["held_out_error"] == {"red": 0.03, "green": 0.03}
+
+
+def test_the_script_runs_alone(rig: Rig, tmp_path: Path) -> None:
+    rig.write(tmp_path, "thin")
+    command = [sys.executable, "-I", str(tmp_path / "render.py"), "--camera", "c0", "--light", "l1", "--spp", "4", "--out", str(tmp_path / "tooth.exr")]
+    # Isolated mode leaves out the script's folder, as a stranger's own set-up might.
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "tooth.exr").stat().st_size > 500
+
+
+def test_a_table_becomes_the_tissue_it_describes() -> None:
+    table = report_of(TISSUE).parameters["red"]
+    assert tissue_of(table) == TISSUE
+    homogeneous = tissue_of({name: estimate for name, estimate in table.items() if name.startswith("enamel")})
+    assert homogeneous.enamel == TISSUE.enamel
+    assert homogeneous.dentin.sigma == 0
+
+
+def test_pixels_land_where_the_camera_projects_them(rig: Rig) -> None:
+    # A shifted principal point and a rolled pose against Mitsuba's own rays.
+    prepare_device()
+    import drjit as dr
+    import mitsuba as mi
+
+    camera = rig.cameras[0].model_copy(update={"K": ((900.0, 0.0, 3.7), (0.0, 900.0, 9.1), (0.0, 0.0, 1.0))})
+    sensor = load_scene({"type": "scene", "camera": sensor_dict(camera)}).sensors()[0]
+    places = np.array([[0.5, 0.5], [4.2, 1.1], [2.0, 7.9]])
+    scaled = places / np.array(camera.size)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(scaled.T.astype(np.float32)), mi.Point2f(0.5))
+    dr.eval(ray)
+    _, directions = camera.rays(places[:, 0], places[:, 1])
+    # Single precision of a pixel's angle: 1e-3 rad at 1e-7 relative, with a margin for the matrix product.
+    np.testing.assert_allclose(np.array(ray.d).T, directions, atol=2e-6)
+
+
+def test_rectangular_pixels_are_refused(rig: Rig) -> None:
+    camera = rig.cameras[0].model_copy(update={"K": ((900.0, 0.0, 5.0), (0.0, 910.0, 5.0), (0.0, 0.0, 1.0))})
+    with pytest.raises(CaptureInputError, match="unequal focal lengths"):
+        sensor_dict(camera)
+
+
+def test_a_tooth_without_dentin_needs_one_medium(rig: Rig, tmp_path: Path) -> None:
+    scene = nested_scene({"11": (tmp_path / "outer.ply", None)}, TISSUE, rig.cameras, (0, 0, 1), 1.0)
+    assert "medium_dentin" not in scene
+    assert "exterior" not in scene["outer_11"]
