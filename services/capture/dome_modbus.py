@@ -29,7 +29,6 @@ from services.core.errors import InterlockError, ReadbackError, RigError
 
 REPLY_TIMEOUT_S = 0.5
 HANG_MARGIN_S = 2.0
-FEEDS_PER_WATCHDOG = 5
 DARK_ATTEMPTS = 3
 
 
@@ -72,7 +71,7 @@ class ModbusDome:
         self.watchdog_s = watchdog_s
         self._budget = budget
         self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
-        self._keepalive = KeepAlive(ModbusLink(host, port, REPLY_TIMEOUT_S), watchdog_s / FEEDS_PER_WATCHDOG)
+        self._keepalive = KeepAlive(ModbusLink(host, port, REPLY_TIMEOUT_S), watchdog_s)
         self._light_count = 0
         self._lit: tuple[range, float, float] | None = None
         self._previous_handlers: dict[int, object] = {}

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from services.core.errors import StoreError
 from services.core.geometry import Record
@@ -108,7 +109,7 @@ class FrameStore:
     def _newest_leftover(self) -> Path | None:
         for folder in self._attempts():
             journal = folder / JOURNAL
-            if journal.is_file() and journal.read_text().partition("\n")[0] == self._header:
+            if journal.is_file() and (folder / ARRAY / "zarr.json").is_file() and journal.read_text().partition("\n")[0] == self._header:
                 return folder
         return None
 
@@ -116,14 +117,19 @@ class FrameStore:
         shutil.rmtree(self._folder)
         self._folder.mkdir()
         create_array(self._folder, ARRAY, shape, (1, 1, *shape[2:]), "uint16", DIMENSIONS)
+        _digest_durably(self._folder / ARRAY, "zarr.json")
+        _fsync(self._writer.root)
 
 
 def _intact(folder: Path, header: str) -> Iterator[Acknowledged]:
-    """Journal lines whose shards are as acknowledged; a torn last line and damaged frames are left out, to be captured again."""
+    """Journal lines whose shards are as acknowledged; torn and damaged lines and frames are left out, to be captured again."""
     text = (folder / JOURNAL).read_text()
     assert text.startswith(header)
     for row in text.split("\n")[1:-1]:
-        line = Acknowledged.model_validate_json(row)
+        try:
+            line = Acknowledged.model_validate_json(row)
+        except ValidationError:
+            continue
         if all(_digest(folder / ARRAY / name) == (size, sha256) for name, size, sha256 in line.shards):
             yield line
 
@@ -139,13 +145,17 @@ def _digest_durably(array: Path, name: str) -> tuple[int, str]:
     """Fsync a shard and every folder between it and the array; its size and SHA-256."""
     path = array / name
     for entry in [path, *path.parents[: len(Path(name).parts)]]:
-        descriptor = os.open(entry, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        _fsync(entry)
     content = path.read_bytes()
     return len(content), hashlib.sha256(content).hexdigest()
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:

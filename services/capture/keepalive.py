@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import threading
+import time
 
 from services.capture.modbus_link import LinkError, ModbusLink
 from services.capture.registers import KEEPALIVE
 from services.core.errors import RigError
 
+FEEDS_PER_WATCHDOG = 5
+
 
 class KeepAlive:
     """Feeds the watchdog from a thread, over its own connection, so that a slow transaction elsewhere does not starve it."""
 
-    def __init__(self, link: ModbusLink, period_s: float) -> None:
+    def __init__(self, link: ModbusLink, watchdog_s: float) -> None:
         self._link = link
-        self._period_s = period_s
+        self._watchdog_s = watchdog_s
+        self._fed_at_s = float("-inf")
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._problem: LinkError | None = None
@@ -22,6 +26,7 @@ class KeepAlive:
     def start(self) -> None:
         """Feed once, then keep feeding."""
         self._link.write(KEEPALIVE, [1])
+        self._fed_at_s = time.monotonic()
         self._thread = threading.Thread(target=self._feed, name="dome keep-alive", daemon=True)
         self._thread.start()
 
@@ -33,14 +38,14 @@ class KeepAlive:
         self._link.close()
 
     def require_alive(self) -> None:
-        """Raise RigError when the last feed failed."""
-        if self._problem is not None or self._stop.is_set():
+        """Raise RigError when no feed has succeeded for a watchdog period."""
+        if self._stop.is_set() or time.monotonic() > self._fed_at_s + self._watchdog_s:
             raise RigError(f"The dome's watchdog is no longer fed ({self._problem or 'stopped'}); check the network and run again.")
 
     def _feed(self) -> None:
-        while not self._stop.wait(self._period_s):
+        while not self._stop.wait(self._watchdog_s / FEEDS_PER_WATCHDOG):
             try:
                 self._link.write(KEEPALIVE, [1])
-                self._problem = None
+                self._fed_at_s = time.monotonic()
             except LinkError as problem:
                 self._problem = problem
