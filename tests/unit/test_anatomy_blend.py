@@ -85,6 +85,13 @@ def test_each_mode_moves_along_its_axis_and_thickens_enamel(case: Case) -> None:
     assert volumes == sorted(volumes, reverse=True)
 
 
+@pytest.mark.parametrize("fdi", [13, 16, 36, 45])
+def test_other_teeth_of_a_scan_have_a_blend_shape_too(fdi: int) -> None:
+    tooth = Case(read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={fdi}.obj")), ToothFrame.identity())
+    for weights in np.random.default_rng(fdi).random((5, 3)):
+        assert tooth.smallest_depth_mm(tuple(weights)) >= CLEARANCE_MM - GRID_ERROR_MM
+
+
 def test_full_weights_reach_the_full_depth_where_the_tooth_is_thick() -> None:
     outer, _ = procedural()
     shape = dentin_blend_shape(outer)
