@@ -27,6 +27,8 @@ BASE_DEPTH_MM = 0.1
 FULL_DEPTH_MM = 1.5
 CLEARANCE_MM = 0.05
 """Enamel that is left everywhere for any c, away from the base's own depth."""
+CORNER_DEPTH_MM = 0.075
+"""Depth asked of each vertex's box at its corners: the clearance and half as much again for faces between vertices."""
 CREASE_MM = 0.03
 """How much nearer to the enamel's surface a face's middle may come than its corners."""
 MIDDLE_FRACTION = 0.6
@@ -53,7 +55,7 @@ def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, faces: i
     reach = _smooth_below(base, _room_mm(base.vertices_mm, inward, grid))
     for _ in range(40):
         modes = np.stack([np.outer(reach * (inward @ axes[axis]), np.ones(3)) * axes[axis] for axis in MODE_AXES])
-        short = _shallowest_corner_mm(base.vertices_mm, modes, grid) < CLEARANCE_MM + STEP_MM / 2
+        short = _shallowest_corner_mm(base.vertices_mm, modes, grid) < CORNER_DEPTH_MM
         if not short.any():
             return DentinShape(base, modes)
         reach = _smooth_below(base, np.where(short, 0.8 * reach, reach))
