@@ -49,7 +49,6 @@ DOORS: Mapping[StageName, str] = MappingProxyType(
 """``module:function`` of each stage; imported by the worker, never here."""
 _PUBLISHED_AS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
 _WORKER_CONFIG = {
-    "distributed.worker.daemon": False,  # the fit keeps a child process per worker that owns the renderer
     "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],  # Ctrl-C is the parent's to handle
 }
 
@@ -137,11 +136,19 @@ class StageTask:
         with self.events.open() as log:
             lease = self.root / f"{folder}.lease"
             attempt = log.begin_stage(self.stage, int(lease.read_text()) if lease.exists() else 0)
-            context = LocalContext(self.root, attempt, lambda event: log.append(attempt, event))
+            told: set[str] = set()
+
+            def tell(event: StageEvent) -> None:
+                if event.kind != "started":  # begin_stage has recorded it
+                    log.append(attempt, event)
+                told.add(event.kind)
+
+            context = LocalContext(self.root, attempt, tell)
             context.raise_if_cancelled()
             module, function = self.door.split(":")
             getattr(importlib.import_module(module), function)(self.spec, context)
-            context.report(StageEvent(stage=self.stage, kind="finished", done=1.0))
+            if "finished" not in told:
+                tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
 
 

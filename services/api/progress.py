@@ -71,11 +71,5 @@ class ProgressView:
 
 
 def _note(event: JobEvent) -> str:
-    if event.kind != "step":
-        return event.message
-    figures = [f"step {event.data.get('step')}"]
-    if isinstance(loss := event.data.get("loss"), int | float):
-        figures.append(f"loss {loss:.4g}")
-    if isinstance(held_out := event.data.get("held_out_error"), int | float):
-        figures.append(f"held-out error {100 * held_out:.2f} %")
-    return ", ".join(figures)
+    held_out = event.data.get("held_out_error") if event.kind == "step" else None
+    return f"{event.message.rstrip('.')}; held-out error {100 * held_out:.1f} %." if isinstance(held_out, float) else event.message

@@ -48,7 +48,8 @@ def prepare(_spec: JobSpec, context: StageContext) -> AssetManifest:
 def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
     """Reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
     for step in range(10):
-        context.report(StageEvent(stage="fit", kind="step", done=(step + 1) / 10, data={"step": step, "loss": 0.5**step, "held_out_error": 0.5**step}))
+        data = {"channel": "green", "step": step, "loss": 0.5**step, "held_out_error": 0.6**step, "parameters": {"enamel.sigma": 4.0}}
+        context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=(step + 1) / 10, data=data))
         if step == 5 and ((context.root / "always-kill").exists() or ((context.root / "kill-fit").exists() and context.attempt == 1)):
             os.kill(os.getpid(), signal.SIGKILL)
         while (context.root / "deaf-fit").exists():

@@ -1,0 +1,90 @@
+/** The public REST API, as far as this page uses it. */
+
+export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED";
+
+export interface Job {
+  id: string;
+  number: number;
+  state: JobState;
+  created_s: number;
+  changed_s: number;
+  spec: { capture: string | null; rig: { mouth: string } | null };
+  failure: { code: string; message: string; stage: string | null } | null;
+}
+
+export interface Stage {
+  stage: string;
+  state: "waiting" | "running" | "finished" | "stopped";
+  attempt: number;
+  done: number;
+  message: string;
+}
+
+export interface JobDetail extends Job {
+  stages: Stage[];
+}
+
+export interface JobEvent {
+  id: number;
+  time_s: number;
+  attempt: number;
+  stage: string | null;
+  kind: "state" | "started" | "progress" | "log" | "step" | "preview" | "finished";
+  message: string;
+  done: number | null;
+  data: Record<string, unknown>;
+}
+
+export interface Estimate {
+  value: number;
+  se: number | null;
+  unit: string;
+  determined: boolean;
+}
+
+/** channel -> parameter name -> estimate */
+export type Parameters = Record<string, Record<string, Estimate>>;
+
+export interface Artifact {
+  path: string;
+  bytes: number;
+  media_type: string;
+}
+
+export interface JobPage {
+  jobs: Job[];
+  next_before: number | null;
+}
+
+async function ask<T>(path: string, method = "GET"): Promise<T> {
+  const answer = await fetch(`/v1${path}`, { method });
+  if (!answer.ok) {
+    const problem = await answer.json().catch(() => null);
+    throw new Error(problem?.detail ?? `The server answered ${answer.status}.`);
+  }
+  return answer.json() as Promise<T>;
+}
+
+export const listJobs = (before: number | null): Promise<JobPage> => ask(`/jobs?limit=50${before === null ? "" : `&before=${before}`}`);
+export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
+export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
+export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
+export const listArtifacts = (id: string): Promise<Artifact[]> => ask(`/jobs/${id}/artifacts`);
+export const getParameters = (id: string): Promise<Parameters> => ask(`/jobs/${id}/artifacts/parameters.json`);
+
+export function artifactUrl(id: string, path: string): string {
+  return `/v1/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
+}
+
+/** Follow a job's events from the first one; the browser reconnects by itself and the server replays what was missed. */
+export function followEvents(id: string, onEvent: (event: JobEvent) => void, onEnd: () => void, onConnection: (open: boolean) => void): () => void {
+  const source = new EventSource(`/v1/jobs/${id}/events`);
+  source.onopen = () => onConnection(true);
+  source.onerror = () => onConnection(false);
+  source.onmessage = (message) => onEvent(JSON.parse(message.data));
+  source.addEventListener("end", () => {
+    source.close();
+    onEnd();
+  });
+  return () => source.close();
+}

@@ -1,0 +1,108 @@
+/** Render against photograph with a slider between, and the residual beside; earlier steps stay as a film strip. */
+
+import { artifactUrl, type JobEvent } from "./api";
+import { element } from "./element";
+
+interface Preview {
+  camera: string;
+  light: string;
+  channel: string;
+  step: number;
+  heldOut: boolean;
+  render: string;
+  photo: string;
+  residual: string;
+}
+
+const text = (value: unknown): string => (typeof value === "string" ? value : "");
+
+export class Comparison {
+  readonly root = element("div", { class: "comparison" });
+  private readonly views = new Map<string, Map<number, Preview>>();
+  private readonly choice = element("select", { id: "picture-choice" });
+  private readonly step = element("input", { type: "range", id: "picture-step", min: "0", step: "1" });
+  private readonly stepText = element("output", { for: "picture-step" });
+  private readonly split = element("input", { type: "range", id: "picture-split", min: "0", max: "100", value: "50" });
+  private readonly photo = element("img", { alt: "" });
+  private readonly render = element("img", { alt: "", class: "over" });
+  private readonly line = element("div", { class: "line" });
+  private readonly residual = element("img", { alt: "" });
+  private followsLatest = true;
+
+  constructor(private readonly job: string) {
+    this.root.append(element("p", { class: "soft" }, "No picture yet."));
+    this.choice.addEventListener("change", () => this.show(true));
+    this.step.addEventListener("input", () => {
+      this.followsLatest = this.step.value === this.step.max;
+      this.show(false);
+    });
+    this.split.addEventListener("input", () => this.place());
+  }
+
+  add(event: JobEvent): void {
+    const { camera, light, channel, step, render, photo, residual, held_out: heldOut } = event.data;
+    const preview: Preview = {
+      camera: text(camera),
+      light: text(light),
+      channel: text(channel),
+      step: typeof step === "number" ? step : event.id,
+      heldOut: heldOut === true,
+      render: text(render),
+      photo: text(photo),
+      residual: text(residual),
+    };
+    const key = [preview.channel, preview.camera, preview.light].filter(Boolean).join(" · ");
+    if (!this.views.size) this.build();
+    const steps = this.views.get(key) ?? new Map<number, Preview>();
+    if (!this.views.has(key)) this.choice.append(element("option", { value: key }, preview.heldOut ? `${key} (held out)` : key));
+    this.views.set(key, steps.set(preview.step, preview));
+    if (this.choice.value === key) this.show(this.followsLatest);
+  }
+
+  private build(): void {
+    const controls = element(
+      "div",
+      { class: "controls" },
+      element("label", { for: "picture-choice" }, "Picture"),
+      this.choice,
+      element("label", { for: "picture-step" }, "Step"),
+      this.step,
+      this.stepText,
+      element("label", { for: "picture-split" }, "Render | photo"),
+      this.split,
+    );
+    const stack = element("div", { class: "stack" }, this.photo, this.render, this.line);
+    const pictures = element(
+      "div",
+      { class: "pictures" },
+      element("figure", {}, stack, element("figcaption", {}, "left of the line: render; right: photograph")),
+      element("figure", {}, this.residual, element("figcaption", {}, "residual: render less photograph")),
+    );
+    this.root.replaceChildren(controls, pictures);
+    this.place();
+  }
+
+  private show(latest: boolean): void {
+    const steps = [...(this.views.get(this.choice.value)?.values() ?? [])].sort((a, b) => a.step - b.step);
+    this.step.max = String(Math.max(steps.length - 1, 0));
+    if (latest) this.step.value = this.step.max;
+    const shown = steps[Number(this.step.value)];
+    if (!shown) return;
+    const name = `camera ${shown.camera}, light ${shown.light}, step ${shown.step}`;
+    this.stepText.textContent = String(shown.step);
+    for (const [image, path, kind] of [
+      [this.render, shown.render, "Render"],
+      [this.photo, shown.photo, "Photograph"],
+      [this.residual, shown.residual, "Residual"],
+    ] as const) {
+      image.alt = `${kind}: ${name}`;
+      image.src = artifactUrl(this.job, path);
+    }
+  }
+
+  private place(): void {
+    const share = `${this.split.value}%`;
+    this.render.style.setProperty("clip-path", `inset(0 calc(100% - ${share}) 0 0)`);
+    this.line.style.setProperty("left", share);
+  }
+}

@@ -1,0 +1,38 @@
+/** Numbers for people: an uncertain number shows as many digits as its standard error allows. */
+
+import type { Estimate } from "./api";
+
+const UNITS: Record<string, string> = { "1": "", "1/mm": "mm⁻¹", "per mm": "mm⁻¹", "mm^-1": "mm⁻¹" };
+
+export function unitOf(estimate: Estimate): string {
+  return UNITS[estimate.unit] ?? estimate.unit;
+}
+
+export function valueOf(estimate: Estimate): string {
+  if (estimate.se === null) return significant(estimate.value);
+  const decimals = decimalsFor(estimate.se);
+  return `${estimate.value.toFixed(decimals)} ± ${estimate.se.toFixed(decimals)}`;
+}
+
+export function significant(value: number): string {
+  return Number(value.toPrecision(4)).toString();
+}
+
+export function percent(fraction: number): string {
+  return `${(100 * fraction).toFixed(1)} %`;
+}
+
+export function bytes(count: number): string {
+  const units = ["B", "kB", "MB", "GB"];
+  const power = Math.min(Math.floor(Math.log10(Math.max(count, 1)) / 3), units.length - 1);
+  return `${(count / 1000 ** power).toFixed(power ? 1 : 0)} ${units[power]}`;
+}
+
+export function when(seconds: number): string {
+  return new Date(1000 * seconds).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
+}
+
+/** Two digits of the standard error. */
+function decimalsFor(se: number): number {
+  return se > 0 ? Math.min(Math.max(1 - Math.floor(Math.log10(se)), 0), 8) : 4;
+}

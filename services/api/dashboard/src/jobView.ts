@@ -1,0 +1,120 @@
+/** One job, live: fed by its event stream, completed from its artifacts when it ends. */
+
+import { artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob } from "./api";
+import { Comparison } from "./comparison";
+import { element } from "./element";
+import { bytes, when } from "./format";
+import { LossChart } from "./lossChart";
+import { ParameterTable } from "./parameterTable";
+import { StageList } from "./stageList";
+
+const FINAL: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
+
+export class JobView {
+  readonly root = element("article", { class: "job" });
+  private readonly state = element("span", { class: "badge", role: "status" });
+  private readonly failure = element("p", { class: "failure", role: "alert" });
+  private readonly action = element("button", { type: "button" });
+  private readonly stages = new StageList();
+  private readonly chart = new LossChart();
+  private readonly parameters = new ParameterTable();
+  private readonly comparison: Comparison;
+  private readonly files = element("ul", { class: "files" });
+  private current: JobState = "SUBMITTED";
+  private close: () => void = () => undefined;
+
+  constructor(
+    private readonly id: string,
+    private readonly onChange: () => void,
+    private readonly onConnection: (open: boolean) => void,
+  ) {
+    this.comparison = new Comparison(id);
+    this.failure.hidden = true;
+    this.action.addEventListener("click", () => void this.act());
+  }
+
+  /** Fill the view and follow the job until `stop`. */
+  async start(): Promise<void> {
+    const job = await getJob(this.id);
+    const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
+    const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
+    this.root.replaceChildren(
+      element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action),
+      element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
+      this.failure,
+      section("Stages", this.stages.root),
+      section("Fit", this.chart.root),
+      section("Render and photograph", this.comparison.root),
+      section("Parameters", this.parameters.root),
+      section("Files", this.files),
+    );
+    this.stages.show(job.stages);
+    this.showState(job);
+    this.follow();
+    await this.showFiles();
+  }
+
+  stop(): void {
+    this.close();
+  }
+
+  private follow(): void {
+    this.close();
+    this.close = followEvents(this.id, (event) => this.take(event), () => void this.refresh(), this.onConnection);
+  }
+
+  private take(event: JobEvent): void {
+    this.stages.take(event);
+    if (event.kind === "step") {
+      this.chart.add(event);
+      const { parameters, channel } = event.data;
+      if (parameters && typeof parameters === "object") this.parameters.showStep(typeof channel === "string" ? channel : "all", parameters as Record<string, number>);
+    }
+    if (event.kind === "preview") this.comparison.add(event);
+    if (event.kind === "finished") void this.showFiles();
+    if (event.kind === "state") void this.refreshState();
+  }
+
+  /** The replay tells old states too, so the state itself is always asked for. */
+  private async refreshState(): Promise<Job> {
+    const job = await getJob(this.id);
+    this.showState(job);
+    if (FINAL.includes(job.state)) this.stages.show(job.stages);
+    this.onChange();
+    return job;
+  }
+
+  private async refresh(): Promise<void> {
+    await this.refreshState();
+    await this.showFiles();
+  }
+
+  private showState(job: Job): void {
+    this.current = job.state;
+    this.state.textContent = job.state.toLowerCase();
+    this.state.dataset["state"] = job.state;
+    this.failure.hidden = job.failure === null;
+    this.failure.textContent = job.failure ? `${job.failure.stage ?? "job"}: ${job.failure.message}` : "";
+    this.action.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING";
+    this.action.textContent = FINAL.includes(job.state) ? "Retry" : "Cancel";
+  }
+
+  private async act(): Promise<void> {
+    const retry = FINAL.includes(this.current);
+    this.showState(await (retry ? retryJob : cancelJob)(this.id));
+    if (retry) this.follow();
+    this.onChange();
+  }
+
+  private async showFiles(): Promise<void> {
+    const files = await listArtifacts(this.id);
+    const isResult = (path: string) => path.startsWith("asset/") || !path.includes("/");
+    const shown = files.filter((file) => isResult(file.path));
+    this.files.replaceChildren(
+      ...shown.map((file) =>
+        element("li", {}, element("a", { href: artifactUrl(this.id, file.path), target: "_blank", rel: "noopener" }, file.path), ` ${bytes(file.bytes)}`),
+      ),
+    );
+    if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id));
+  }
+}

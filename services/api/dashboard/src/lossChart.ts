@@ -1,0 +1,98 @@
+/** The live curve of a fit: loss and held-out error per channel over steps, on a logarithmic axis. */
+
+import uPlot from "uplot";
+import type { JobEvent } from "./api";
+import { element } from "./element";
+import { percent, significant } from "./format";
+
+interface Point {
+  loss: number | null;
+  heldOut: number | null;
+}
+
+const positive = (value: unknown): number | null => (typeof value === "number" && value > 0 ? value : null);
+
+export class LossChart {
+  readonly root = element("figure", { class: "chart" });
+  private readonly canvas = element("div", { role: "img" });
+  private readonly caption = element("figcaption", { "aria-live": "polite" }, "No step yet.");
+  private readonly channels = new Map<string, Map<number, Point>>();
+  private plot: uPlot | null = null;
+  private plotted = "";
+  private stale = false;
+
+  constructor() {
+    this.root.append(this.canvas, this.caption);
+    new ResizeObserver(() => this.plot?.setSize(this.size())).observe(this.canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      this.plotted = "";
+      this.draw();
+    });
+  }
+
+  /** Take in a step; a step that a later attempt repeats replaces the earlier one. */
+  add(event: JobEvent): void {
+    const { step, loss, held_out_error: heldOut, channel } = event.data;
+    if (typeof step !== "number") return;
+    const name = typeof channel === "string" ? channel : "all";
+    const points = this.channels.get(name) ?? new Map<number, Point>();
+    this.channels.set(name, points.set(step, { loss: positive(loss), heldOut: positive(heldOut) }));
+    if (!this.stale) requestAnimationFrame(() => this.draw());
+    this.stale = true;
+  }
+
+  private size(): { width: number; height: number } {
+    return { width: this.canvas.clientWidth || 600, height: 300 };
+  }
+
+  private draw(): void {
+    this.stale = false;
+    if (!this.channels.size) return;
+    const names = [...this.channels.keys()];
+    const steps = [...new Set([...this.channels.values()].flatMap((points) => [...points.keys()]))].sort((a, b) => a - b);
+    const column = (points: Map<number, Point>, key: keyof Point) => steps.map((step) => points.get(step)?.[key] ?? null);
+    const data = [steps, ...[...this.channels.values()].flatMap((points) => [column(points, "loss"), column(points, "heldOut")])] as uPlot.AlignedData;
+    if (this.plot && this.plotted === names.join()) this.plot.setData(data);
+    else this.rebuild(names, data);
+    this.describe(steps.length);
+  }
+
+  private rebuild(names: string[], data: uPlot.AlignedData): void {
+    const style = getComputedStyle(document.documentElement);
+    const colour = (name: string) => style.getPropertyValue(name).trim();
+    const line = (name: string, index: number) => colour(`--channel-${name}`) || colour(`--line-${index % 3}`);
+    const axis = { stroke: colour("--text-soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--rule") } };
+    const series = names.flatMap((name, index) => [
+      { label: `${name} loss`, stroke: line(name, index), width: 2, spanGaps: true },
+      { label: `${name} held-out error`, stroke: line(name, index), width: 2, dash: [6, 4], points: { show: true, size: 6 }, spanGaps: true },
+    ]);
+    this.plot?.destroy();
+    this.plot = new uPlot(
+      {
+        ...this.size(),
+        scales: { x: { time: false }, y: { distr: 3 } },
+        axes: [
+          { ...axis, label: "step", incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500] },
+          { ...axis, label: "relative error", size: 70 },
+        ],
+        legend: { markers: { dash: (plot, index) => (plot.series[index]?.dash ? "dashed" : "solid"), fill: "transparent" } },
+        series: [{ label: "step" }, ...series],
+      },
+      data,
+      this.canvas,
+    );
+    this.plotted = names.join();
+  }
+
+  private describe(count: number): void {
+    const latest = [...this.channels].map(([name, points]) => {
+      const last = [...points.values()];
+      const loss = last.at(-1)?.loss;
+      const heldOut = last.findLast((point) => point.heldOut !== null)?.heldOut;
+      return `${name}: loss ${loss ? significant(loss) : "not yet"}${heldOut ? `, held-out error ${percent(heldOut)}` : ""}`;
+    });
+    const text = `${count} steps. ${latest.join("; ")}.`;
+    this.caption.textContent = text;
+    this.canvas.setAttribute("aria-label", `Loss over steps, logarithmic. ${text}`);
+  }
+}

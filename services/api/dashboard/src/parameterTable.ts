@@ -1,0 +1,57 @@
+/** Fitted parameters per channel, each with unit, standard error, and a flag where the data does not determine it. */
+
+import type { Parameters } from "./api";
+import { element } from "./element";
+import { significant, unitOf, valueOf } from "./format";
+
+export class ParameterTable {
+  readonly root = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" }, element("p", { class: "soft" }, "No value yet."));
+  private readonly current = new Map<string, Record<string, number>>();
+  private isFinal = false;
+
+  /** Values of a running fit: no uncertainty is known yet, and the table says so. */
+  showStep(channel: string, values: Record<string, number>): void {
+    this.current.set(channel, values);
+    if (this.isFinal) return;
+    const cell = (name: string, at: string) => [significant(this.current.get(at)?.[name] ?? NaN)];
+    const names = [...new Set([...this.current.values()].flatMap(Object.keys))];
+    this.fill("While fitting: current values, uncertainty not known yet.", [...this.current.keys()], names, () => "", cell);
+  }
+
+  /** The published result. */
+  showResult(result: Parameters): void {
+    this.isFinal = true;
+    const channels = Object.keys(result);
+    const names = [...new Set(channels.flatMap((channel) => Object.keys(result[channel] ?? {})))];
+    const unit = (name: string) => {
+      const first = channels.map((channel) => result[channel]?.[name]).find((estimate) => estimate);
+      return first ? unitOf(first) : "";
+    };
+    this.fill("Result: value ± one standard error.", channels, names, unit, (name, channel) => {
+      const estimate = result[channel]?.[name];
+      if (!estimate) return ["–"];
+      const flags = [estimate.determined ? null : "not determined", estimate.se === null ? "not fitted" : null];
+      return [valueOf(estimate), ...flags.filter((flag) => flag !== null).map((flag) => element("span", { class: "flag" }, flag))];
+    });
+  }
+
+  private fill(
+    caption: string,
+    channels: string[],
+    names: string[],
+    unit: (name: string) => string,
+    cell: (name: string, channel: string) => (string | HTMLElement)[],
+  ): void {
+    const head = element("tr", {}, ...["parameter", "unit", ...channels].map((text) => element("th", { scope: "col" }, text)));
+    const rows = names.map((name) =>
+      element(
+        "tr",
+        {},
+        element("th", { scope: "row" }, name),
+        element("td", {}, unit(name)),
+        ...channels.map((channel) => element("td", { class: "number" }, ...cell(name, channel))),
+      ),
+    );
+    this.root.replaceChildren(element("table", {}, element("caption", {}, caption), element("thead", {}, head), element("tbody", {}, ...rows)));
+  }
+}
