@@ -71,7 +71,7 @@ class FolderSource:
             radiance = self._read(entry, entry.file, camera)
             finite = np.isfinite(radiance)
             broken = int(np.count_nonzero(~finite.all(axis=-1) & footprint.covered))
-            if broken > NOT_FINITE_LIMIT * int(np.count_nonzero(footprint.covered)):
+            if broken > max(1, NOT_FINITE_LIMIT * int(np.count_nonzero(footprint.covered))):
                 raise CaptureInputError(
                     f"Image file {self.root / entry.file} (camera {name}, light {entry.light}) is not finite at {broken} tooth pixels; export it again."
                 )

@@ -50,13 +50,21 @@ def half_angles(camera: Camera, light: Light, footprint: Footprint, band_rows: i
 
 
 def highlight_mask(
-    radiance: Image, variance: Image, usable: BoolArray, angles: Image, normal: Image, light_colour: tuple[float, ...], options: HighlightOptions | None = None
+    radiance: Image,
+    variance: Image,
+    usable: BoolArray,
+    saturated: BoolArray,
+    angles: Image,
+    normal: Image,
+    light_colour: tuple[float, ...],
+    options: HighlightOptions | None = None,
 ) -> BoolArray:
     """Mask (H, W) of pixels that a surface reflection brightens by more than ``options.tolerated``.
 
     Args:
         radiance, variance: (H, W, C), linear, and its variance.
         usable: (H, W), pixels whose whole footprint is tooth and whose value is good.
+        saturated: (H, W), tooth pixels without a value because too bright; near the mirror direction they are a highlight's core.
         angles: (H, W) from ``half_angles``.
         normal: (H, W, 3), outward.
         light_colour: the light's intensity per channel.
@@ -65,7 +73,8 @@ def highlight_mask(
 
     o = options or HighlightOptions()
     near = usable & (angles < np.radians(o.cone_deg))
-    if not near.any():
+    burnt = saturated & (angles < np.radians(o.cone_deg))
+    if not (near | burnt).any():
         return np.zeros(usable.shape, dtype=bool)
     axis = np.asarray(light_colour, dtype=np.float64)
     axis /= np.linalg.norm(axis)
@@ -84,12 +93,13 @@ def highlight_mask(
     # Hysteresis: a strong core, continued through weak neighbours, and one pixel of bloom
     weak = near & (fraction > o.weak) & (estimate > o.weak_sigma * sigma)
     strong = weak & (fraction > o.strong) & (estimate > o.strong_sigma * sigma)
+    weak, strong = weak | burnt, strong | burnt
     labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=8)[1]
     core = np.isin(labels, np.unique(labels[strong])) & weak
     bloom = cv2.dilate(core.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
     lobe = angles < _lobe_angle(estimate, weight, brightness, usable, angles, o)
-    return usable & (bloom | lobe) if core.any() else np.zeros(usable.shape, dtype=bool)
+    return (usable | saturated) & (bloom | lobe) if core.any() else np.zeros(usable.shape, dtype=bool)
 
 
 def _by_shading(brightness: Image, variance: Image, usable: BoolArray, far: BoolArray, normal: Image, o: HighlightOptions) -> tuple[Image, Image]:

@@ -62,5 +62,5 @@ class Merge:
     def result(self) -> tuple[Image, Image, BoolArray]:
         """Radiance and variance (H, W, C), and where no exposure was usable (H, W)."""
         weight = np.maximum(self._weight, 1e-30)
-        lost = (self._weight == 0).any(axis=-1)
-        return self._weighted / weight, np.where(lost[..., None], 0, 1 / weight).astype(np.float32), lost
+        lost: BoolArray = (self._weight == 0).any(axis=-1)
+        return (self._weighted / weight).astype(np.float32), np.where(lost[..., None], 0, 1 / weight).astype(np.float32), lost

@@ -79,18 +79,18 @@ class RigSource:
 def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion, counts: Counts) -> LightImage:
     merged = Merge(radiometry.black.shape)
     moves = [motion.at(frame) for frame in frames]
-    warped = False
+    warped, beyond = False, np.zeros(radiometry.black.shape[:2], dtype=bool)
     for frame, move in zip(frames, moves, strict=True):
         radiance, variance, saturated = radiometry.radiance(counts(frame), frame)
         if move.median_px > STILL_PX:
             # Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right
             field = motion.field(move)
             radiance, variance, saturated = warp(radiance, field), warp(variance, field), warp(saturated, field) > 0
-            saturated |= (variance <= 0).any(axis=-1)
+            beyond |= (variance <= 0).any(axis=-1)
             warped = True
         merged.add(radiance, variance, saturated)
     radiance, variance, lost = merged.result()
-    bits = np.where(lost, MaskBit.SATURATED, 0).astype(np.uint16)
+    bits = (np.where(lost & ~beyond, MaskBit.SATURATED, 0) | np.where(beyond, MaskBit.MOTION, 0)).astype(np.uint16)
     if max(move.error_px for move in moves) > UNCERTAIN_PX:
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)

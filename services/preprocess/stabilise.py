@@ -124,7 +124,8 @@ class Aligner:
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
             basis = level.terms[level.region] / level.pixel_px
             fixed_x, fixed_y = _gradient(level.feature)
-            for _ in range(iterations):
+            # The finest level only polishes; far motion is found below it
+            for _ in range(iterations if level is not self._levels[0] else iterations // 3):
                 # Sample the frame where the reference pixel has gone; the gradient is the mean of both images'
                 shift = level.terms @ coefficients.astype(np.float32) / level.pixel_px
                 warped = cv2.remap(moving, x + shift[..., 0], y + shift[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -148,7 +149,7 @@ class Aligner:
 def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
     """Values at ``time`` by the cubic through the four nearest knots, and an error estimate.
 
-    The estimate is the difference to the parabola through the three nearest, which bounds the cubic's error where motion is smooth; with
+    The estimate is the difference to the parabola through the three nearest, larger than the cubic's own error where motion is smooth; with
     fewer than three knots it is zero, since nothing is known.
 
     Args:

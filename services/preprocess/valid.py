@@ -25,8 +25,10 @@ def valid_bits(image: LightImage, footprint: Footprint, camera: Camera, light: L
     if image.warped:
         inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
     bits = image.bits | np.where(inside, 0, MaskBit.OUTSIDE).astype(np.uint16)
-    usable = footprint.covered & (image.bits & ~np.uint16(MaskBit.MOTION) == 0)
-    highlight = highlight_mask(image.radiance, image.variance, usable, half_angles(camera, light, footprint), footprint.normal, light.intensity)
+    saturated = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED) > 0)
+    usable = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE) == 0)
+    angles = half_angles(camera, light, footprint)
+    highlight = highlight_mask(image.radiance, image.variance, usable, saturated, angles, footprint.normal, light.intensity)
     return np.asarray(bits | np.where(highlight, MaskBit.HIGHLIGHT, 0).astype(np.uint16), dtype=np.uint16)
 
 

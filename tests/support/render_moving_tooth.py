@@ -90,7 +90,7 @@ def light_positions(count: int) -> FloatArray:
 def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
     """Frames in the order of ``options["frames"]``: a list of (light index or -1 for all on, time in 0..1).
 
-    Returns total and diffuse radiance (camera, frame, y, x, 3) float32 and everything needed to describe the capture.
+    Returns total and diffuse radiance (camera, frame, y, x, 3) float32, the latter 0 in all-on frames, and everything that describes the capture.
     """
     import mitsuba as mi
 
@@ -146,9 +146,9 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
         for light, time in options["frames"]:
             pose_now = motion(time, options["amplitude_mm"])
             for images, specular in ((total, 1.0), (diffuse, 0.0)):
-                # Light by light, since choosing one light per sample at random would add noise
+                # Light by light, since choosing one light per sample at random would add noise; what is specular matters in light frames alone
                 image = np.zeros((height, width, 3), dtype=np.float32)
-                for k in range(len(lights)) if light < 0 else [light]:
+                for k in [light] if light >= 0 else range(len(lights) if specular else 0):
                     lamp = {"type": "point", "position": lights[k].tolist(), "intensity": {"type": "rgb", "value": intensity.tolist()}}
                     scene = {"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor, "tooth": tooth(pose_now, specular), "lamp": lamp}
                     image += np.array(mi.render(mi.load_dict(scene), seed=11))

@@ -1,0 +1,230 @@
+"""Import of folder captures: the real incisor's, and everything that can be wrong with one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import zarr
+
+from services.core.errors import CaptureInputError, DentineError, MeshError, SettingsError
+from services.core.geometry import Mesh
+from services.core.meshfiles import write_mesh
+from services.core.records import JobSpec, MaskBit, PreparedManifest
+from services.core.stage import LocalContext
+from services.core.store import open_stage
+from services.preprocess.stage import run
+from tests.support.shared_data import shared_path
+
+Tree = dict[str, Any]
+
+
+def write_folder(root: Path) -> Tree:
+    """A minimal capture: a ball, two cameras of different size, two lights, two channels."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
+    write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32)))
+    tree: Tree = {"units": "mm", "channels": ["green", "blue"], "cameras": [], "lights": [], "images": []}
+    for name, size in (("front", (20, 16)), ("side", (24, 18))):
+        K = [[1500, 0, size[0] / 2], [0, 1500, size[1] / 2], [0, 0, 1]]
+        pose = np.eye(4)
+        pose[2, 3] = 1000
+        tree["cameras"].append({"name": name, "size": size, "K": K, "camera_from_world": pose.tolist()})
+    for k, name in enumerate(("left", "right")):
+        tree["lights"].append({"name": name, "position_mm": [(-900, 900)[k], 0, -400], "intensity": [1e6, 1e6]})
+    rng = np.random.default_rng(3)
+    for camera in tree["cameras"]:
+        for light in tree["lights"]:
+            file = f"{camera['name']}_{light['name']}.npy"
+            width, height = camera["size"]
+            np.save(root / file, rng.uniform(0.5, 1, (height, width, 2)).astype(np.float32))
+            tree["images"].append({"camera": camera["name"], "light": light["name"], "file": file})
+    write_tree(root, tree)
+    return tree
+
+
+def write_tree(root: Path, tree: Tree) -> None:
+    (root / "capture.json").write_text(json.dumps(tree))
+
+
+def prepare(folder: Path, root: Path, **options: Any) -> PreparedManifest:
+    return run(JobSpec(capture=folder, **options), LocalContext(root))
+
+
+def test_incisor_imports_whole(tmp_path: Path) -> None:
+    """Valid pixels are those that ray tracing of centres and corners gives; images and variances arrive bit by bit."""
+    folder = shared_path("data/tooth-ur1-truth")
+    manifest = prepare(folder, tmp_path, boundary="matched", dentin="known")
+    published, _ = open_stage(tmp_path, "prepared", PreparedManifest)
+    radiance, variance, valid = (zarr.open_array(published / "prepared.zarr" / name, mode="r") for name in ("radiance", "variance", "valid"))
+    assert radiance.shape == (3, 8, 34, 28, 1)
+    assert valid.metadata.dimension_names == ("camera", "light", "y", "x")
+    counts = (np.asarray(valid) == 0).sum(axis=(2, 3))
+    np.testing.assert_array_equal(counts, np.repeat([[367], [380], [370]], 8, axis=1))
+    np.testing.assert_array_equal(radiance[2, 5], np.load(folder / "c2_l5.npy"))
+    np.testing.assert_array_equal(variance[1, 3], np.load(folder / "c1_l3_var.npy"))
+    assert set(manifest.held_out) == {(f"c{k}", f"l{j}") for k in range(3) for j in (5, 6, 7)}
+    assert (manifest.fdi, manifest.dentin_known, manifest.median_motion_px, manifest.valid_fraction) == ((11,), (11,), None, 1.0)
+    assert (published / "teeth" / "11" / "dentin.ply").is_file()
+
+
+def test_noise_model_fills_in_for_missing_variance(tmp_path: Path) -> None:
+    write_folder(tmp_path)
+    prepare(tmp_path, tmp_path / "job", sensor_noise_relative=0.03, sensor_noise_floor=0.01)
+    image = np.load(tmp_path / "front_right.npy").astype(np.float64)
+    variance = zarr.open_array(tmp_path / "job" / "prepared" / "prepared.zarr" / "variance", mode="r")
+    np.testing.assert_allclose(variance[0, 1, :16, :20], (0.03 * image) ** 2 + (0.01 * image.max()) ** 2, rtol=1e-5)
+
+
+def test_padding_and_absent_pairs_are_not_valid(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    tree["images"] = tree["images"][:-1]
+    write_tree(tmp_path, tree)
+    prepare(tmp_path, tmp_path / "job")
+    valid = np.asarray(zarr.open_array(tmp_path / "job" / "prepared" / "prepared.zarr" / "valid", mode="r"))
+    assert valid.shape == (2, 2, 18, 24)
+    assert (valid[0, :, 16:] == MaskBit.OUTSIDE).all()
+    assert (valid[0, :, :, 20:] == MaskBit.OUTSIDE).all()
+    assert (valid[1, 1] & MaskBit.UNLIT > 0).all()
+    assert (valid[1, 0] == 0).any()
+
+
+def test_few_dead_pixels_and_zero_variance_are_masked(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    image = np.load(tmp_path / "front_left.npy")
+    image[8, 10, 0] = np.nan
+    np.save(tmp_path / "front_left.npy", image)
+    variance = np.full((16, 20, 2), 1e-4, dtype=np.float32)
+    variance[8, 11] = 0
+    np.save(tmp_path / "variance.npy", variance)
+    tree["images"][0]["variance_file"] = "variance.npy"
+    write_tree(tmp_path, tree)
+    prepare(tmp_path, tmp_path / "job")
+    store = tmp_path / "job" / "prepared" / "prepared.zarr"
+    valid, radiance = (np.asarray(zarr.open_array(store / name, mode="r")) for name in ("valid", "radiance"))
+    assert (valid[0, 0, 8, [10, 11]] & MaskBit.NOT_FINITE > 0).all()
+    assert valid[0, 0, 8, 9] & MaskBit.NOT_FINITE == 0
+    assert np.isfinite(radiance).all()
+
+
+def test_held_out_lights_of_the_job_replace_the_captures(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    tree["images"][0]["held_out"] = True
+    write_tree(tmp_path, tree)
+    assert prepare(tmp_path, tmp_path / "own").held_out == (("front", "left"),)
+    assert prepare(tmp_path, tmp_path / "asked", held_out_lights=("right",)).held_out == (("front", "right"), ("side", "right"))
+    assert prepare(tmp_path, tmp_path / "none", held_out_lights=()).held_out == ()
+
+
+def edit(change: Callable[[Tree], object]) -> Callable[[Path, Tree], None]:
+    def damage(root: Path, tree: Tree) -> None:
+        change(tree)
+        write_tree(root, tree)
+
+    return damage
+
+
+def replace_image(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, Tree], None]:
+    return lambda root, _: np.save(root / "side_left.npy", make(np.load(root / "side_left.npy")))
+
+
+def rescale_mesh(factor: float) -> Callable[[Path, Tree], None]:
+    def damage(root: Path, _: Tree) -> None:
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=4 * factor)
+        write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32)))
+
+    return damage
+
+
+def open_mesh(root: Path, _: Tree) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
+    write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces[3:], dtype=np.int32)))
+
+
+def move_camera(distance: float) -> Callable[[Tree], object]:
+    return lambda tree: tree["cameras"][1]["camera_from_world"][2].__setitem__(3, distance)
+
+
+BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] = {
+    "missing file": (
+        lambda root, _: (root / "front_right.npy").unlink(),
+        CaptureInputError,
+        r"front_right\.npy \(camera front, light right\) does not exist",
+    ),
+    "truncated file": (
+        lambda root, _: (root / "side_left.npy").write_bytes((root / "side_left.npy").read_bytes()[:300]),
+        CaptureInputError,
+        r"side_left\.npy \(camera side, light left\) cannot be read .*truncated",
+    ),
+    "not a file of arrays": (lambda root, _: (root / "side_left.npy").write_bytes(b""), CaptureInputError, r"side_left\.npy .*cannot be read"),
+    "wrong shape": (replace_image(lambda image: image[1:]), CaptureInputError, r"side_left\.npy .* shape \(17, 24, 2\) instead of \(18, 24, 2\)"),
+    "whole numbers": (replace_image(lambda image: (255 * image).astype(np.uint8)), CaptureInputError, r"side_left\.npy .*floating-point radiance"),
+    "NaN": (replace_image(lambda image: image * np.nan), CaptureInputError, r"side_left\.npy \(camera side, light left\) is not finite at \d+ tooth pixels"),
+    "no image": (edit(lambda tree: tree.update(images=[])), CaptureInputError, r"lists no image"),
+    "unknown camera": (edit(lambda tree: tree["images"][1].update(camera="rear")), CaptureInputError, r"front_right\.npy names camera rear"),
+    "unknown light": (edit(lambda tree: tree["images"][1].update(light="sun")), CaptureInputError, r"front_right\.npy names light sun"),
+    "same pair twice": (edit(lambda tree: tree["images"].append(tree["images"][0])), CaptureInputError, r"camera front under light left twice"),
+    "same light twice": (edit(lambda tree: tree["lights"].append(tree["lights"][0])), CaptureInputError, r"light left twice"),
+    "channel without intensity": (edit(lambda tree: tree["lights"][1].update(intensity=[1e6])), CaptureInputError, r"light right has 1 intensities for 2"),
+    "other format": (edit(lambda tree: tree["images"][0].update(file="capture.json")), CaptureInputError, r"no \.npy file"),
+    "file elsewhere": (edit(lambda tree: tree["images"][0].update(file="../secret.npy")), CaptureInputError, r"secret\.npy lies outside"),
+    "not JSON": (lambda root, _: (root / "capture.json").write_text("{"), CaptureInputError, r"capture\.json"),
+    "other units": (edit(lambda tree: tree.update(units="m")), CaptureInputError, r"capture\.json: units"),
+    "no mesh": (lambda root, _: (root / "teeth" / "11" / "outer.ply").unlink(), CaptureInputError, r"outer\.ply does not exist"),
+    "mesh in metres": (rescale_mesh(1e-3), MeshError, r"teeth/11/outer\.ply is 0\.008 units across.*rescale"),
+    "mesh with holes": (open_mesh, MeshError, r"teeth/11/outer\.ply is not watertight"),
+    "pose in metres": (edit(move_camera(1.0)), CaptureInputError, r"Camera side stands 1 mm from the teeth"),
+    "pose in micrometres": (edit(move_camera(1e6)), CaptureInputError, r"teeth span 0\.012 px in camera side"),
+    "light in metres": (edit(lambda tree: tree["lights"][0].update(position_mm=[-0.9, 0, -0.4])), CaptureInputError, r"Light left stands 0\.985 mm"),
+    "tooth out of view": (edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)), CaptureInputError, r"No tooth .* camera front"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_ends_in_one_sentence(case: str, tmp_path: Path) -> None:
+    folder, job = tmp_path / "capture", tmp_path / "job"
+    folder.mkdir()
+    damage, kind, pattern = BAD[case]
+    damage(folder, write_folder(folder))
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(kind, match=pattern) as caught:
+        prepare(folder, job)
+    assert caught.value.message.endswith(".")
+    assert "\n" not in caught.value.message
+    assert not (job / "prepared").exists()
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("options", "pattern"),
+    [
+        ({"held_out_lights": ("sun",)}, r"'held_out_lights' names sun, but the capture has left, right"),
+        ({"held_out_lights": ("left", "right")}, r"keeps every light from the fit"),
+        ({"channels": ("red",)}, r"'channels' names red, but the capture has green, blue"),
+    ],
+)
+def test_options_that_do_not_fit_the_capture(options: Tree, pattern: str, tmp_path: Path) -> None:
+    write_folder(tmp_path)
+    with pytest.raises(SettingsError, match=pattern):
+        prepare(tmp_path, tmp_path / "job", **options)
+
+
+def test_a_failed_import_leaves_the_published_one(tmp_path: Path) -> None:
+    write_folder(tmp_path)
+    first = prepare(tmp_path, tmp_path / "job")
+    (tmp_path / "front_left.npy").unlink()
+    with pytest.raises(CaptureInputError):
+        prepare(tmp_path, tmp_path / "job")
+    assert open_stage(tmp_path / "job", "prepared", PreparedManifest)[1] == first
+
+
+def test_neither_folder_nor_store(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CaptureInputError, match=r"holds neither capture\.json nor a published capture"):
+        prepare(tmp_path / "empty", tmp_path / "job")
+    with pytest.raises(CaptureInputError, match=r"capture\.json does not exist"):
+        prepare(tmp_path / "absent", tmp_path / "job")
