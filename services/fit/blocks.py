@@ -1,0 +1,140 @@
+"""What a fit's tasks need, as small files that every worker reads: scene recipes and blocks of measurements. No pickles.
+
+A job writes them once, at its start; they fix the block partition and the order of summation for the life of the job.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CorruptStoreError
+from services.core.geometry import Camera, Mesh
+from services.core.store import write_atomic
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+
+Array = NDArray[np.float64]
+
+BLOCK_BYTES = 4 * 2**20
+"""Largest residual block that travels between tasks: mean and variance, float64."""
+BLOCK_PIXELS = 4096
+"""Largest block: long enough to fill a kernel, short enough that a lost worker costs little."""
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file named by its content."""
+
+    path: Path
+    digest: str
+
+    def load(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays in it.
+
+        Raises:
+            CorruptStoreError: absent or altered.
+        """
+        content = self.path.read_bytes() if self.path.is_file() else b""
+        if _digest(content) != self.digest:
+            raise CorruptStoreError(f"{self.path} is missing or altered; remove its folder so that the fit starts again.")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return dict(arrays)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Measurements of some pixels of one view; arrays over (light, pixel) are (L, N)."""
+
+    view: View
+    reference: Array
+    variance: Array
+    fit_weight: Array
+    """Weight in the fitted loss, 1/variance units; 0 where masked or held out."""
+    held_out: NDArray[np.bool_]
+    """Valid and kept from the fit."""
+
+
+def pixels_per_block(lights: int) -> int:
+    """Pixels whose residuals under all lights stay within BLOCK_BYTES."""
+    return max(1, min(BLOCK_PIXELS, BLOCK_BYTES // (16 * lights)))
+
+
+def write_block(folder: Path, block: Block) -> StoredFile:
+    """Store a block in ``folder``."""
+    return _write(
+        folder,
+        "block",
+        camera=np.frombuffer(block.view.camera.model_dump_json().encode(), dtype=np.uint8),
+        pixels=block.view.pixels,
+        reference=block.reference,
+        variance=block.variance,
+        fit_weight=block.fit_weight,
+        held_out=block.held_out,
+    )
+
+
+def read_block(stored: StoredFile) -> Block:
+    """Read a block."""
+    a = stored.load()
+    camera = Camera.model_validate_json(a["camera"].tobytes())
+    view = View(camera, a["pixels"].astype(np.int32))
+    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool))
+
+
+def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
+    """Store a recipe in ``folder``."""
+    dentin: dict[str, NDArray[Any]] = {}
+    if recipe.dentin is not None:
+        base = recipe.dentin.base
+        dentin = {"dentin_vertices": base.vertices_mm, "dentin_faces": base.faces, "dentin_modes": recipe.dentin.modes_mm}
+    return _write(
+        folder,
+        "scene",
+        outer_vertices=recipe.outer.vertices_mm,
+        outer_faces=recipe.outer.faces,
+        light_positions=recipe.light_positions_mm,
+        light_intensities=recipe.light_intensities,
+        boundary=np.array(recipe.boundary),
+        ior=np.array(recipe.ior),
+        **dentin,
+    )
+
+
+def read_recipe(stored: StoredFile) -> SceneRecipe:
+    """Read a recipe."""
+    a = stored.load()
+
+    def mesh(part: str) -> Mesh:
+        return Mesh(a[f"{part}_vertices"].astype(float), a[f"{part}_faces"].astype(np.int32))
+
+    return SceneRecipe(
+        outer=mesh("outer"),
+        dentin=DentinShape(mesh("dentin"), a["dentin_modes"].astype(float)) if "dentin_faces" in a else None,
+        light_positions_mm=a["light_positions"].astype(float),
+        light_intensities=a["light_intensities"].astype(float),
+        boundary="thin" if str(a["boundary"]) == "thin" else "matched",
+        ior=float(np.asarray(a["ior"], dtype=float)),
+    )
+
+
+def _write(folder: Path, stem: str, **arrays: NDArray[Any]) -> StoredFile:
+    # Written by value, so that writing it again changes nothing.
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    content = stream.getvalue()
+    digest = _digest(content)
+    path = folder / f"{stem}-{digest[:16]}.npz"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, content)
+    return StoredFile(path, digest)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

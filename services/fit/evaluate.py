@@ -1,0 +1,113 @@
+"""How well renders explain photographs: the relative image error, with both noises taken out.
+
+    err^2 = [sum (C1 - ref)(C2 - ref) - sum var_ref] / [sum ref^2 - sum var_ref]
+
+over valid pixels, linear radiance, C1 and C2 two independent renders. Monte Carlo noise cancels in the product, sensor noise in the subtraction, so a
+perfect model scores 0 on average whatever the noise; a negative square is noise and counts as 0.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.blocks import read_block
+from services.fit.engine_host import EngineHost
+from services.fit.optics.parameters import Tissue
+from services.fit.passes import BlockTask, Passes, TraceRow, trace_row
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Sums over measurements; blocks add."""
+
+    product: float = 0.0
+    reference_squared: float = 0.0
+    reference_variance: float = 0.0
+    product_noise: float = 0.0
+    """Monte Carlo variance of ``product``."""
+
+    def __add__(self, other: ErrorSums) -> ErrorSums:
+        return ErrorSums(
+            self.product + other.product,
+            self.reference_squared + other.reference_squared,
+            self.reference_variance + other.reference_variance,
+            self.product_noise + other.product_noise,
+        )
+
+    @property
+    def error(self) -> float | None:
+        """Relative image error, 0.05 for 5 %; None where there is no signal to compare with."""
+        signal = self.reference_squared - self.reference_variance
+        return float(np.sqrt(max(self.product - self.reference_variance, 0.0) / signal)) if signal > 0 else None
+
+    @property
+    def error_se(self) -> float | None:
+        """One standard error of ``error`` by Monte Carlo noise; at error 0 the error whose square is one standard error of the square."""
+        error, signal = self.error, self.reference_squared - self.reference_variance
+        if error is None:
+            return None
+        square_se = np.sqrt(self.product_noise) / signal
+        return float(min(square_se / (2 * error), np.sqrt(square_se))) if error > 0 else float(np.sqrt(square_se))
+
+
+def error_sums(first: Array, second: Array, reference: Array, variance: Array, chosen: NDArray[np.bool_]) -> ErrorSums:
+    """Sums over the chosen measurements of two independent renders against a reference; all arrays of one shape."""
+    a, b, r, v = (values[chosen] for values in (first, second, reference, variance))
+    spread = (a - b) * (0.5 * (a + b) - r)
+    return ErrorSums(float((a - r) @ (b - r)), float(r @ r), float(v.sum()), float(spread @ spread))
+
+
+Shown = tuple[tuple[str, int], ...]
+"""Images to return whole: camera name and light index."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors on fitted and on held-out images, and the images that were asked for."""
+
+    fitted: ErrorSums
+    held_out: ErrorSums
+    renders: dict[tuple[str, int], tuple[NDArray[np.int32], Array]]
+    """By camera name and light index: pixels (N, 2) and the mean of the two renders (N,)."""
+
+
+def evaluate(passes: Passes, label: str, tissue: Tissue, samples: int, shown: Shown = ()) -> Evaluation:
+    """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else."""
+    seeds = passes.seeds(label, "evaluate-1"), passes.seeds(label, "evaluate-2")
+    parts: list[BlockErrors] = passes.run(f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown)
+    passes.record([part.trace for part in parts])
+    fitted, held_out = ErrorSums(), ErrorSums()
+    pieces: dict[tuple[str, int], list[tuple[NDArray[np.int32], Array]]] = {}
+    for part in parts:
+        fitted, held_out = fitted + part.fitted, held_out + part.held_out
+        for image, values in part.renders.items():
+            pieces.setdefault(image, []).append((part.pixels, values))
+    renders = {image: (np.concatenate([p for p, _ in found]), np.concatenate([v for _, v in found])) for image, found in pieces.items()}
+    return Evaluation(fitted, held_out, renders)
+
+
+@dataclass(frozen=True)
+class BlockErrors:
+    """One block's share of an evaluation."""
+
+    fitted: ErrorSums
+    held_out: ErrorSums
+    pixels: NDArray[np.int32]
+    renders: dict[tuple[str, int], Array]
+    trace: TraceRow
+
+
+def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown) -> BlockErrors:
+    """Errors of one block."""
+    start, block = time.time(), read_block(task.block)
+    first, second = (host.call("images", task.recipe, task.tissue, block.view, samples=task.samples, seed=seed).mean for seed in seeds)
+    fitted, held_out = (error_sums(first, second, block.reference, block.variance, chosen) for chosen in (block.fit_weight > 0, block.held_out))
+    camera = block.view.camera.name
+    renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in shown if name == camera}
+    return BlockErrors(fitted, held_out, block.view.pixels, renders, trace_row("evaluate", task, start))

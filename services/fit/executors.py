@@ -1,0 +1,104 @@
+"""Where tasks run: here, one after the other, or on the workers of a Dask cluster. A task is ``task(host, *args)``; arguments may be earlier results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from services.fit.engine_host import ENGINE, ChildHost, EngineHost, InProcessHost
+
+Task = Callable[..., Any]
+ALLOWED_RETRIES = 3
+
+
+class Executor(Protocol):
+    """Runs tasks."""
+
+    def submit(self, key: str, task: Task, *args: Any) -> Any:
+        """Start ``task(host, *args)``; returns something that later submits and ``gather`` take."""
+
+    def gather(self, pending: Sequence[Any]) -> list[Any]:
+        """Results in the order given. Raises what a task raised."""
+
+
+class LocalExecutor:
+    """Runs each task when it is submitted, in this process or in a child of it."""
+
+    def __init__(self, host: EngineHost) -> None:
+        self._host = host
+
+    def submit(self, key: str, task: Task, *args: Any) -> Any:  # noqa: ARG002 - keys name tasks on a cluster
+        """See Executor."""
+        return task(self._host, *args)
+
+    def gather(self, pending: Sequence[Any]) -> list[Any]:
+        """See Executor."""
+        return list(pending)
+
+
+class DaskExecutor:
+    """Runs tasks on any worker; a worker's tasks share its one child process."""
+
+    def __init__(self, client: Any, factory: str, prefix: str) -> None:
+        self._client, self._prefix, self._plugin = client, prefix, plugin_name(factory)
+        client.register_plugin(_EnginePlugin(factory), name=self._plugin, idempotent=True)
+
+    def submit(self, key: str, task: Task, *args: Any) -> Any:
+        """See Executor."""
+        return self._client.submit(run_on_worker, self._plugin, task, *args, key=f"{self._prefix}-{key}", pure=False, retries=ALLOWED_RETRIES)
+
+    def gather(self, pending: Sequence[Any]) -> list[Any]:
+        """See Executor."""
+        return list(self._client.gather(list(pending)))
+
+
+class _EnginePlugin:
+    """A worker's child process, made at its first task and ended with the worker."""
+
+    name = "dentine-engine"
+
+    def __init__(self, factory: str) -> None:
+        self._factory = factory
+        self.host: EngineHost | None = None
+
+    def setup(self, worker: Any) -> None:
+        """Called by Dask on every worker, late-comers included."""
+        self.host = ChildHost(self._factory, worker.state.nthreads)
+
+    def teardown(self, worker: Any) -> None:  # noqa: ARG002 - Dask's signature
+        """Called by Dask when the worker closes."""
+        if self.host is not None:
+            self.host.close()
+
+
+def plugin_name(factory: str) -> str:
+    """Name under which a worker keeps the child for an engine."""
+    return f"dentine-{factory}"
+
+
+def run_on_worker(plugin: str, task: Task, *args: Any) -> Any:
+    """Run a task with its worker's child."""
+    from distributed import get_worker
+
+    return task(get_worker().plugins[plugin].host, *args)
+
+
+@contextmanager
+def executor(factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
+    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process."""
+    try:
+        from distributed import get_worker
+
+        get_worker()
+    except (ImportError, ValueError):
+        host = InProcessHost(factory)
+        try:
+            yield LocalExecutor(host)
+        finally:
+            host.close()
+        return
+    from distributed import worker_client
+
+    with worker_client() as client:
+        yield DaskExecutor(client, factory, prefix)

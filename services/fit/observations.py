@@ -1,0 +1,209 @@
+"""From the prepared stage to a fit's inputs: which measurements count, how much, and in which blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError, SettingsError
+from services.core.geometry import Camera, Tooth
+from services.core.meshfiles import read_teeth
+from services.core.records import JobSpec, PreparedManifest
+from services.core.store import open_stage, reading
+from services.fit.blocks import Block, StoredFile, pixels_per_block, write_block, write_recipe
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+
+Array = NDArray[np.float64]
+
+LEAST_BLOCKS = 4
+LEAST_BLOCK_PIXELS = 128
+SEARCH_PIXELS = 210
+"""Pixels over all views that the table search compares."""
+
+
+@dataclass(frozen=True)
+class ViewStack:
+    """One camera's pixels in one channel; arrays over (light, pixel) are (L, N), lights in the manifest's order."""
+
+    camera: Camera
+    pixels: NDArray[np.int32]
+    reference: Array
+    variance: Array
+    valid: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
+    """(L,): this camera's image under that light is kept from the fit."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What the prepared stage holds for one tooth."""
+
+    folder: Path
+    manifest: PreparedManifest
+    tooth: Tooth
+    held_out: NDArray[np.bool_]
+    """(camera, light)"""
+
+    @property
+    def light_positions_mm(self) -> Array:
+        """Positions (L, 3)."""
+        return np.array([light.position_mm for light in self.manifest.lights])
+
+    def light_intensities(self, channel: str) -> Array:
+        """(L,) radiant intensities of a channel; a light given by one number has it in all channels."""
+        index = self.manifest.channels.index(channel)
+        return np.array([light.intensity[index if len(light.intensity) > 1 else 0] for light in self.manifest.lights])
+
+
+@dataclass(frozen=True)
+class ChannelFiles:
+    """One channel's blocks and scenes on disk."""
+
+    channel: str
+    recipe: StoredFile
+    blocks: tuple[StoredFile, ...]
+    """Fitted lights only."""
+    search_blocks: tuple[StoredFile, ...]
+    """A few pixels of each view under the fitted lights."""
+    evaluation_recipe: StoredFile
+    evaluation_blocks: tuple[StoredFile, ...]
+    """All lights."""
+    weight: float
+    """Weight of every fitted measurement: 1 / mean variance."""
+    signal: float
+    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
+    quality: float
+    """Signal-to-noise power over fitted measurements."""
+
+
+def read_observations(root: Path, spec: JobSpec) -> Observations:
+    """Open and check the prepared stage.
+
+    Raises:
+        CaptureInputError, SettingsError: what is asked cannot be fitted to what was captured; names the thing and the remedy.
+    """
+    folder, manifest = open_stage(root, "prepared", PreparedManifest)
+    if len(manifest.fdi) != 1:
+        raise CaptureInputError(f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); keep one folder below teeth/.")
+    (tooth,) = read_teeth(folder, manifest.fdi)
+    if spec.dentin == "known" and tooth.dentin is None:
+        raise SettingsError(f"dentin = 'known' but tooth {tooth.fdi} has no dentin.ply; add it, or set dentin to 'fit' or 'none'.")
+    for channel in spec.channels or ():
+        if channel not in manifest.channels:
+            raise SettingsError(f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}.")
+    return Observations(folder, manifest, tooth, held_out_images(manifest, spec))
+
+
+def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
+    """Which images (camera, light) stay out of the fit: the job's choice, else the capture's, else every fourth light, at least one.
+
+    Raises:
+        SettingsError: a light is unknown or none is left to fit. CaptureInputError: fewer than two lights.
+    """
+    cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
+    if len(lights) < 2:
+        raise CaptureInputError(f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more lights.")
+    chosen = np.zeros((len(cameras), len(lights)), dtype=bool)
+    if spec.held_out_lights is not None:
+        for name in spec.held_out_lights:
+            if name not in lights:
+                raise SettingsError(f"Option held_out_lights names '{name}', which the capture does not have; it has {', '.join(lights)}.")
+            chosen[:, lights.index(name)] = True
+    elif manifest.held_out:
+        for camera, light in manifest.held_out:
+            chosen[cameras.index(camera), lights.index(light)] = True
+    else:
+        chosen[:, 3::4] = True
+        chosen[:, -1] |= not chosen.any()
+    if chosen.all():
+        raise SettingsError("Every image is held out and none is left to fit; name fewer lights in held_out_lights.")
+    return chosen
+
+
+def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
+    """Gather one channel's valid pixels of every camera.
+
+    Raises:
+        CaptureInputError: no valid pixel, or no light in them.
+    """
+    manifest, index = observations.manifest, observations.manifest.channels.index(channel)
+    store = observations.folder / "prepared.zarr"
+    views = []
+    with reading(store / "radiance") as radiance, reading(store / "variance") as variance, reading(store / "valid") as bits:
+        for c, camera in enumerate(manifest.cameras):
+            width, height = camera.size
+            valid = np.asarray(bits[c])[:, :height, :width] == 0
+            valid[:, np.arange(height) % spec.pixel_step != 0] = False
+            valid[:, :, np.arange(width) % spec.pixel_step != 0] = False
+            y, x = np.nonzero(valid.any(axis=0))
+            if len(x) == 0:
+                continue
+            reference, spread = (
+                np.stack([np.asarray(stack[c, light])[y, x, index] for light in range(len(manifest.lights))]).astype(np.float64)
+                for stack in (radiance, variance)
+            )
+            chosen = valid[:, y, x] & np.isfinite(reference)
+            reference = np.where(chosen, reference, 0.0)
+            assumed = (spec.sensor_noise_relative * reference) ** 2 + (spec.sensor_noise_floor * reference.max(initial=0.0)) ** 2
+            known = np.isfinite(spread) & (spread > 0)
+            pixels = np.stack([x, y], axis=-1).astype(np.int32)
+            views.append(ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c]))
+    if not views:
+        raise CaptureInputError("No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres.")
+    fitted = [(v.valid & ~v.held_out[:, None]) for v in views]
+    if not any(f.any() for f in fitted):
+        raise CaptureInputError("No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks.")
+    signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
+    if signal <= 0:
+        raise CaptureInputError(f"Channel {channel} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out.")
+    if spec.held_out_lights != () and not any((v.valid & v.held_out[:, None]).any() for v in views):
+        raise CaptureInputError("No pixel is valid in any held-out image; name other lights in held_out_lights.")
+    return tuple(views)
+
+
+def write_channel(
+    folder: Path, observations: Observations, channel: str, views: tuple[ViewStack, ...], dentin: DentinShape | None, spec: JobSpec
+) -> ChannelFiles:
+    """Write one channel's blocks and scenes; the same input gives the same files."""
+    fitted = [v.valid & ~v.held_out[:, None] for v in views]
+    used = np.any([f.any(axis=1) for f in fitted], axis=0)
+    seen = np.any([v.valid.any(axis=1) for v in views], axis=0)
+    noise = np.concatenate([v.variance[f] for v, f in zip(views, fitted, strict=True)])
+    values = np.concatenate([v.reference[f] for v, f in zip(views, fitted, strict=True)])
+    weight = 1.0 / float(noise.mean()) if noise.mean() > 0 else 1.0
+
+    def recipe(lights: NDArray[np.bool_]) -> StoredFile:
+        positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
+        return write_recipe(folder, SceneRecipe(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior))
+
+    def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
+        files = []
+        for v in views:
+            valid, held = v.valid[lights], v.held_out[lights][:, None]
+            relevant = np.flatnonzero((valid & ~held).any(axis=0) if lights is used else valid.any(axis=0))
+            for part in _split(relevant, int(lights.sum()), len(views)) if most is None else [_spread(relevant, most // len(views))]:
+                if len(part):
+                    cut = np.ix_(np.flatnonzero(lights), part)
+                    chosen = v.valid[cut]
+                    block = Block(View(v.camera, v.pixels[part]), v.reference[cut], v.variance[cut], np.where(chosen & ~held, weight, 0.0), chosen & held)
+                    files.append(write_block(folder, block))
+        return tuple(files)
+
+    return ChannelFiles(
+        channel, recipe(used), blocks(used), blocks(used, SEARCH_PIXELS), recipe(seen), blocks(seen), weight, float(weight * values @ values),
+        float(values @ values / noise.sum()),
+    )  # fmt: skip
+
+
+def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
+    # Enough blocks for two workers, none too small to fill a kernel, none too large to travel; independent of how many workers there are.
+    wanted = min(-(-LEAST_BLOCKS // views), max(1, len(pixels) // LEAST_BLOCK_PIXELS))
+    return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
+
+
+def _spread(pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    # Evenly over the raster order.
+    return pixels[np.unique(np.linspace(0, len(pixels) - 1, max(count, 1)).astype(int))] if len(pixels) else pixels

@@ -1,0 +1,179 @@
+"""The unbounded domain in which parameters are fitted, and its chain-rule factors (teeth 2018 Eq. 22, 24; signs as in optics).
+
+==========  =====================  =======================  ==========================
+parameter   natural                d natural / d x          kept inside
+==========  =====================  =======================  ==========================
+sigma       exp(x), per mm         sigma                    1e-3 to 1e3 per mm
+alpha       1 - 10^-x              10^-x ln 10              1 - alpha from 1e-7 to 0.9
+g1, g2      tanh x                 sech^2 x                 abs(g) < 0.9991
+beta        logistic x             beta (1 - beta)          6e-4 to 1 - 6e-4
+shape       x                      1                        0 to 1, projected
+==========  =====================  =======================  ==========================
+
+The bounds only keep a wild step representable in float32; a fit that ends on one is reported as undetermined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import SettingsError
+from services.fit.optics.parameters import Medium, Tissue
+
+LN10 = math.log(10.0)
+
+BOUNDS = {
+    "sigma": (math.log(1e-3), math.log(1e3)),
+    "alpha": (-math.log10(0.9), 7.0),
+    "g1": (-3.85, 3.85),
+    "g2": (-3.85, 3.85),
+    "beta": (-7.4, 7.4),
+    "shape": (0.0, 1.0),
+}
+STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "g2": 0.35, "beta": 1.0, "shape": 0.25}
+"""Length over which the image is roughly linear in each coordinate; a trust radius of 1 means one of these."""
+UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "g2": "1", "beta": "1", "shape": "1"}
+
+
+def kind_of(name: str) -> str:
+    """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` is ``sigma``, for ``shape.0`` it is ``shape``."""
+    part, leaf = name.split(".")
+    kind = "shape" if part == "shape" else leaf
+    if kind not in BOUNDS:
+        raise SettingsError(f"Parameter {name} is not one a fit can change; choose from {', '.join(BOUNDS)}.")
+    return kind
+
+
+def to_dual(kind: str, value: float) -> float:
+    """Coordinate x of a natural value, clipped to the kind's bounds."""
+    low, high = BOUNDS[kind]
+    tiny = 1e-300
+    if kind == "sigma":
+        x = math.log(max(value, tiny))
+    elif kind == "alpha":
+        x = -math.log10(max(1.0 - value, tiny))
+    elif kind in {"g1", "g2"}:
+        x = math.copysign(high, value) if abs(value) >= 1.0 else math.atanh(value)
+    elif kind == "beta":
+        x = math.log(max(value, tiny)) - math.log(max(1.0 - value, tiny))
+    else:
+        x = value
+    return min(max(x, low), high)
+
+
+def to_natural(kind: str, x: float) -> float:
+    """Natural value of a coordinate. ``alpha`` by expm1 and ``beta`` by sign, so that nothing cancels or overflows."""
+    if kind == "sigma":
+        return math.exp(x)
+    if kind == "alpha":
+        return -math.expm1(-x * LN10)
+    if kind in {"g1", "g2"}:
+        return math.tanh(x)
+    if kind == "beta":
+        return 1.0 / (1.0 + math.exp(-x)) if x >= 0 else math.exp(x) / (1.0 + math.exp(x))
+    return x
+
+
+def natural_derivative(kind: str, x: float) -> float:
+    """Derivative of the natural value to x; 1 - g^2 as sech^2 x, never as 1 - tanh^2 x."""
+    if kind == "sigma":
+        return math.exp(x)
+    if kind == "alpha":
+        return LN10 * math.exp(-x * LN10)
+    if kind in {"g1", "g2"}:
+        return 1.0 / math.cosh(x) ** 2
+    if kind == "beta":
+        decay = math.exp(-abs(x))
+        return decay / (1.0 + decay) ** 2
+    return 1.0
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One unbounded coordinate and the parameters that share its value (one, or the same one of both media)."""
+
+    targets: tuple[str, ...]
+    prior_mean: float | None = None
+    """Centre of a Gaussian prior in this domain; None for a flat prior."""
+    prior_sd: float = math.inf
+
+    @property
+    def name(self) -> str:
+        """``enamel.sigma``, or ``tooth.sigma`` when it drives both media."""
+        return self.targets[0] if len(self.targets) == 1 else f"tooth.{self.targets[0].split('.')[1]}"
+
+    @property
+    def kind(self) -> str:
+        """Key into the tables of this module."""
+        return kind_of(self.targets[0])
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The coordinates of one fit; parameters they do not name stay as in the tissue they are applied to."""
+
+    coordinates: tuple[Coordinate, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coordinate names, the order of every vector x."""
+        return tuple(c.name for c in self.coordinates)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the natural parameters, the order in which the engine is asked for derivatives."""
+        return tuple(target for c in self.coordinates for target in c.targets)
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds of x, both (F,)."""
+        low, high = zip(*(BOUNDS[c.kind] for c in self.coordinates), strict=True)
+        return np.array(low), np.array(high)
+
+    @property
+    def scale(self) -> NDArray[np.float64]:
+        """Step scale of x, (F,)."""
+        return np.array([STEP_SCALE[c.kind] for c in self.coordinates])
+
+    @property
+    def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Prior mean and precision 1/sd^2, both (F,); precision 0 where the prior is flat."""
+        mean = np.array([0.0 if c.prior_mean is None else c.prior_mean for c in self.coordinates])
+        precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates])
+        return mean, precision
+
+    def x_of(self, tissue: Tissue) -> NDArray[np.float64]:
+        """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""
+        return np.array([to_dual(c.kind, tissue.value(c.targets[0])) for c in self.coordinates])
+
+    def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Tissue) -> Tissue:
+        """``base`` with this domain's parameters at x."""
+        values = {target: to_natural(c.kind, float(v)) for c, v in zip(self.coordinates, x, strict=True) for target in c.targets}
+        return base.with_values(values)
+
+    def chain(self, x: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative of each parameter to each coordinate, (P, F): maps derivatives to natural parameters onto coordinates."""
+        matrix = np.zeros((len(self.parameters), len(self.coordinates)))
+        row = 0
+        for column, (c, v) in enumerate(zip(self.coordinates, x, strict=True)):
+            for _ in c.targets:
+                matrix[row, column] = natural_derivative(c.kind, float(v))
+                row += 1
+        return matrix
+
+
+def similar_medium(medium: Medium, g: float) -> Medium:
+    """The medium of mean cosine g with the same reduced scattering and absorption (similarity theory); bright and fast to render where g is low."""
+    scattering, absorption = medium.sigma_s_reduced / (1 - g), (1 - medium.alpha) * medium.sigma
+    sigma = scattering + absorption
+    return Medium(sigma, scattering / sigma, g1=g)
+
+
+def similar_tissue(tissue: Tissue, g: float) -> Tissue:
+    """Both media replaced by similar ones; the shape stays."""
+    return Tissue(similar_medium(tissue.enamel, g), similar_medium(tissue.dentin, g), tissue.shape)

@@ -1,0 +1,257 @@
+"""One step's tasks: image and Jacobian passes over blocks of pixels, side by side on any worker.
+
+::
+
+    image(block)     ──── residual, at most 4 MB ───┐
+                                                    ├── products(block) ── ordered sum ── solve
+    jacobian(block)  ──── JacobianBlock, stays ─────┘
+
+The Jacobian task renders its two seeds in one process. Its result keeps the arrays where they were made: pickled, it is only the recipe for making them
+again. The scheduler is told its true size and so sends the small residual to it; should it move all the same, or its worker die, the block is computed
+again from the same seeds, with the same result. What leaves a worker are sums over the block.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.blocks import Block, StoredFile, read_block
+from services.fit.engine_host import EngineHost
+from services.fit.executors import Executor
+from services.fit.optics.domain import Domain, similar_tissue
+from services.fit.optics.parameters import Tissue
+from services.fit.seeds import Seeds
+from services.fit.solve.normal_equations import LossChange, NormalEquations, loss_change, normal_equations
+from services.fit.transport.recipe import JacobianEstimate, StackEstimate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TraceRow:
+    """When and where one task ran."""
+
+    kind: str
+    step: str
+    block: int
+    worker: str
+    start_s: float
+    """Seconds since the epoch."""
+    end_s: float
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """What every task on a block is told."""
+
+    block: StoredFile
+    index: int
+    recipe: StoredFile
+    step: str
+    tissue: Tissue
+    samples: int
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Render minus reference of one block (L, N), with the render's variance."""
+
+    residual: Array
+    variance: Array
+    trace: TraceRow
+
+
+@dataclass
+class JacobianBlock:
+    """Two estimates of a block's derivatives to the fit's coordinates, (F, L N) each. Pickles without them."""
+
+    task: BlockTask
+    parameters: tuple[str, ...]
+    chain: Array
+    seeds: tuple[int, int]
+    trace: TraceRow
+    arrays: tuple[Array, Array] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"arrays": None}
+
+    def __sizeof__(self) -> int:
+        return 1000 + sum(a.nbytes for a in self.arrays or ())
+
+    def derivatives(self, host: EngineHost) -> tuple[Array, Array]:
+        """The two estimates, rendered again where they are not at hand."""
+        if self.arrays is None:
+            self.arrays = _render_jacobians(host, self.task, self.parameters, self.chain, self.seeds)
+        return self.arrays
+
+
+@dataclass(frozen=True)
+class Products:
+    """A block's share of the normal equations and the trace of the tasks that made it."""
+
+    equations: NormalEquations
+    trace: tuple[TraceRow, ...]
+
+
+def image_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
+    """Render a block and subtract the reference."""
+    start, block = time.time(), read_block(task.block)
+    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.view, samples=task.samples, seed=seed)
+    return Residual(stack.mean - block.reference, stack.variance, trace_row("image", task, start))
+
+
+def jacobian_task(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> JacobianBlock:
+    """Render a block's derivatives with two seeds."""
+    start = time.time()
+    arrays = _render_jacobians(host, task, parameters, chain, seeds)
+    return JacobianBlock(task, parameters, chain, seeds, trace_row("jacobian", task, start), arrays)
+
+
+def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual) -> Products:
+    """Multiply where the Jacobian lies."""
+    start, block = time.time(), read_block(jacobian.task.block)
+    j1, j2 = jacobian.derivatives(host)
+    equations = normal_equations(j1, j2, *(a.reshape(-1) for a in (residual.residual, residual.variance, block.variance, block.fit_weight)))
+    return Products(equations, (residual.trace, jacobian.trace, trace_row("products", jacobian.task, start)))
+
+
+def compare_task(host: EngineHost, task: BlockTask, new: Tissue, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
+    """Render a block at two points with the same two seeds and compare their losses."""
+    start, block = time.time(), read_block(task.block)
+
+    def residuals(tissue: Tissue) -> tuple[Array, Array]:
+        first, second = (
+            (host.call("images", task.recipe, tissue, block.view, samples=task.samples, seed=seed).mean - block.reference).reshape(-1) for seed in seeds
+        )
+        return first, second
+
+    return loss_change(*residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1)), trace_row("compare", task, start)
+
+
+def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:
+    """Render a block split by scattering order at albedo 1, (K, L, N)."""
+    start, block = time.time(), read_block(task.block)
+    orders = host.call("order_images", task.recipe, task.tissue, block.view, bin_edges=edges, samples=task.samples, seed=seed)
+    return np.asarray(orders, dtype=np.float64), trace_row("orders", task, start)
+
+
+@dataclass(frozen=True)
+class Passes:
+    """One channel's blocks and where their tasks run."""
+
+    executor: Executor
+    blocks: tuple[StoredFile, ...]
+    recipe: StoredFile
+    seeds: Seeds
+    record: Callable[[Sequence[TraceRow]], None]
+    """Takes the trace of finished tasks."""
+
+    def run(self, label: str, tissue: Tissue, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
+        """One task per block, results in block order."""
+        return self.executor.gather([self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)])
+
+    def read_blocks(self) -> list[Block]:
+        """The blocks themselves, in order."""
+        return [read_block(stored) for stored in self.blocks]
+
+    def tasks(self, label: str, tissue: Tissue, samples: int) -> list[BlockTask]:
+        """What the blocks' tasks are told, in block order."""
+        return [BlockTask(block, k, self.recipe, label, tissue, samples) for k, block in enumerate(self.blocks)]
+
+
+@dataclass(frozen=True)
+class StackProblem:
+    """The least-squares problem of one stage, as the solver sees it (``solve.gauss_newton.Problem``)."""
+
+    passes: Passes
+    domain: Domain
+    base: Tissue
+    stage: str
+    jacobian_g: float | None = None
+    """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma, alpha and shape."""
+    image_g: float | None = None
+    """The same for images: a fit of similar media."""
+
+    def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
+        """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
+        run, label = self.passes.executor, f"{self._prefix}-{step}"
+        tissue, similar, parameters, chain = self._jacobian_media(x)
+        seeds = self._seed(step, "jacobian-1"), self._seed(step, "jacobian-2")
+        pending = []
+        for task in self.passes.tasks(label, tissue, samples):
+            jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, seeds)
+            image = run.submit(f"{label}-image-{task.index}", image_task, task, self._seed(step, "image"))
+            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image))
+        products: list[Products] = run.gather(pending)
+        self.passes.record([row for p in products for row in p.trace])
+        total = products[0].equations
+        for p in products[1:]:
+            total = total + p.equations
+        return total
+
+    def compare(self, x_old: Array, x_new: Array, *, samples: int, step: int, trial: int) -> LossChange:
+        """See Problem: half the samples per seed, summed in block order."""
+        label = f"{self._prefix}-{step}-trial-{trial}"
+        old, new = self._image_media(x_old), self._image_media(x_new)
+        seeds = self._seed(step, "compare-1", trial), self._seed(step, "compare-2", trial)
+        parts = self.passes.run(label, old, max(samples // 2, 16), compare_task, new, seeds)
+        self.passes.record([row for _, row in parts])
+        total: LossChange = parts[0][0]
+        for change, _ in parts[1:]:
+            total = total + change
+        return total
+
+    def _image_media(self, x: Array) -> Tissue:
+        tissue = self.domain.tissue_at(x, self.base)
+        return tissue if self.image_g is None else similar_tissue(tissue, self.image_g)
+
+    def _jacobian_media(self, x: Array) -> tuple[Tissue, Tissue, tuple[str, ...], Array]:
+        # Media of the image and of the derivatives, the parameters to differentiate, and d parameter / d x.
+        if self.jacobian_g is None:
+            return self._image_media(x), self.domain.tissue_at(x, self.base), self.domain.parameters, self.domain.chain(x)
+        names = tuple(dict.fromkeys(n for p in self.domain.parameters for n in _similar_parameters(p)))
+
+        # The map to similar media is smooth and closed, so central differences of it are exact to rounding.
+        def values(at: Array) -> Array:
+            tissue = similar_tissue(self.domain.tissue_at(at, self.base), float(self.jacobian_g or 0.0))
+            return np.array([tissue.value(name) for name in names])
+
+        shifts = 1e-5 * np.eye(len(x))
+        chain = np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
+        return self._image_media(x), similar_tissue(self.domain.tissue_at(x, self.base), self.jacobian_g), names, chain
+
+    @property
+    def _prefix(self) -> str:
+        return f"{self.passes.seeds.channel}-{self.stage}"
+
+    def _seed(self, step: int, *purpose: str | int) -> int:
+        return self.passes.seeds(self.stage, step, *purpose)
+
+
+def _similar_parameters(name: str) -> tuple[str, ...]:
+    part = name.partition(".")[0]
+    return (name,) if part == "shape" else (f"{part}.sigma", f"{part}.alpha")
+
+
+def _render_jacobians(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> tuple[Array, Array]:
+    view = read_block(task.block).view
+
+    def render(seed: int) -> Array:
+        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, parameters, samples=task.samples, seed=seed)
+        natural = np.asarray(estimate.jacobian, dtype=np.float64)
+        return np.asarray(chain.T @ natural.reshape(len(natural), -1))
+
+    return render(seeds[0]), render(seeds[1])
+
+
+def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:
+    """The trace of a task that ends now, in this process."""
+    return TraceRow(kind, task.step, task.index, f"{socket.gethostname()}:{os.getpid()}", start_s, time.time())

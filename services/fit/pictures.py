@@ -1,0 +1,109 @@
+"""Pictures of a fit: previews while it runs, render beside photograph for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Tooth
+from services.core.records import PreparedManifest
+from services.core.store import write_atomic
+from services.fit.evaluate import Evaluation
+from services.fit.anatomy.thickness import thickness_image
+from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
+from services.fit.export.report import ReportPictures
+from services.fit.observations import ViewStack
+from services.fit.schedule import StepReport
+
+Array = NDArray[np.float64]
+PREVIEWS = "previews"
+PICTURES = "pictures.npz"
+
+
+def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
+    """Images to show: per camera the brightest fitted and the brightest held-out one, by camera name and index among the lights anyone sees."""
+    seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views], axis=0))
+    shown = []
+    for view in views:
+        brightness = np.where(view.valid, view.reference, 0.0).sum(axis=1)[seen]
+        for group in (~view.held_out[seen], view.held_out[seen]):
+            lit = np.flatnonzero(group & (brightness > 0))
+            if len(lit):
+                shown.append((view.camera.name, int(lit[np.argmax(brightness[lit])])))
+    return tuple(shown)
+
+
+def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> tuple[Picture, ...]:
+    """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
+    channels = list(evaluations)
+    images: dict[tuple[str, str], Picture] = {}
+    for index, channel in enumerate(channels):
+        seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views[channel]], axis=0))
+        by_camera = {v.camera.name: v for v in views[channel]}
+        for (camera, light), (pixels, values) in evaluations[channel].renders.items():
+            view, number = by_camera[camera], int(seen[light])
+            key = (camera, manifest.lights[number].name)
+            if key not in images:
+                width, height = view.camera.size
+                blank = np.zeros((height, width, len(channels)))
+                images[key] = Picture(*key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool))
+            x, y = view.pixels.T
+            images[key].photo[y, x, index] = view.reference[number]
+            images[key].valid[y, x] |= view.valid[number]
+            images[key].render[pixels[:, 1], pixels[:, 0], index] = values
+    return tuple(images[key] for key in sorted(images))
+
+
+def write_preview(root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]) -> list[dict[str, object]]:
+    """Write render, photograph and residual of one image as PNG; returns the preview event's data, paths relative to ``root``."""
+    pictures = pictures_of({step.channel: evaluation}, manifest, {step.channel: views})
+    chosen = [p for p in pictures if not p.held_out][:1] + [p for p in pictures if p.held_out][:1]
+    (root / PREVIEWS).mkdir(exist_ok=True)
+    events = []
+    for picture in chosen:
+        white = white_level(picture.photo, picture.valid)
+        drawn = {
+            "render": tone_map(picture.render, white),
+            "photo": tone_map(picture.photo, white),
+            "residual": signed_map(picture.residual, 0.25 * white, picture.valid),
+        }
+        event: dict[str, object] = {
+            "camera": picture.camera, "light": picture.light, "held_out": picture.held_out,
+            "channel": step.channel, "step": step.step, "residual_limit": 0.25 * white,
+        }  # fmt: skip
+        for kind, image in drawn.items():
+            path = Path(PREVIEWS) / f"{step.channel}-{step.step:03d}-{picture.camera}-{picture.light}-{kind}.png"
+            write_atomic(root / path, png_bytes(enlarge(image)))
+            event[kind] = path.as_posix()
+        events.append(event)
+    return events
+
+
+def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> None:
+    """Keep the final pictures, linear, in the fit's folder."""
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for k, picture in enumerate(pictures_of(evaluations, manifest, views)):
+        arrays |= {
+            f"{k}.name": np.array([picture.camera, picture.light]),
+            f"{k}.held_out": np.array(picture.held_out),
+            f"{k}.photo": picture.photo.astype(np.float32),
+            f"{k}.render": picture.render.astype(np.float32),
+            f"{k}.valid": picture.valid,
+        }
+    np.savez_compressed(folder / PICTURES, allow_pickle=False, **arrays)
+
+
+def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth, cameras: tuple[Camera, ...]) -> ReportPictures:
+    """What the report shows."""
+    with np.load(folder / PICTURES, allow_pickle=False) as stored:
+        count = sum(name.endswith(".name") for name in stored.files)
+        pictures = []
+        for k in range(count):
+            camera, light = (str(part) for part in stored[f"{k}.name"])
+            pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
+    if tooth.dentin is None:
+        return ReportPictures(channels, tuple(pictures))
+    return ReportPictures(channels, tuple(pictures), thickness_image(tooth.outer, tooth.dentin, cameras[0]), cameras[0].name)

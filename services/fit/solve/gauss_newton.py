@@ -1,0 +1,223 @@
+"""Gauss-Newton with Monte Carlo Jacobians: init, step, terminate, finish; the outcome is a value.
+
+The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step asks the problem for normal equations
+(curvature from two independent seeds, residual from a third), pools them with those of earlier steps carried to the present point, solves a
+trust-region subproblem that damps past the most negative curvature, and judges the proposal.
+
+Two independent witnesses judge: the loss compared at both ends with common random numbers, from seeds that saw neither gradient nor curvature; and the
+change that the quadratic model promises, with the noise of its gradient and curvature and an allowance for its error that grows with the step. Far from
+the optimum the comparison decides, close to it, where losses hardly differ, the gradient knows more. With z = 3 standard errors:
+
+* both together surely better, and not contradicting each other: taken;
+* surely worse, or less than promised: the model's curvature is at fault, the trust radius shrinks;
+* otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import NonFiniteError
+from services.fit.optics.domain import Domain
+from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
+from services.fit.solve.trust_region import solve_box
+
+Array = NDArray[np.float64]
+
+
+class Result(StrEnum):
+    """How a fit ended. ``running`` is the only one that continues."""
+
+    RUNNING = "running"
+    CONVERGED = "converged"
+    NOISE_LIMITED = "noise limited"
+    MAX_STEPS = "step limit"
+    STALLED = "stalled"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the optimum was reached to within what the samples can tell."""
+        return self in {Result.CONVERGED, Result.NOISE_LIMITED}
+
+
+ADVICE = {
+    Result.RUNNING: "The fit has not ended.",
+    Result.CONVERGED: "",
+    Result.NOISE_LIMITED: "",
+    Result.MAX_STEPS: "The fit still improved at its last step; raise max_steps.",
+    Result.STALLED: "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the capture.",
+}
+
+
+class Problem(Protocol):
+    """What is fitted. Equal arguments give equal answers, so that a repeated step repeats its result."""
+
+    def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
+        """Normal equations of the data alone at x."""
+
+    def compare(self, x_old: Array, x_new: Array, *, samples: int, step: int, trial: int) -> LossChange:
+        """Change of the data's loss from x_old to x_new with common random numbers that no other call uses."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Limits and thresholds of the solver."""
+
+    max_steps: int = 12
+    max_samples: int = 1024
+    max_trials: int = 3
+    """Radii tried with one set of normal equations."""
+    sure_z: float = 3.0
+    """A change counts as real beyond so many standard errors: a worse step passes with probability at most 1.3e-3."""
+    model_error: float = 0.5
+    """Relative error of the promised change per unit of step length; at length 1 the promise counts little."""
+    tolerance: float = 0.0
+    """Converged when neither a further step nor Monte Carlo noise is worth more than this change of F."""
+    least_radius: float = 1e-3
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything a step needs of the past."""
+
+    x: Array
+    samples: int
+    radius: float = 1.0
+    step: int = 0
+    accepted: int = 0
+    result: Result = Result.RUNNING
+    memory: NormalEquations | None = None
+    """What earlier steps know, as a model around x."""
+    memory_samples: float = 0.0
+    verdict: str = ""
+    """What happened in the last step, for the log."""
+
+
+def state_record(state: State) -> dict[str, Any]:
+    """A state as JSON values; floats survive exactly."""
+    memory = None if state.memory is None else state.memory.record()
+    return {f.name: getattr(state, f.name) for f in fields(State)} | {"x": state.x.tolist(), "memory": memory}
+
+
+def state_from(record: dict[str, Any]) -> State:
+    """The state of a record."""
+    memory = None if record["memory"] is None else NormalEquations.of(record["memory"])
+    return State(**(record | {"x": np.array(record["x"]), "result": Result(record["result"]), "memory": memory}))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """End of a fit: where, how, and what to do about it."""
+
+    x: Array
+    result: Result
+    advice: str
+    steps: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Solver for one domain; stateless, the state goes in and out."""
+
+    domain: Domain
+    options: Options = Options()
+
+    def init(self, x: Array, samples: int) -> State:
+        """State at a start, moved inside the bounds."""
+        low, high = self.domain.bounds
+        return State(np.clip(x, low, high), samples)
+
+    def terminate(self, state: State) -> bool:
+        """Whether nothing is left to do."""
+        return state.result is not Result.RUNNING
+
+    def finish(self, state: State) -> Solution:
+        """The outcome as a value."""
+        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples)
+
+    def step(self, problem: Problem, state: State) -> State:
+        """One linearisation and up to ``max_trials`` comparisons.
+
+        Raises:
+            NonFiniteError: the problem returned NaN or infinity.
+        """
+        options, x = self.options, state.x
+        fresh, known = problem.linearise(x, samples=state.samples, step=state.step), float(state.samples)
+        if state.memory is not None:
+            fresh, known = pool(state.memory, state.memory_samples, fresh, known), state.memory_samples + known
+        state = replace(state, step=state.step + 1, memory=fresh, memory_samples=known)
+
+        # The weak prior is exact: it joins curvature and gradient, never their noise.
+        mean, precision = self.domain.prior
+        equations = replace(fresh, hessian=fresh.hessian + np.diag(precision), gradient=fresh.gradient + precision * (x - mean))
+        noise_gain = gain_by_noise(equations)
+
+        radius, at_fault = state.radius, False
+        for trial in range(options.max_trials):
+            step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, radius, equations.hessian_noise)
+            promised = -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
+            if max(promised, noise_gain) <= options.tolerance:
+                return replace(state, result=Result.CONVERGED, verdict="converged")
+            if promised <= noise_gain:
+                break
+            new, length = x + step, float(np.linalg.norm(step / self.domain.scale))
+            compared = problem.compare(x, new, samples=state.samples, step=state.step - 1, trial=trial)
+            change = compared.change + 0.5 * float(precision @ ((new - mean) ** 2 - (x - mean) ** 2))
+            if not np.isfinite([change, compared.variance]).all():
+                raise NonFiniteError(f"The loss is not finite at step {state.step}; check the capture for invalid radiance.")
+
+            # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
+            model, model_se = noise_gain - promised, math.hypot(equations.step_noise(step), options.model_error * length * promised)
+            total, total_se = _combine(change, compared.se, model, model_se)
+            contradicted = abs(change - model) > options.sure_z * math.hypot(compared.se, model_se)
+            if total + options.sure_z * total_se < 0 and change - options.sure_z * compared.se < 0 and not (contradicted and change > 0):
+                poor = change > 0.25 * model
+                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * model else radius
+                state = replace(
+                    state, x=new, accepted=state.accepted + 1, radius=min(0.5 * length if poor and contradicted else grown, 4.0), verdict="accepted"
+                )
+                return self._limited(self._carry(state, step, length))
+            at_fault = change > options.sure_z * compared.se or contradicted
+            if not at_fault:
+                break
+            radius = 0.25 * min(length, radius)
+            if radius < options.least_radius:
+                return replace(state, result=Result.STALLED, verdict="worse at every radius")
+        if at_fault:
+            return self._limited(replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced"))
+        if state.samples < options.max_samples:
+            return self._limited(replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled"))
+        return replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit")
+
+    def _carry(self, state: State, step: Array, length: float) -> State:
+        # What was known before a long step is worth less after it: the model's error grows with the step, its noise does not.
+        assert state.memory is not None
+        return replace(state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2))
+
+    def _limited(self, state: State) -> State:
+        return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state
+
+
+def gain_by_noise(equations: NormalEquations) -> float:
+    """What a Newton step at the true optimum promises on average because the gradient is noisy: tr(H^-1 C) / 2, over directions that curve upwards."""
+    eigenvalues, vectors = np.linalg.eigh(equations.hessian)
+    floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
+    spread = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise, vectors)
+    return 0.5 * float(np.maximum(spread, 0.0) @ (1 / np.maximum(eigenvalues, floor)))
+
+
+def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:
+    # Inverse-variance mean; an exact witness speaks alone, the comparison before the model.
+    if first_se == 0:
+        return first, 0.0
+    if second_se == 0:
+        return second, 0.0
+    a, b = first_se**-2, second_se**-2
+    return (a * first + b * second) / (a + b), (a + b) ** -0.5

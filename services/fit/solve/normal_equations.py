@@ -1,0 +1,146 @@
+"""Unbiased sums over measurements from noisy Jacobians and images, and how noisy each sum is.
+
+Two independently seeded estimates j1, j2 of a derivative have the mean m = (j1 + j2) / 2 and the difference d = j1 - j2. Then m m' - d d' / 4 is the
+symmetrised product of the two, unbiased for j j', and for any direction u the product (u'j1)(u'j2) has the variance E[(u'm)^2 (u'd)^2]
+(m and d are uncorrelated; exact for Gaussian noise). So one pair of estimates gives every sum here together with its own error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Sums over measurements i with weights w: F = 1/2 sum w r^2, for coordinates x (F,)."""
+
+    hessian: Array
+    """sum w j j', (F, F), from two independent seeds; may be indefinite."""
+    gradient: Array
+    """sum w j r, (F,), residual from a third seed."""
+    hessian_noise: Array
+    """(F*F, F*F): the variance of u'Hu is (u x u)' hessian_noise (u x u)."""
+    gradient_noise: Array
+    """Monte Carlo covariance of the gradient, (F, F)."""
+    data_noise: Array
+    """Covariance of the gradient by the noise of the measurements, J'W Sigma W J, (F, F)."""
+    squares: float = 0.0
+    """sum w (r^2 - its Monte Carlo variance)."""
+    expected_squares: float = 0.0
+    """sum w var_ref: what ``squares`` would be if only the measurements' noise were left."""
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self)}
+
+    @staticmethod
+    def of(record: dict[str, Any]) -> NormalEquations:
+        """From ``record``."""
+        return NormalEquations(**{name: np.array(value) if isinstance(value, list) else value for name, value in record.items()})
+
+    def scaled(self, factor: float) -> NormalEquations:
+        """The same with every weight multiplied: sums scale once, their covariances twice."""
+        linear, quadratic = factor, factor**2
+        return NormalEquations(
+            self.hessian * linear,
+            self.gradient * linear,
+            self.hessian_noise * quadratic,
+            self.gradient_noise * quadratic,
+            self.data_noise * quadratic,
+            self.squares * linear,
+            self.expected_squares * linear,
+        )
+
+    def moved(self, step: Array) -> NormalEquations:
+        """The quadratic model seen from ``step`` further on; the curvature's noise enters the gradient."""
+        count = len(step)
+        carried = np.einsum("aibj,i,j->ab", self.hessian_noise.reshape((count,) * 4), step, step)
+        return replace(self, gradient=self.gradient + self.hessian @ step, gradient_noise=self.gradient_noise + carried)
+
+    def step_noise(self, step: Array) -> float:
+        """Standard deviation of the change g'p + p'Hp/2 that the model predicts for a step p."""
+        pair = np.outer(step, step).reshape(-1)
+        return float(np.sqrt(max(float(step @ self.gradient_noise @ step + 0.25 * pair @ self.hessian_noise @ pair), 0.0)))
+
+    def eigenvalue_noise(self, directions: Array) -> Array:
+        """Standard deviation of u'Hu for each column u of ``directions`` (F, K)."""
+        pairs = np.einsum("ak,bk->kab", directions, directions).reshape(directions.shape[1], -1)
+        return np.sqrt(np.maximum(np.einsum("ka,ab,kb->k", pairs, self.hessian_noise, pairs), 0.0))
+
+
+def normal_equations(j1: Array, j2: Array, residual: Array, residual_variance: Array, reference_variance: Array, weight: Array) -> NormalEquations:
+    """Sum one block of measurements.
+
+    Args:
+        j1, j2: derivatives (F, M) from two independent seeds.
+        residual: render minus reference (M,), third seed.
+        residual_variance: Monte Carlo variance of the render (M,).
+        reference_variance: variance of the reference (M,).
+        weight: (M,), 0 where a measurement does not count.
+    """
+    mean, difference = 0.5 * (j1 + j2), j1 - j2
+
+    # Curvature, and its noise from the products of mean and difference.
+    weighted = weight * mean
+    hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
+    products = 0.5 * (mean[:, None] * difference[None] + difference[:, None] * mean[None]) * weight
+    flat = products.reshape(-1, products.shape[-1])
+
+    # Gradient; its noise is the Jacobian's seen through the residual plus the residual's seen through the Jacobian.
+    through_residual = weight * residual * difference
+    image = weight**2 * residual_variance
+    sensor = weight**2 * reference_variance
+    return NormalEquations(
+        hessian=hessian,
+        gradient=weighted @ residual,
+        hessian_noise=flat @ flat.T,
+        gradient_noise=0.25 * through_residual @ through_residual.T + (image * mean) @ mean.T,
+        data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * difference) @ difference.T,
+        squares=float(weight @ (residual**2 - residual_variance)),
+        expected_squares=float(weight @ reference_variance),
+    )
+
+
+def pool(old: NormalEquations, old_samples: float, new: NormalEquations, new_samples: float) -> NormalEquations:
+    """Mean of two independent estimates of the same sums, weighted by their samples. The measurements are the same ones: their own noise does not average."""
+    share = new_samples / (old_samples + new_samples)
+    pooled = old.scaled(1 - share) + new.scaled(share)
+    return replace(pooled, data_noise=(1 - share) * old.data_noise + share * new.data_noise)
+
+
+@dataclass(frozen=True)
+class LossChange:
+    """Change of F = 1/2 sum w r^2 between two points, both rendered with the same two seeds, and its Monte Carlo variance."""
+
+    change: float
+    variance: float
+    loss: float
+    """F at the new point, the reference's own noise included."""
+
+    @property
+    def se(self) -> float:
+        """One standard error of ``change``."""
+        return float(np.sqrt(self.variance))
+
+    def __add__(self, other: LossChange) -> LossChange:
+        return LossChange(self.change + other.change, self.variance + other.variance, self.loss + other.loss)
+
+
+def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array) -> LossChange:
+    """Compare residuals (M,) at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
+
+    The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows from the same identity as above,
+    applied to the bilinear form n1 n2 - o1 o2.
+    """
+    terms = weight * (new1 * new2 - old1 * old2)
+    deviations = weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))
+    return LossChange(0.5 * float(terms.sum()), 0.25 * float(deviations @ deviations), 0.5 * float((weight * new1) @ new2))

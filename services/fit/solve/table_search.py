@@ -1,0 +1,127 @@
+"""Start of a fit: the best homogeneous tooth in a table over albedo x density x anisotropy (teeth 2018, section 7).
+
+An image is a polynomial in the albedo when its paths are kept by scattering order, I(alpha) = sum_n alpha^n I_n. So a render at alpha = 1, split into
+bins of orders, gives every albedo at once, and tens of renders over density x anisotropy carry tens of thousands of table points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.blocks import Block
+from services.fit.optics.domain import to_natural
+
+Array = NDArray[np.float64]
+
+REDUCED_DENSITIES = (0.15, 0.3, 0.5, 0.8, 1.2, 1.7, 2.4, 3.4, 5.0)
+"""Reduced scattering sigma (1 - g), per mm: the literature's span for enamel and dentin. A grid in it, not in sigma, keeps every render as costly as needed."""
+ANISOTROPIES = (0.0, 0.5, 0.75, 0.88)
+KAPPA = (1.0, 4.5)
+"""Range of -log10(1 - alpha)."""
+SCALE_TRUST = 0.35
+"""Log-scale misfit that costs as much as a relative image error of 1: lights are calibrated, but one medium stands for two."""
+
+
+def order_edges(last: int = 4096) -> NDArray[np.int64]:
+    """Bin edges over the number of scatterings: single orders first, then four bins per octave."""
+    fine = np.arange(0, 9)
+    coarse = np.round(8 * 2.0 ** (np.arange(1, 4 * int(np.log2(last / 8)) + 1) / 4))
+    return np.unique(np.concatenate([fine, coarse])).astype(np.int64)
+
+
+def bin_powers(alpha: Array, edges: NDArray[np.int64]) -> Array:
+    """Mean of alpha^n over the orders of each bin, (A, K), from the geometric sum; stable as alpha tends to 1.
+
+    Within a bin the orders are taken as equally frequent; bins are narrow enough (2^(1/4)) that this hardly matters.
+    """
+    log_alpha = np.log(alpha)[:, None]
+    first, count = edges[:-1][None].astype(float), np.diff(edges)[None].astype(float)
+    ratio = np.expm1(count * log_alpha) / np.where(log_alpha == 0, 1.0, np.expm1(log_alpha))
+    return np.where(log_alpha == 0, 1.0, np.exp(first * log_alpha) * ratio / count)
+
+
+@dataclass(frozen=True)
+class Node:
+    """One render of the table."""
+
+    sigma: float
+    g: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A point of the table and how well it explains the photographs."""
+
+    sigma: float
+    alpha: float
+    g: float
+    error: float
+    """Relative image error after the best common scale, 0 to 1."""
+    scale: float
+    """That scale: photographs over renders."""
+
+    @property
+    def score(self) -> float:
+        """What the search minimises: shape error and, weakly, the scale's distance from 1."""
+        return float(np.hypot(self.error, np.log(self.scale) * SCALE_TRUST)) if self.scale > 0 else np.inf
+
+
+def nodes() -> tuple[Node, ...]:
+    """The renders of one channel's table."""
+    return tuple(Node(reduced / (1 - g), g) for g in ANISOTROPIES for reduced in REDUCED_DENSITIES)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The photographs of one block, flattened."""
+
+    reference: Array
+    variance: Array
+    weight: Array
+
+    @staticmethod
+    def of(block: Block) -> Observed:
+        """From a stored block."""
+        return Observed(block.reference.reshape(-1), block.variance.reshape(-1), block.fit_weight.reshape(-1))
+
+
+def search_node(
+    node: Node, orders: Sequence[tuple[Array, Array]], edges: NDArray[np.int64], observed: Sequence[Observed], albedos: int
+) -> tuple[Candidate, ...]:
+    """Errors of one node's table points, best first.
+
+    Args:
+        orders: per block, two independently seeded images at alpha = 1 by bin of order, (K, L, N) each.
+        observed: per block, what was photographed.
+        albedos: number of albedo values.
+    """
+    alpha = np.array([to_natural("alpha", x) for x in np.linspace(*KAPPA, albedos)])
+    powers = bin_powers(alpha, edges)
+
+    # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; two seeds keep noise out of <C,C>.
+    bins = len(edges) - 1
+    cross, gram, total = np.zeros(bins), np.zeros((bins, bins)), 0.0
+    for (first, second), seen in zip(orders, observed, strict=True):
+        a, b = first.reshape(bins, -1), second.reshape(bins, -1)
+        product = (a * seen.weight) @ b.T
+        cross += 0.5 * (a + b) @ (seen.weight * seen.reference)
+        gram += 0.5 * (product + product.T)
+        total += float(seen.weight @ (seen.reference**2 - seen.variance))
+    cr, cc = powers @ cross, np.einsum("ak,kl,al->a", powers, gram, powers)
+
+    # A black render (<C,C> = 0) explains nothing: error 1, scale 0.
+    lit = (cc > 0) & (cr > 0) & (total > 0)
+    safe = np.where(lit, cc, 1.0)
+    scale = np.where(lit, cr / safe, 0.0)
+    error = np.sqrt(np.clip(np.where(lit, 1 - cr**2 / (safe * max(total, 1e-300)), 1.0), 0.0, 1.0))
+    found = [Candidate(node.sigma, float(a), node.g, float(e), float(s)) for a, e, s in zip(alpha, error, scale, strict=True)]
+    return tuple(sorted(found, key=lambda c: c.score))
+
+
+def best(per_node: Sequence[Sequence[Candidate]], count: int = 3) -> tuple[Candidate, ...]:
+    """The best candidates, at most one per node, best first."""
+    return tuple(sorted((node[0] for node in per_node if node), key=lambda c: c.score)[:count])

@@ -1,0 +1,92 @@
+"""The trust-region subproblem with a curvature that Monte Carlo noise may have made indefinite (Moré and Sorensen 1983)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import NonFiniteError
+
+Array = NDArray[np.float64]
+
+
+def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: Array | None = None) -> Array:
+    """Step p that minimises g'p + p'Hp/2 over norm(p) <= radius, in coordinates where a ball is meant.
+
+    Args:
+        hessian: symmetric (F, F), may be indefinite.
+        gradient: (F,)
+        radius: largest length of the step, positive.
+        curvature_floor: least curvature (F,) that is believed in each eigendirection, ascending order of H's eigenvalues; noise level of the eigenvalue.
+
+    Raises:
+        NonFiniteError: NaN or infinity in the input.
+    """
+    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+        raise NonFiniteError(
+            f"The normal equations hold {np.count_nonzero(~np.isfinite(hessian))} non-finite entries; lower the sample noise or mask the pixels that cause it."
+        )
+    size = float(np.linalg.norm(gradient))
+    if size == 0.0 or radius <= 0.0:
+        return np.zeros_like(gradient)
+
+    # Work with numbers of order one, whatever the units of the loss.
+    largest = max(float(np.abs(hessian).max()), size / radius)
+    eigenvalues, vectors = np.linalg.eigh(hessian / largest)
+    floor = np.zeros_like(eigenvalues) if curvature_floor is None else np.maximum(curvature_floor / largest, 0.0)
+    slope = vectors.T @ (gradient / largest)
+
+    # Curvature that is negative or below its noise is raised to the noise; rounding alone sets the least value.
+    tiny = 1e-13 * max(1.0, float(np.abs(eigenvalues).max()))
+    curvature = np.maximum(np.maximum(eigenvalues, floor), tiny)
+
+    # One damping for all directions, by bisection on the length of the step, which falls monotonically with it.
+    def length(damping: float) -> float:
+        return float(np.linalg.norm(slope / (curvature + damping)))
+
+    if length(0.0) <= radius:
+        return np.asarray(-vectors @ (slope / curvature))
+    low, high = 0.0, float(np.linalg.norm(slope)) / radius
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if length(middle) > radius else (low, middle)
+        if high - low <= 1e-12 * high:
+            break
+    return np.asarray(-vectors @ (slope / (curvature + high)))
+
+
+def solve_box(hessian: Array, gradient: Array, x: Array, bounds: tuple[Array, Array], scale: Array, radius: float, hessian_noise: Array | None = None) -> Array:
+    """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on their bound and the rest solved again.
+
+    Args:
+        hessian_noise: (F*F, F*F) as in NormalEquations, for the least believed curvature; None for exact curvature.
+    """
+    low, high = bounds
+    step = np.zeros_like(x)
+    free = np.ones(len(x), dtype=bool)
+    for _ in range(len(x)):
+        index = np.flatnonzero(free)
+        if len(index) == 0:
+            break
+        fixed = np.flatnonzero(~free)
+        s = scale[index]
+        reduced = hessian[np.ix_(index, index)] * np.outer(s, s)
+        slope = (gradient[index] + hessian[np.ix_(index, fixed)] @ step[fixed]) * s
+        floor = None
+        if hessian_noise is not None:
+            vectors = np.linalg.eigh(reduced)[1] if np.isfinite(reduced).all() else np.eye(len(index))
+            directions = np.zeros((len(x), len(index)))
+            directions[index] = s[:, None] * vectors
+            pairs = np.einsum("ak,bk->kab", directions, directions).reshape(len(index), -1)
+            floor = np.sqrt(np.maximum(np.einsum("ka,ab,kb->k", pairs, hessian_noise, pairs), 0.0))
+        room = max(radius**2 - float(((step[fixed] / scale[fixed]) ** 2).sum()), 0.0) ** 0.5
+        step[index] = s * solve_ball(reduced, slope, room, floor)
+
+        # A coordinate stays free as long as its own step stays inside.
+        target = x + step
+        leaving = free & ((target < low) | (target > high))
+        if not leaving.any():
+            break
+        step[leaving] = np.clip(target[leaving], low[leaving], high[leaving]) - x[leaving]
+        free &= ~leaving
+    return np.clip(x + step, low, high) - x

@@ -1,0 +1,112 @@
+"""The fit service's doors: ``run`` fits a prepared capture, ``export`` turns the fit into an asset."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from services.core.records import AssetManifest, FitReport, JobSpec
+from services.core.stage import StageContext, StageEvent
+from services.core.store import StageWriter, open_stage, write_atomic, write_record
+
+if TYPE_CHECKING:
+    from services.core.geometry import Tooth
+
+ENGINE = "services.fit.transport.engine:Engine"
+CHECKPOINT = "fit-checkpoint"
+
+
+def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:
+    """Fit every channel and publish ``fit/``: report, history, task trace, pictures.
+
+    Inside a Dask task the passes spread over the cluster and this task holds no slot; elsewhere they run in this process. Each step is on disk before the
+    next begins; a new attempt continues after the last one.
+
+    Args:
+        engine: who renders, as ``module:class``.
+
+    Raises:
+        CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError: between two steps.
+    """
+    from services.fit.driver import FitDriver
+
+    context.report(StageEvent(stage="fit", kind="started"))
+    context.raise_if_cancelled()
+    writer = StageWriter(context.root, "fit", context.attempt)
+    driver = FitDriver(spec, context, writer, engine)
+    report = driver.run(time.time())
+    writer.publish(report)
+    context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=summary(report)))
+    return report
+
+
+def summary(report: FitReport) -> str:
+    """One sentence on how the fit went."""
+    errors = report.held_out_error or report.fit_error
+    kind = "held-out" if report.held_out_error else "fit"
+    parts = ", ".join(f"{channel} {100 * error:.1f} %" for channel, error in errors.items())
+    return f"{'Converged' if report.converged else 'Stopped'} after {report.steps} steps; {kind} error {parts}."
+
+
+def export(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Write the asset, and parameters.json, errors.json and report.html beside it in the job's folder.
+
+    Raises:
+        StoreError: fit or prepared stage missing or damaged.
+    """
+    from services.core.records import PreparedManifest
+    from services.fit.export.asset import write_asset
+    from services.fit.export.report import write_report
+    from services.fit.pictures import read_pictures
+
+    context.report(StageEvent(stage="export", kind="started"))
+    context.raise_if_cancelled()
+    fit_folder, report = open_stage(context.root, "fit", FitReport)
+    prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
+    writer = StageWriter(context.root, "asset", context.attempt)
+    channels = tuple(report.parameters)
+    tooth = fitted_tooth(prepared_folder, prepared.fdi[0], spec, report)
+    index = [prepared.channels.index(channel) for channel in channels]
+    lights = tuple(
+        light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
+    )
+    files = write_asset(writer.folder, report, (tooth,), prepared.cameras, lights, channels=channels, boundary=spec.boundary, ior=spec.ior)
+
+    history = json.loads((fit_folder / "history.json").read_text())
+    facts = {"title": f"Tooth {tooth.fdi}", "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
+    write_report(context.root / "report.html", report, read_pictures(fit_folder, channels, tooth, prepared.cameras), history, facts)
+    errors = {"fit_error": report.fit_error, "held_out_error": report.held_out_error, "unit": "1", "converged": report.converged, "advice": report.advice}
+    parameters = {channel: {name: e.model_dump() for name, e in table.items()} for channel, table in report.parameters.items()}
+    write_atomic(context.root / "parameters.json", _json(parameters))
+    write_atomic(context.root / "errors.json", _json(errors))
+
+    held_out = list((report.held_out_error or report.fit_error).values())
+    centre = (tooth.outer.vertices_mm.min(axis=0) + tooth.outer.vertices_mm.max(axis=0)) / 2
+    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), centre_mm=(float(centre[0]), float(centre[1]), float(centre[2])))
+    write_record(writer.folder / "asset.json", manifest)
+    writer.publish(manifest)
+    context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))
+    return manifest
+
+
+def fitted_tooth(prepared_folder: Path, fdi: int, spec: JobSpec, report: FitReport) -> Tooth:
+    """The tooth with the dentin surface the fit ended with."""
+    from services.core.geometry import Mesh, Tooth
+    from services.core.meshfiles import read_teeth
+    from services.fit.driver import dentin_shape
+
+    (tooth,) = read_teeth(prepared_folder, (fdi,))
+    dentin = dentin_shape(tooth, spec)
+    if dentin is None:
+        return Tooth(fdi, tooth.outer)
+    return Tooth(fdi, tooth.outer, Mesh(dentin.vertices_mm(report.shape), dentin.base.faces))
+
+
+def _source(spec: JobSpec) -> str:
+    return spec.capture.name if spec.capture is not None else f"rig {spec.rig.dome if spec.rig else ''}"
+
+
+def _json(value: object) -> bytes:
+    return (json.dumps(value, indent=1) + "\n").encode()
