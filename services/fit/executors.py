@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+from distributed import WorkerPlugin
+
 from services.fit.engine_host import ENGINE, ChildHost, EngineHost, InProcessHost
 
 Task = Callable[..., Any]
@@ -42,7 +44,7 @@ class DaskExecutor:
 
     def __init__(self, client: Any, factory: str, prefix: str) -> None:
         self._client, self._prefix, self._plugin = client, prefix, plugin_name(factory)
-        client.register_plugin(_EnginePlugin(factory), name=self._plugin, idempotent=True)
+        client.register_plugin(_EnginePlugin(factory), name=self._plugin)
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
         """See Executor."""
@@ -53,10 +55,11 @@ class DaskExecutor:
         return list(self._client.gather(list(pending)))
 
 
-class _EnginePlugin:
+class _EnginePlugin(WorkerPlugin):
     """A worker's child process, made at its first task and ended with the worker."""
 
     name = "dentine-engine"
+    idempotent = True
 
     def __init__(self, factory: str) -> None:
         self._factory = factory
