@@ -140,6 +140,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     expect(page.locator("tr", has_text="enamel.sigma").first).to_contain_text("4.032 ± 0.051")
     expect(page.locator("tr", has_text="dentin.g1").first).to_contain_text("not determined")
     expect(page.get_by_role("link", name="report.html")).to_be_visible()
+    expect(page.get_by_role("link", name="Open the report")).to_be_visible()
     assert contrast_failures(page) == []
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=f"{folder}/dashboard-{request.node.callspec.params['page']}.png", full_page=True)

@@ -1,6 +1,6 @@
 /** One job, live: fed by its event stream, completed from its artifacts when it ends. */
 
-import { artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob } from "./api";
+import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, when } from "./format";
@@ -15,6 +15,7 @@ export class JobView {
   private readonly state = element("span", { class: "badge", role: "status" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
   private readonly action = element("button", { type: "button" });
+  private readonly report = element("a", { class: "report", target: "_blank", rel: "noopener" }, "Open the report");
   private readonly stages = new StageList();
   private readonly chart = new LossChart();
   private readonly parameters = new ParameterTable();
@@ -30,6 +31,8 @@ export class JobView {
   ) {
     this.comparison = new Comparison(id);
     this.failure.hidden = true;
+    this.report.hidden = true;
+    this.report.href = artifactUrl(id, "report.html");
     this.action.addEventListener("click", () => void this.act());
   }
 
@@ -39,7 +42,7 @@ export class JobView {
     const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
     const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
     this.root.replaceChildren(
-      element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action),
+      element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action, this.report),
       element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
       this.failure,
       section("Stages", this.stages.root),
@@ -108,8 +111,9 @@ export class JobView {
 
   private async showFiles(): Promise<void> {
     const files = await listArtifacts(this.id);
-    const isResult = (path: string) => path.startsWith("asset/") || !path.includes("/");
-    const shown = files.filter((file) => isResult(file.path));
+    const isTop = (file: Artifact) => !file.path.includes("/");
+    const shown = [...files.filter(isTop), ...files.filter((file) => file.path.startsWith("asset/"))];
+    this.report.hidden = !files.some((file) => file.path === "report.html");
     this.files.replaceChildren(
       ...shown.map((file) =>
         element("li", {}, element("a", { href: artifactUrl(this.id, file.path), target: "_blank", rel: "noopener" }, file.path), ` ${bytes(file.bytes)}`),

@@ -30,8 +30,8 @@ export class ParameterTable {
     this.fill("Result: value ± one standard error.", channels, names, unit, (name, channel) => {
       const estimate = result[channel]?.[name];
       if (!estimate) return ["–"];
-      const flags = [estimate.determined ? null : "not determined", estimate.se === null ? "not fitted" : null];
-      return [valueOf(estimate), ...flags.filter((flag) => flag !== null).map((flag) => element("span", { class: "flag" }, flag))];
+      const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";
+      return flag ? [valueOf(estimate), element("span", { class: "flag" }, flag)] : [valueOf(estimate)];
     });
   }
 
