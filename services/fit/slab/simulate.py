@@ -49,10 +49,10 @@ class SlabResult(Record):
     T: float
     R_se: float
     T_se: float
-    dR: dict[str, float] = {}
-    dT: dict[str, float] = {}
-    dR_se: dict[str, float] = {}
-    dT_se: dict[str, float] = {}
+    dR: dict[str, float] = Field(default_factory=dict)
+    dT: dict[str, float] = Field(default_factory=dict)
+    dR_se: dict[str, float] = Field(default_factory=dict)
+    dT_se: dict[str, float] = Field(default_factory=dict)
     paths: int = Field(description="number of walks")
 
     def as_json(self) -> dict[str, Any]:

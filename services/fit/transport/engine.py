@@ -131,11 +131,11 @@ class Engine:
         slice_size = max(1, LANE_BUDGET // (batches * slots * tables))
         pieces = []
         for first in range(0, len(view), slice_size):
-            part = View(view.camera, view.pixels[first : first + slice_size])
-            start = CameraStart(part, batches, seed, self._radius_mm)
+            piece = View(view.camera, view.pixels[first : first + slice_size])
+            start = CameraStart(piece, batches, seed, self._radius_mm)
             tally = Walk(self._geometry, kernel_media, self._lights, start, plan, self._ior).run(per_batch)
             sums, derivatives = tally.arrays()
-            pieces.append([array.reshape(batches, len(part), slots) / per_batch for array in (sums, *derivatives)])
+            pieces.append([array.reshape(batches, len(piece), slots) / per_batch for array in (sums, *derivatives)])
         whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
         _require_finite(whole, view)
         return whole[0], whole[1:]

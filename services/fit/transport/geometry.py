@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.clearance import Clearance
+from services.fit.transport.recipe import SceneRecipe
 
 ENAMEL, DENTIN = 1, 2
 RAY_EPSILON = 8.9e-5
@@ -44,6 +45,9 @@ class Geometry(Protocol):
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
         """Next surface."""
 
+    def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Distance in mm within which no surface lies; 0 where that is not known."""
+
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Index of the medium, 0 for empty space."""
 
@@ -71,6 +75,7 @@ class MeshGeometry:
             faces.append(self.shape.base.faces + self._outer_vertices)
         self._faces = np.concatenate(faces).astype(np.uint32)
         self._current: tuple[float, ...] | None = None
+        self._clearance = Clearance(recipe.outer.vertices_mm, recipe.outer.faces)
         self._build((0.0,) * self.modes)
         if self.shape is not None:
             self._mode_tables = [mi.Float(np.ascontiguousarray(mode[self.shape.base.faces].reshape(-1), dtype=np.float32)) for mode in self.shape.modes_mm]
@@ -80,6 +85,7 @@ class MeshGeometry:
         vertices = [self.recipe.outer.vertices_mm]
         if self.shape is not None:
             vertices.append(self.shape.vertices_mm(shape))
+            self._clearance.move_inner(vertices[1], self.shape.base.faces)
         points = np.concatenate(vertices)
         if self._current is None:
             mesh = mi.Mesh("tooth", len(points), len(self._faces))
@@ -112,6 +118,10 @@ class MeshGeometry:
         normal = dr.gather(mi.Normal3f, self._normals, found.prim_index, valid)
         outer = mi.Bool(True) if self.shape is None else found.prim_index < self.outer_faces
         return Hit(dr.select(valid, found.t, dr.inf), valid, normal, outer, found.prim_index, found.prim_uv)
+
+    def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Distance within which no surface lies."""
+        return self._clearance(point, active)
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Dentin over enamel over air, whatever surfaces overlap."""
@@ -165,6 +175,10 @@ class SlabGeometry:
         distance = dr.select(active & (direction.z != 0), distance, dr.inf)
         outer = dr.select(down, place == self.layers, place == 1)
         return Hit(distance, active & dr.isfinite(distance), mi.Normal3f(0, 0, 1), outer, place, mi.Point2f(0))
+
+    def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - planes are as cheap to hit
+        """Not used: hitting a plane costs as little."""
+        return mi.Float(0)
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Layer number; both outsides are empty."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from services.fit.optics import fresnel
 from services.fit.transport.border import inverse_cosine
 from services.fit.transport.geometry import Geometry
-from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.media import Media
 
 CANDIDATES = 8
 """Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
@@ -35,8 +36,8 @@ class PointLights:
         edges = np.linspace(0, self.count, min(self.count, CANDIDATES) + 1).astype(int)
         self.strata = tuple(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
-    def choose(self, point: mi.Point3f, importance: LightImportance, rng: mi.PCG32, active: mi.Bool) -> ChosenLight:
-        """Pick one light out of stratified candidates in proportion to phase x intensity / distance^2 (resampled importance sampling)."""
+    def choose(self, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], rng: mi.PCG32, active: mi.Bool) -> ChosenLight:
+        """Pick one light of stratified candidates in proportion to importance(direction) x intensity / distance^2 (resampled importance sampling)."""
         total, chosen = mi.Float(0), ChosenLight(mi.UInt32(0), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
         for first, last in self.strata:
             size = last - first
@@ -54,17 +55,6 @@ class PointLights:
             chosen.strength = dr.select(take, strength, chosen.strength)
         chosen.total = total
         return chosen
-
-
-class LightImportance:
-    """Phase function value towards a light, the light-dependent factor of a connection."""
-
-    def __init__(self, phase: PhaseFunction, omega: mi.Vector3f) -> None:
-        self.phase, self.omega = phase, omega
-
-    def __call__(self, direction: mi.Vector3f) -> mi.Float:
-        """Value for the propagation direction towards the light."""
-        return self.phase.density(self.omega, direction)
 
 
 @dataclass

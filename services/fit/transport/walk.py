@@ -7,6 +7,7 @@ slab that count what leaves either face. What a scene lacks is absent from its k
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ import mitsuba as mi
 from services.fit.optics import fresnel
 from services.fit.transport.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
 from services.fit.transport.geometry import Geometry, Hit
-from services.fit.transport.lights import ROULETTE_FLOOR, ROULETTE_GAIN, ChosenLight, LightImportance, PointLights, shadow
+from services.fit.transport.lights import ROULETTE_FLOOR, ROULETTE_GAIN, ChosenLight, PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction, Score
 from services.fit.transport.starts import CameraStart, SlabStart
 from services.fit.transport.tally import Tally
@@ -206,8 +207,11 @@ class Walk:
     def _fly(self, walker: Walker) -> Flight:
         medium = self.geometry.medium(walker.place)
         sigma = self.media.extinction(medium)
-        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
         distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
+        # A flight that ends within the known clearance meets no surface: no ray is traced.
+        inside = walker.active & (medium != 0)
+        traced = walker.active & (distance >= self.geometry.clearance(walker.origin, inside))
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, traced)
         scatters = walker.active & (distance < hit.distance)
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
@@ -275,9 +279,10 @@ class Walk:
         walker.counts = [dr.select(flight.scatters & (flight.medium == k + 1), count + 1, count) for k, count in enumerate(walker.counts)]
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
+        assert self.lights is not None
         carried = self._carried(walker)
         phase = PhaseFunction(self.media, flight.medium)
-        chosen = self.lights.choose(walker.origin, LightImportance(phase, walker.omega), walker.rng, flight.scatters)
+        chosen = self.lights.choose(walker.origin, partial(phase.density, walker.omega), walker.rng, flight.scatters)
 
         # Cast the shadow ray with a probability in proportion to what it could bring.
         chance = dr.clip(ROULETTE_GAIN * carried * chosen.strength * self.lights.inverse_irradiance, ROULETTE_FLOOR, 1)
@@ -302,7 +307,7 @@ class Walk:
             return value
 
         dr.if_stmt(
-            (walker, flight.medium, chosen, carried * chosen.total / chance, casts), casts, cast, lambda *arguments: mi.Float(0), label="connection",
+            (walker, flight.medium, chosen, carried * chosen.total / chance, casts), casts, cast, lambda *_: mi.Float(0), label="connection",
         )  # fmt: skip
 
     def _slot(self, walker: Walker, chosen: ChosenLight) -> mi.UInt32:
