@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -89,6 +89,8 @@ def run(
     spec = read_job(job)
     with cancelling_on_signals(out), ProgressView() as view:
         asset = run_job(spec, out, view, workers)
+    if not view.events:
+        print("Every stage was published already; nothing ran.", file=sys.stderr)
     report = out / "report.html"
     if as_json:
         result = {"held_out_error": asset.held_out_error, "report": str(report), "parameters": str(out / "parameters.json"), "files": list(asset.files)}
@@ -268,28 +270,32 @@ def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
         raise typer.Exit(failure["exit_status"])
 
 
-_BENCHMARKS: dict[str, str] = {}
+_BENCHMARKS = MappingProxyType({"slab": "services.fit.bench.slab:run", "transport-stack": "services.fit.bench.transport_stack:run"})
 """Name -> ``module:function``; the function takes ``quick`` and returns JSON values."""
 
 
 def bench(
-    name: Annotated[str | None, typer.Argument(help="Benchmark to run; none lists them.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Benchmark to run, or all; without it they are listed.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file.")] = None,
-    quick: Annotated[bool, typer.Option(help="A smaller case, for a check.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A smaller case, for a check.")] = False,
 ) -> None:
     """Measure speed with its error beside it."""
     import importlib
 
     if name is None:
-        print("\n".join(_BENCHMARKS) or "No benchmark is built in yet.")
+        print("\n".join(_BENCHMARKS))
         return
-    if name not in _BENCHMARKS:
-        raise InputError(f"Benchmark {name} does not exist; known are {', '.join(_BENCHMARKS) or 'none yet'}.")
-    module, function = _BENCHMARKS[name].split(":")
-    result = json.dumps(getattr(importlib.import_module(module), function)(quick=quick), indent=1)
+    names = list(_BENCHMARKS) if name == "all" else [name]
+    if unknown := [one for one in names if one not in _BENCHMARKS]:
+        raise InputError(f"Benchmark {unknown[0]} does not exist; known are {', '.join(_BENCHMARKS)} and all.")
+    results = {}
+    for one in names:
+        module, function = _BENCHMARKS[one].split(":")
+        results[one] = getattr(importlib.import_module(module), function)(quick=quick)
+    text = json.dumps(results if name == "all" else results[name], indent=1)
     if json_file is not None:
-        json_file.write_text(result + "\n")
-    print(result)
+        json_file.write_text(text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":
