@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 
 
 class ProgressView:
-    """A context manager that is called with every event."""
+    """A context manager that is called with every event; ``events`` counts them."""
 
     def __init__(self) -> None:
+        self.events = 0
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._tenths: dict[str, int] = {}
@@ -42,6 +43,7 @@ class ProgressView:
 
     def __call__(self, event: JobEvent) -> None:
         """Show one event."""
+        self.events += 1
         if self._bars is not None:
             self._draw(self._bars, event)
         elif self._worth_a_line(event):

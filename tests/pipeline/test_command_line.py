@@ -76,6 +76,12 @@ def test_version_and_help_need_nothing() -> None:
     assert "simulate" in dentine("--help").stdout
 
 
+def test_benchmarks_are_listed_and_an_unknown_one_is_named() -> None:
+    names = dentine("bench").stdout.split()
+    assert names
+    assert f"known are {', '.join(names)} and all" in sentence(dentine("bench", "speed"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
