@@ -49,7 +49,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
         estimate = engine.images(TISSUE, view, samples=samples, seed=samples)
         rows.append(_row("dentine", time.perf_counter() - begun, estimate.mean, estimate.variance))
         ours.append(rows[-1])
-    peers = []
+    peers: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         counts = (64,) if quick else (64, 256)
         peers.extend(_peer(Path(folder), incisor, camera, view, positions, intensities, peer_lights, samples) for samples in counts)
