@@ -1,0 +1,114 @@
+"""The slab reference tables as layers and values."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.slab.simulate import Layer, Sums, accumulate
+from tests.support.shared_data import shared_path
+
+SOURCES = ("normal", "diffuse")
+BOUNDARIES = {"none": "matched", "thin": "thin", "smooth": "smooth"}
+"""The tables' names, and the project's."""
+
+
+@dataclass(frozen=True)
+class SlabCase:
+    """One simulation's worth of reference: layers under one source, with R and T as columns."""
+
+    name: str
+    layers: tuple[Layer, ...]
+    boundary: str
+    ior: float
+    source: str
+    names: tuple[str, ...]
+    """Of the derivatives."""
+    values: NDArray[np.float64]
+    """(1 + derivatives, 2): totals, then one row per derivative."""
+
+    def derivative_tolerance(self) -> NDArray[np.float64]:
+        """1 % of each derivative, or of 1e-3 of the largest one of the same case and source (derivatives, 2)."""
+        size = np.abs(self.values[1:])
+        return 0.01 * np.maximum(size, 1e-3 * size.max())
+
+
+def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int) -> Sums:
+    """Trace until ``shortfall`` is at most 1; with derivatives where the case has any."""
+    gradient = bool(case.names)
+    names, sums = accumulate(case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=gradient, seed=seed)
+    assert names[-len(case.names) :] == case.names
+    return sums
+
+
+def passes(count: int) -> Callable[[Sums], float]:
+    """A shortfall that ends after a number of passes, each four times as long as the one before, whatever the error."""
+    return lambda sums: 0.0 if sums.passes >= count else 10.0
+
+
+def total_cases() -> list[SlabCase]:
+    """``slab_totals.csv``: extinction 1 per mm, so the thickness is the optical depth."""
+    cases = []
+    for row in _rows("slab_totals.csv"):
+        ior = float(row["n"])
+        layer = Layer(sigma=1, alpha=float(row["a"]), g1=float(row["g"]), thickness_mm=float(row["tau"]))
+        for source in SOURCES:
+            name = f"a={row['a']} g={row['g']} tau={row['tau']} n={row['n']} {source}"
+            values = np.array([[float(row[f"R_{source}"]), float(row[f"T_{source}"])]])
+            cases.append(SlabCase(name, (layer,), "smooth" if ior > 1 else "matched", ior, source, (), values))
+    return cases
+
+
+def derivative_cases() -> list[SlabCase]:
+    """``slab_derivatives.csv``, in the order in which the simulation prints its derivatives."""
+    groups: dict[str, list[dict[str, str]]] = {}
+    for row in _rows("slab_derivatives.csv"):
+        groups.setdefault(row["case"], []).append(row)
+    cases = []
+    for name, rows in groups.items():
+        layers = tuple(_layer(rows[0], number) for number in range(1, int(rows[0]["layers"]) + 1))
+        for source in SOURCES:
+            values = [[float(rows[0][f"{side}_{source}"]) for side in "RT"]] + [[float(row[f"d{side}_{source}"]) for side in "RT"] for row in rows]
+            # One layer of one lobe prints plain names; the order is the table's.
+            names = ("sigma", "alpha", "g") if len(rows) == 3 else tuple(row["wrt"] for row in rows)
+            cases.append(SlabCase(f"{name} {source}", layers, BOUNDARIES[rows[0]["boundary"]], float(rows[0]["n"]), source, names, np.array(values)))
+    return cases
+
+
+def zero_cases() -> list[SlabCase]:
+    """``boundary_zero_test.csv``, lit uniformly, with the border at the table's middle depth; dR/dc, the last value, is exactly zero."""
+    cases = []
+    for row in _rows("boundary_zero_test.csv"):
+        border, depth = float(row["c2_mm"]), float(row["depth_mm_T_below_1e-6"])
+        optics = {"alpha": float(row["alpha"]), "beta": float(row["beta"]), "g1": float(row["g1"]), "g2": float(row["g2"])}
+        layers = (
+            Layer(sigma=float(row["sigma_top"]), thickness_mm=border, **optics),
+            Layer(sigma=float(row["sigma_bottom"]), thickness_mm=depth - border, **optics),
+        )
+        values = np.array([[float(row["R_diffuse"]), 0.0], [0.0, 0.0]])
+        cases.append(SlabCase(row["case"], layers, BOUNDARIES[row["boundary"]], float(row["n"]), "diffuse", ("c",), values))
+    return cases
+
+
+def named(cases: list[SlabCase], *names: str) -> list[SlabCase]:
+    """The cases whose first word is among ``names``."""
+    return [case for case in cases if case.name.split()[0] in names]
+
+
+def _layer(row: dict[str, str], number: int) -> Layer:
+    def value(column: str, default: float = 0.0) -> float:
+        return float(row[column]) if row[column] else default
+
+    n = str(number)
+    return Layer(
+        sigma=value("sigma" + n), alpha=value("alpha" + n), beta=value("beta" + n, 1.0), g1=value(f"g{n}a"), g2=value(f"g{n}b"), thickness_mm=value("d" + n)
+    )
+
+
+def _rows(file: str) -> list[dict[str, str]]:
+    with shared_path(f"reference/{file}").open(newline="") as stream:
+        return list(csv.DictReader(stream))

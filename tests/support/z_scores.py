@@ -1,0 +1,46 @@
+"""Judging Monte Carlo results: z-scores against a truth, with stated false-alarm rates.
+
+The rule of every table: standard error at most a third of the tolerance, then |z| <= 4.5 for each value (one false alarm in
+150,000 values) and an rms z between 0.8 and 1.25. Of few values an honest rms strays further; then the bounds are those
+that chi-square leaves with probability 1e-3.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+LARGEST_Z = 4.5
+RMS_FALSE_ALARM = 1e-3
+
+
+def rms_bounds(independent: int) -> tuple[float, float]:
+    """Bounds on the rms of z-scores of which ``independent`` are independent; fewer count as the wider case."""
+    tails = stats.chi2.ppf([RMS_FALSE_ALARM / 2, 1 - RMS_FALSE_ALARM / 2], independent) / independent
+    return min(0.8, math.sqrt(tails[0])), max(1.25, math.sqrt(tails[1]))
+
+
+def z_scores(values: ArrayLike, truth: ArrayLike, standard_errors: ArrayLike) -> NDArray[np.float64]:
+    """Scores of all values; those that are exact (no spread, no difference) have none and are left out."""
+    values, truth, errors = (np.asarray(a, dtype=np.float64).ravel() for a in (values, truth, standard_errors))
+    exact = (errors == 0) & (values == truth)
+    assert (errors[~exact] > 0).all(), "a value without spread differs from the truth"
+    return (values[~exact] - truth[~exact]) / errors[~exact]
+
+
+def require_unbiased(scores: ArrayLike, independent: int) -> None:
+    """Assert that z-scores look like noise alone; ``independent`` is the number of separate simulations behind them."""
+    scores = np.asarray(scores, dtype=np.float64)
+    assert np.isfinite(scores).all()
+    assert np.abs(scores).max() <= LARGEST_Z
+    low, high = rms_bounds(independent)
+    assert low <= np.sqrt(np.mean(scores**2)) <= high
+
+
+def student_to_normal(t: ArrayLike, freedom: int) -> NDArray[np.float64]:
+    """Student's t mapped onto a standard normal of equal tail probability, through the smaller tail."""
+    t = np.asarray(t, dtype=np.float64)
+    return np.copysign(stats.norm.isf(stats.t.sf(np.abs(t), freedom)), t)
