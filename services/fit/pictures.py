@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import PreparedManifest
 from services.core.store import write_atomic
-from services.fit.evaluate import Evaluation
 from services.fit.anatomy.thickness import thickness_image
+from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
 from services.fit.observations import ViewStack

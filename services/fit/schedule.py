@@ -52,7 +52,7 @@ HOMOGENEOUS_STEPS = 4
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
-"""A stage has converged when neither its next step nor Monte Carlo noise in its parameters changes the images by more, relative."""
+"""A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class Options:
     model_error: float = 0.5
     """Relative error of the promised change per unit of step length; at length 1 the promise counts little."""
     tolerance: float = 0.0
-    """Converged when neither a further step nor Monte Carlo noise is worth more than this change of F."""
+    """Converged when a further step promises no more than noise does, and noise is worth no more than this change of F."""
     least_radius: float = 1e-3
 
 
@@ -159,12 +159,14 @@ class GaussNewton:
         equations = replace(fresh, hessian=fresh.hessian + np.diag(precision), gradient=fresh.gradient + precision * (x - mean))
         noise_gain = gain_by_noise(equations)
 
+        # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never looks like convergence.
+        _, promised = self._propose(equations, x, max(state.radius, 1.0))
+        if promised <= noise_gain <= options.tolerance:
+            return replace(state, result=Result.CONVERGED, verdict="converged")
+
         radius, at_fault = state.radius, False
-        for trial in range(options.max_trials):
-            step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, radius, equations.hessian_noise)
-            promised = -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
-            if max(promised, noise_gain) <= options.tolerance:
-                return replace(state, result=Result.CONVERGED, verdict="converged")
+        for trial in range(options.max_trials if promised > noise_gain else 0):
+            step, promised = self._propose(equations, x, radius)
             if promised <= noise_gain:
                 break
             new, length = x + step, float(np.linalg.norm(step / self.domain.scale))
@@ -195,6 +197,11 @@ class GaussNewton:
         if state.samples < options.max_samples:
             return self._limited(replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled"))
         return replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit")
+
+    def _propose(self, equations: NormalEquations, x: Array, radius: float) -> tuple[Array, float]:
+        # Step within the radius and the gain that the model promises for it.
+        step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, radius, equations.hessian_noise)
+        return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
     def _carry(self, state: State, step: Array, length: float) -> State:
         # What was known before a long step is worth less after it: the model's error grows with the step, its noise does not.

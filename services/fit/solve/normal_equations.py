@@ -45,7 +45,8 @@ class NormalEquations:
     @staticmethod
     def of(record: dict[str, Any]) -> NormalEquations:
         """From ``record``."""
-        return NormalEquations(**{name: np.array(value) if isinstance(value, list) else value for name, value in record.items()})
+        values: dict[str, Any] = {name: np.array(value) if isinstance(value, list) else value for name, value in record.items()}
+        return NormalEquations(**values)
 
     def scaled(self, factor: float) -> NormalEquations:
         """The same with every weight multiplied: sums scale once, their covariances twice."""

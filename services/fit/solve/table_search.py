@@ -17,16 +17,16 @@ from services.fit.optics.domain import to_natural
 
 Array = NDArray[np.float64]
 
-REDUCED_DENSITIES = (0.15, 0.3, 0.5, 0.8, 1.2, 1.7, 2.4, 3.4, 5.0)
+REDUCED_DENSITIES = (0.2, 0.4, 0.7, 1.1, 1.6, 2.3, 3.3, 4.8)
 """Reduced scattering sigma (1 - g), per mm: the literature's span for enamel and dentin. A grid in it, not in sigma, keeps every render as costly as needed."""
-ANISOTROPIES = (0.0, 0.5, 0.75, 0.88)
-KAPPA = (1.0, 4.5)
-"""Range of -log10(1 - alpha)."""
+ANISOTROPIES = (0.0, 0.7)
+KAPPA = (1.0, 3.0)
+"""Range of -log10(1 - alpha). Not beyond: where absorption is invisible the fit would start on a plateau."""
 SCALE_TRUST = 0.35
 """Log-scale misfit that costs as much as a relative image error of 1: lights are calibrated, but one medium stands for two."""
 
 
-def order_edges(last: int = 4096) -> NDArray[np.int64]:
+def order_edges(last: int = 2048) -> NDArray[np.int64]:
     """Bin edges over the number of scatterings: single orders first, then four bins per octave."""
     fine = np.arange(0, 9)
     coarse = np.round(8 * 2.0 ** (np.arange(1, 4 * int(np.log2(last / 8)) + 1) / 4))

@@ -1,0 +1,92 @@
+"""An engine without light transport: a smooth formula with seeded noise, for tests of everything around the engine.
+
+The image of a pixel with enamel of thickness d under a light at angle c has a near part from enamel and a deep part from dentin::
+
+    I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d),   s = reduced scattering, a = reduced albedo
+
+so reduced quantities are fixed by the images and nothing else is. Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import NonFiniteError
+from services.fit.optics.parameters import Tissue
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+
+Array = NDArray[np.float64]
+
+NOISE = 1.0
+"""Relative standard deviation of one path."""
+SCORE_NOISE = 1.0
+
+
+class FakeEngine:
+    """Same methods as the real engine."""
+
+    def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
+        self.recipe = recipe
+
+    def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
+        truth = self._formula(tissue, view)
+        sigma = NOISE / np.sqrt(samples) * truth
+        return StackEstimate(truth + sigma * self._normal(view, seed, 0), sigma**2)
+
+    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
+        image = self.images(tissue, view, samples=samples, seed=seed)
+        rows = []
+        for k, name in enumerate(names):
+            step = 1e-5 * max(abs(tissue.value(name)), 1e-3)
+            high, low = (self._formula(tissue.with_values({name: tissue.value(name) + s}), view) for s in (step, -step))
+            exact = (high - low) / (2 * step)
+            scale = SCORE_NOISE * np.abs(exact).mean() / np.sqrt(samples)
+            rows.append((exact + scale * self._normal(view, seed, k + 1), np.full(exact.shape, scale**2)))
+        return JacobianEstimate(names, image.mean, image.variance, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
+
+    def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> Array:
+        image = self.images(tissue, view, samples=samples, seed=seed).mean
+        share = np.exp(-bin_edges[:-1] / 20.0) * np.diff(bin_edges)
+        return share[:, None, None] / share.sum() * image
+
+    def _formula(self, tissue: Tissue, view: View) -> Array:
+        x, y = view.pixels.T.astype(float)
+        thickness = 0.3 + 0.9 * y / 34.0
+        if self.recipe.dentin is None:
+            thickness = thickness + 50.0
+        for m, c in enumerate(tissue.shape):
+            thickness = thickness * (1 + 0.3 * c * np.cos((m + 1) * x / 9.0))
+        lights = np.arange(len(self.recipe.light_positions_mm))[:, None]
+        direction = np.abs(self.recipe.light_positions_mm[:, :1]).astype(float) / 1000
+        cosine = 0.35 + 0.6 * np.abs(np.cos(0.12 * x + direction * 3.0 + 0.1 * y))
+        enamel, dentin = tissue.enamel, tissue.dentin
+        through = np.exp(-enamel.sigma_s_reduced * thickness)
+        near = cosine * (1 - through) * enamel.alpha_reduced**1.5
+        deep = np.sqrt(cosine) * through * dentin.alpha_reduced**1.5 * (1 - np.exp(-dentin.sigma_s_reduced * cosine**2))
+        image = np.asarray(near + deep + 0.05 + 0.0 * lights)
+        if not np.isfinite(image).all():
+            raise NonFiniteError("The formula is not finite; check the parameters.")
+        return image
+
+    def _normal(self, view: View, seed: int, stream: int) -> Array:
+        # A counter-based number per (seed, stream, light, pixel): block and order do not matter.
+        lights = np.arange(len(self.recipe.light_positions_mm), dtype=np.uint64)[:, None]
+        pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None] + np.uint64(2**40) * lights
+        key = np.uint64((seed * 131 + stream * 7919 + sum(view.camera.name.encode())) % 2**63)
+        u = _uniform(pixel ^ _mix(np.full_like(pixel, key)))
+        v = _uniform(_mix(pixel + np.uint64(0x9E3779B9)) ^ _mix(np.full_like(pixel, key + np.uint64(1))))
+        return np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
+
+
+def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    # splitmix64 (Steele, Lea and Flood 2014)
+    with np.errstate(over="ignore"):
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return z ^ (z >> np.uint64(31))
+
+
+def _uniform(z: NDArray[np.uint64]) -> Array:
+    return (_mix(z) >> np.uint64(11)).astype(np.float64) / 2.0**53 + 2.0**-54
+

@@ -1,0 +1,99 @@
+"""Sums from two seeds are unbiased, and the errors they state are the errors they have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.fit.solve.normal_equations import NormalEquations, loss_change, normal_equations, pool
+
+ROUNDS = 3000
+MEASUREMENTS = 40
+
+
+def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
+    j, r, weight = _problem()
+    spread = 0.8
+    variance, reference = np.full(MEASUREMENTS, 0.3), np.full(MEASUREMENTS, 0.05)
+    return tuple(
+        normal_equations(
+            j + spread * rng.standard_normal(j.shape),
+            j + spread * rng.standard_normal(j.shape),
+            r + np.sqrt(variance) * rng.standard_normal(MEASUREMENTS),
+            variance,
+            reference,
+            weight,
+        )
+        for _ in range(ROUNDS)
+    )
+
+
+def _problem() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(3)
+    return rng.standard_normal((3, MEASUREMENTS)), rng.standard_normal(MEASUREMENTS), rng.uniform(0.5, 2, MEASUREMENTS)
+
+
+def test_sums_are_unbiased_and_their_errors_true() -> None:
+    j, r, weight = _problem()
+    many = _noisy(np.random.default_rng(1))
+    gradients = np.array([e.gradient for e in many])
+    hessians = np.array([e.hessian for e in many])
+
+    # Means against the noise-free sums: 12 values, family-wise 1e-3 is |z| < 4.
+    for sample, exact in ((gradients, (weight * j) @ r), (hessians, (weight * j) @ j.T)):
+        z = (sample.mean(axis=0) - exact) / (sample.std(axis=0) / np.sqrt(ROUNDS))
+        assert np.abs(z).max() < 4
+
+    # Stated against seen variances: a variance of ROUNDS values has a relative error of sqrt(2 / ROUNDS) = 2.6 %, doubled for non-Gaussian products; 4 sigma.
+    tolerance = 4 * 2 * np.sqrt(2 / ROUNDS)
+    for u in np.eye(3), np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]:
+        seen = np.array([[direction @ h @ direction for direction in u.T] for h in hessians]).var(axis=0)
+        stated = np.mean([e.eigenvalue_noise(u) ** 2 for e in many], axis=0)
+        np.testing.assert_allclose(stated, seen, rtol=tolerance)
+        np.testing.assert_allclose(
+            np.mean([np.diag(u.T @ e.gradient_noise @ u) for e in many], axis=0), ((gradients @ u).var(axis=0)), rtol=tolerance
+        )  # fmt: skip
+
+
+def test_data_noise_is_unbiased() -> None:
+    j, _, weight = _problem()
+    many = _noisy(np.random.default_rng(4))
+    sample = np.array([e.data_noise for e in many])
+    exact = (weight**2 * 0.05 * j) @ j.T
+    z = (sample.mean(axis=0) - exact) / (sample.std(axis=0) / np.sqrt(ROUNDS))
+    assert np.abs(z).max() < 4
+
+
+def test_compared_losses_are_unbiased_and_their_error_true() -> None:
+    rng = np.random.default_rng(7)
+    old, new, weight = rng.standard_normal(MEASUREMENTS), rng.standard_normal(MEASUREMENTS), rng.uniform(0.5, 2, MEASUREMENTS)
+    changes = []
+    for _ in range(ROUNDS):
+        shared = rng.standard_normal((2, MEASUREMENTS))
+        own = rng.standard_normal((2, 2, MEASUREMENTS))
+        o = [old + 0.5 * shared[k] + 0.1 * own[0, k] for k in range(2)]
+        n = [new + 0.5 * shared[k] + 0.1 * own[1, k] for k in range(2)]
+        changes.append(loss_change(o[0], o[1], n[0], n[1], weight))
+    values = np.array([c.change for c in changes])
+    exact = 0.5 * float(weight @ (new**2 - old**2))
+    assert abs(values.mean() - exact) < 4 * values.std() / np.sqrt(ROUNDS)
+    np.testing.assert_allclose(np.mean([c.variance for c in changes]), values.var(), rtol=8 * np.sqrt(2 / ROUNDS))
+
+
+def test_pooling_averages_monte_carlo_noise_but_not_the_data() -> None:
+    first, second = _noisy(np.random.default_rng(9))[:2]
+    both = pool(first, 64, second, 64)
+    np.testing.assert_allclose(both.gradient, 0.5 * (first.gradient + second.gradient))
+    np.testing.assert_allclose(both.gradient_noise, 0.25 * (first.gradient_noise + second.gradient_noise))
+    np.testing.assert_allclose(both.data_noise, 0.5 * (first.data_noise + second.data_noise))
+
+
+def test_moving_the_model_keeps_its_predictions() -> None:
+    equations = _noisy(np.random.default_rng(11))[0]
+    step, further = np.array([0.3, -0.2, 0.1]), np.array([-0.1, 0.4, 0.2])
+    moved = equations.moved(step)
+
+    def model(e: NormalEquations, p: np.ndarray) -> float:
+        return float(e.gradient @ p + 0.5 * p @ e.hessian @ p)
+
+    assert np.isclose(model(equations, step + further), model(equations, step) + model(moved, further))
+    assert NormalEquations.of(equations.record()).record() == equations.record()
