@@ -22,6 +22,7 @@ class FolderSource:
     """Reads a folder capture; everything but the pixels is checked before the first image is opened."""
 
     measures_motion = False
+    notes: tuple[str, ...] = ()
 
     def __init__(self, root: Path, noise_relative: float, noise_floor: float) -> None:
         """Open ``root/capture.json``.

@@ -22,6 +22,8 @@ STILL_PX = 0.1
 # A frame whose interpolated motion is less certain than this is not used
 UNCERTAIN_PX = 0.5
 BLACK_FRAMES = 8
+# A cubic in time has four coefficients
+MIN_TRACKING = 4
 
 Counts = Callable[[FrameRecord], NDArray[np.uint16]]
 
@@ -49,6 +51,11 @@ class RigSource:
             if not own:
                 raise CaptureInputError(f"Capture {root} has no lit frame of light {light.name}; capture that light again.")
             self._frames.append(own)
+        tracking = sum(frame.kind == "tracking" for frame in manifest.frames)
+        self.notes: tuple[str, ...] = ()
+        if tracking < MIN_TRACKING:
+            note = f"Capture has {tracking} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to 0.2 px; lower rig.tracking_every."
+            self.notes = (note,)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``; every camera sees every light."""
@@ -66,9 +73,11 @@ class RigSource:
             for frame in self._black:
                 black += counts(frame) / np.float32(len(self._black))
             radiometry = Radiometry(black, len(self._black), self._manifest)
+            # Without the black image, whose noise would be the same in every frame and speak for no motion at all
+            level = np.float32(np.median(black))
 
             def brightness(frame: FrameRecord) -> Image:
-                return np.asarray(radiometry.radiance(counts(frame), frame)[0].mean(axis=-1), dtype=np.float32)
+                return np.asarray(counts(frame).mean(axis=-1, dtype=np.float32) - level, dtype=np.float32)
 
             view = self.description.cameras[camera].name
             motion = ViewMotion(footprint, jaws(sorted(self._manifest.fdi)), self._manifest.frames, brightness, view)

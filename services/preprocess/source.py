@@ -57,6 +57,10 @@ class Source(Protocol):
     def measures_motion(self) -> bool:
         """Whether images carry a displacement."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences the operator should read before trusting the result."""
+
     def lights_of(self, camera: int) -> tuple[int, ...]:
         """Indices of the lights this camera has an image of."""
 

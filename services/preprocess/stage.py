@@ -49,6 +49,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     images_in_all = sum(len(source.lights_of(k)) for k in range(len(cameras)))
     context.report(StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras."))
 
+    for note in source.notes:
+        context.report(StageEvent(stage="prepare", kind="log", message=note))
+
     # One chunk per image, so that each is written once
     height, width = max(c.size[1] for c in cameras), max(c.size[0] for c in cameras)
     planes, stack = (len(cameras), len(lights), height, width), ("camera", "light", "y", "x")

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +173,18 @@ def test_cancel_between_images_publishes_nothing(moved: tuple[Path, Rendered, Pr
     (tmp_path / "cancel").unlink()
     with pytest.raises(JobCancelledError):
         run(JobSpec(capture=root), LocalContext(tmp_path, listener=cancel_after_two))
+
+
+def test_without_tracking_frames_the_operator_is_told(renders: Mapping[str, Any], tmp_path: Path) -> None:
+    whole = description(renders)
+    lit = [k for k, (light, _) in enumerate(FRAMES) if light >= 0]
+    write_capture(tmp_path, replace(whole, frames=tuple(FRAMES[k] for k in lit), radiance=whole.radiance[:, lit]))
+    events: list[StageEvent] = []
+    manifest = run(JobSpec(capture=tmp_path, held_out_lights=("l1",)), LocalContext(tmp_path, listener=events.append))
+    assert [event.message for event in events if event.kind == "log"] == [
+        "Capture has 0 tracking frames, and 4 are needed to follow a smooth motion to 0.2 px; lower rig.tracking_every."
+    ]
+    assert manifest.held_out == (("c0", "l1"), ("c1", "l1"))
 
 
 def test_truncated_shard_is_named(renders: Mapping[str, Any], tmp_path: Path) -> None:
