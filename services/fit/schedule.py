@@ -49,6 +49,8 @@ SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature table."""
 HOMOGENEOUS_STEPS = 4
+EXACT_SAMPLES = 4
+"""Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
@@ -122,11 +124,11 @@ class ChannelSchedule:
             domain = Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",)) for k in range(self.modes)))
             tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
-        tissue, solution = self._iterate(problem, options, solution.samples)
+        tissue, solution = self._iterate(problem, options, min(solution.samples, EXACT_SAMPLES * samples))
         if spec.lobes == 2:
             domain = media_domain(parts, ("sigma", "alpha", "g1", "beta", "g2"))
             problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
-            tissue, solution = self._iterate(problem, options, solution.samples)
+            tissue, solution = self._iterate(problem, options, min(solution.samples, EXACT_SAMPLES * samples))
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
 
     def _homogeneous_start(self) -> Tissue:

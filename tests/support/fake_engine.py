@@ -9,6 +9,8 @@ so reduced quantities are fixed by the images and nothing else is. Noise is Gaus
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,3 +92,15 @@ def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def _uniform(z: NDArray[np.uint64]) -> Array:
     return (_mix(z) >> np.uint64(11)).astype(np.float64) / 2.0**53 + 2.0**-54
 
+
+
+class SlowFakeEngine(FakeEngine):
+    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are the fake engine's."""
+
+    def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
+        time.sleep(0.01)
+        return super().images(tissue, view, samples=samples, seed=seed)
+
+    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
+        time.sleep(0.02)
+        return super().jacobian(tissue, view, names, samples=samples, seed=seed)

@@ -1,0 +1,146 @@
+"""The fit on a Dask cluster: both kinds of pass at once on two workers, and the same answer after a worker or a renderer is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+from distributed import Client, LocalCluster
+
+from services.core.records import FitReport, JobSpec
+from services.core.stage import LocalContext
+from services.core.store import open_stage
+from services.fit.stage import run
+from tests.support.prepared import FAKE, write_prepared
+
+SLOW = "tests.support.fake_engine:SlowFakeEngine"
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with (
+        dask.config.set({"distributed.worker.daemon": False}),
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def spec_for(root: Path) -> JobSpec:
+    return JobSpec(
+        capture=root, boundary="matched", dentin="known", samples_per_pixel=64, max_samples_per_pixel=128, max_steps=4, search_candidates=500
+    )  # fmt: skip
+
+
+def fit_once(root: Path, engine: str) -> None:
+    """What the pipeline's stage task does: a higher attempt each time it is run."""
+    lease = root / "fit.lease"
+    attempt = int(lease.read_text()) + 1 if lease.exists() else 1
+    (root / "driver.pid").write_text(str(os.getpid()))
+    run(spec_for(root), LocalContext(root, attempt), engine=engine)
+
+
+def answer(root: Path) -> dict[str, Any]:
+    return open_stage(root, "fit", FitReport)[1].model_dump(exclude={"seconds"})
+
+
+def trace(root: Path) -> list[dict[str, Any]]:
+    return list(json.loads((root / "fit" / "trace.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("undisturbed")
+    write_prepared(root)
+    client.submit(fit_once, root, SLOW, pure=False).result(timeout=200)
+    return root
+
+
+def test_image_and_jacobian_tasks_run_on_two_workers_at_once(undisturbed: Path) -> None:
+    rows = trace(undisturbed)
+    together = [
+        (a, b)
+        for a in rows
+        for b in rows
+        if a["kind"] == "image" and b["kind"] == "jacobian" and a["step"] == b["step"] and a["worker"] != b["worker"]
+        if min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"])
+    ]
+    assert together
+    assert len({row["worker"] for row in rows}) == 2
+
+
+def test_a_cluster_gives_the_answer_of_one_process(undisturbed: Path, tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    run(spec_for(tmp_path), LocalContext(tmp_path), engine=FAKE)
+    assert answer(tmp_path) == answer(undisturbed)
+
+
+def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
+    # The driver's own worker dies: Dask runs the stage again elsewhere, a new attempt that continues from the journal.
+    write_prepared(tmp_path)
+    future = client.submit(fit_once, tmp_path, SLOW, pure=False, retries=2)
+    entries = await_entries(tmp_path, 5)
+    os.kill(int((tmp_path / "driver.pid").read_text()), signal.SIGKILL)
+    future.result(timeout=200)
+    assert answer(tmp_path) == answer(undisturbed)
+    assert len(read_entries(tmp_path)) > entries
+
+
+def test_killed_helper_worker_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
+    # The other worker dies with whatever blocks it held; the driver goes on.
+    write_prepared(tmp_path)
+    future = client.submit(fit_once, tmp_path, SLOW, pure=False)
+    await_entries(tmp_path, 5)
+    driver = int((tmp_path / "driver.pid").read_text())
+    os.kill(next(pid for pid in client.run(os.getpid).values() if pid != driver), signal.SIGKILL)
+    future.result(timeout=200)
+    assert answer(tmp_path) == answer(undisturbed)
+    assert (tmp_path / "fit.lease").read_text() == "1"
+
+
+def test_killed_renderer_is_started_again(client: Client, undisturbed: Path, tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    future = client.submit(fit_once, tmp_path, SLOW, pure=False)
+    await_entries(tmp_path, 4)
+    children = [pid for pid in client.run(_children).values() if pid]
+    os.kill(children[0], signal.SIGKILL)
+    future.result(timeout=200)
+    assert answer(tmp_path) == answer(undisturbed)
+
+
+def test_renderers_end_with_their_worker(tmp_path: Path) -> None:
+    from services.fit.engine_host import ChildHost
+
+    host = ChildHost(FAKE)
+    host._connect()
+    pid = host.pid
+    assert pid is not None
+    host._pipe.close()  # type: ignore[union-attr]
+    assert host._process is not None
+    assert host._process.wait(timeout=20) == 0
+
+
+def read_entries(root: Path) -> dict[str, Any]:
+    journal = root / "fit-checkpoint" / "journal.json"
+    return dict(json.loads(journal.read_text())["entries"]) if journal.is_file() else {}
+
+
+def await_entries(root: Path, count: int) -> int:
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        found = len(read_entries(root))
+        if found >= count:
+            return found
+        time.sleep(0.05)
+    pytest.fail("the fit recorded nothing")
+
+
+def _children(dask_worker: Any) -> int | None:
+    return next((plugin.host.pid for name, plugin in dask_worker.plugins.items() if name.endswith("SlowFakeEngine")), None)
