@@ -7,7 +7,9 @@ joined by what the scan knows, how far each normal is from the mirror direction.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from services.preprocess.projection import Footprint
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
+FITTED_PIXELS = 100_000
 
 
 @dataclass(frozen=True)
@@ -104,19 +107,47 @@ def highlight_mask(
 
 def _by_shading(brightness: Image, variance: Image, usable: BoolArray, far: BoolArray, normal: Image, o: HighlightOptions) -> tuple[Image, Image]:
     """Reflected part and inverse variance, taking diffuse shading as a quadratic in the normal (nine coefficients)."""
-    x, y, z = (normal[..., k] for k in range(3))
     lit = far & (brightness > 0.1 * np.quantile(brightness[far], 0.95)) if far.any() else far
-    if np.count_nonzero(lit) < 90:
+    chosen = np.flatnonzero(lit)
+    if len(chosen) < 90:
         return np.zeros_like(brightness), np.zeros_like(brightness)
-    terms = np.stack([np.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], axis=-1)
-    chosen, level = terms[lit].astype(np.float64), brightness[lit].astype(np.float64)
+    # Nine coefficients need no more than evenly strided pixels
+    chosen = chosen[:: -(-len(chosen) // FITTED_PIXELS)]
+    terms = np.stack(tuple(_quadratic(normal.reshape(-1, 3)[chosen].astype(np.float64))), axis=-1)
+    level = brightness.ravel()[chosen].astype(np.float64)
     # A small ridge keeps directions that the visible normals do not span at zero
-    matrix = chosen.T @ chosen
-    shading = (terms @ np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), chosen.T @ level)).astype(np.float32)
+    matrix = terms.T @ terms
+    coefficients = np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), terms.T @ level)
+    shading = np.zeros_like(brightness)
+    for coefficient, term in zip(coefficients, _quadratic(normal), strict=True):
+        shading += np.float32(coefficient) * term
     # The fit's own misfit says how far to trust it
-    misfit = max(o.shading_error, float(np.sqrt(np.mean((level - shading[lit]) ** 2)) / level.mean()))
+    misfit = max(o.shading_error, float(np.sqrt(np.mean((level - terms @ coefficients) ** 2)) / level.mean()))
     weight = usable / np.maximum(variance + (misfit * shading) ** 2, 1e-30)
     return brightness - shading, weight.astype(np.float32)
+
+
+def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """The nine monomials of a normal (..., 3) up to degree two, as spherical harmonics up to scale."""
+    x, y, z = (normal[..., k] for k in range(3))
+    yield np.ones_like(x)
+    yield from (x, y, z)
+    yield x * y
+    yield y * z
+    yield z * x
+    yield x * x - y * y
+    yield 3 * z * z - 1
+
+
+def _wide_blur(image: Image, sigma_px: float) -> Image:
+    """Gaussian blur; a wide one is made on a reduced image, which it cannot tell apart."""
+    import cv2
+
+    factor = max(1, int(sigma_px / 6))
+    height, width = image.shape
+    small = image if factor == 1 else cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(small, (0, 0), sigma_px / factor)
+    return np.asarray(blurred if factor == 1 else cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
 
 def _by_colour(
@@ -126,8 +157,6 @@ def _by_colour(
 
     With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance grows as 1/ρ².
     """
-    import cv2
-
     if np.count_nonzero(far) < 20:
         return np.zeros_like(brightness), np.zeros_like(brightness)
     chroma = radiance[far].sum(axis=0, dtype=np.float64)
@@ -140,9 +169,9 @@ def _by_colour(
     along = (radiance @ direction.astype(np.float32)).astype(np.float32)
     reach = max(2.0, 0.15 * float(np.sqrt(np.count_nonzero(usable))))
     mean_along, mean_brightness = float(along[far].mean()), float(brightness[far].mean())
-    known = cv2.GaussianBlur(far.astype(np.float32), (0, 0), reach) + 0.05
-    local_along = (cv2.GaussianBlur(along * far, (0, 0), reach) + 0.05 * mean_along) / known
-    local_brightness = (cv2.GaussianBlur(brightness * far, (0, 0), reach) + 0.05 * mean_brightness) / known
+    known = _wide_blur(far.astype(np.float32), reach) + 0.05
+    local_along = (_wide_blur(along * far, reach) + 0.05 * mean_along) / known
+    local_brightness = (_wide_blur(brightness * far, reach) + 0.05 * mean_brightness) / known
     ratio = np.maximum(local_along / np.maximum(local_brightness, 1e-30), 0.1 * mean_along / mean_brightness)
     estimate = brightness - along / ratio
     spread = np.zeros_like(brightness)
