@@ -26,9 +26,6 @@ class Settings(Record):
     """Everything a deployment may set."""
 
     server: ServerSettings = ServerSettings()
-    workers: int = Field(default=2, ge=1, description="worker processes, one thread each")
-    worker_threads: int = Field(default=1, ge=1, description="Dr.Jit threads per worker process")
-    variant: str = Field(default="llvm", pattern="^(llvm|cuda)$", description="Dr.Jit back end")
 
 
 def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> Settings:
