@@ -87,14 +87,20 @@ def run_on_worker(plugin: str, task: Task, *args: Any) -> Any:
     return task(get_worker().plugins[plugin].host, *args)
 
 
+def _inside_task() -> bool:
+    from distributed import get_worker
+
+    try:
+        get_worker()
+    except ValueError:
+        return False
+    return True
+
+
 @contextmanager
 def executor(factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
     """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process."""
-    try:
-        from distributed import get_worker
-
-        get_worker()
-    except (ImportError, ValueError):
+    if not _inside_task():
         host = InProcessHost(factory)
         try:
             yield LocalExecutor(host)

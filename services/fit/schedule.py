@@ -209,14 +209,16 @@ class ChannelSchedule:
         return ends[best]
 
     def _finish(self, problem: StackProblem, solution: Solution) -> ChannelFit:
-        # Curvature and noise at the solution, with fresh seeds, and the errors that are reported.
+        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
         samples = min(max(solution.samples, 4 * self.spec.samples_per_pixel), self.spec.max_samples_per_pixel)
-
-        self.pause()
-        stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
+        equations = solution.equations
+        if equations is None:
+            self.pause()
+            stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
+            equations = NormalEquations.of(stored)
         evaluation = self._evaluate("final", problem.base, samples)
         fitted, held_out = evaluation.fitted.error or 0.0, evaluation.held_out.error
-        return ChannelFit(problem.base, problem.domain, solution, NormalEquations.of(stored), fitted, held_out, self.steps, evaluation)
+        return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
 
     def _evaluate(self, label: str, tissue: Tissue, samples: int) -> Evaluation:
         passes = replace(self.passes, blocks=self.files.evaluation_blocks, recipe=self.files.evaluation_recipe)

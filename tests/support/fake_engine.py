@@ -10,12 +10,14 @@ so reduced quantities are fixed by the images and nothing else is. Noise is Gaus
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
 from services.fit.optics.parameters import Tissue
+from services.fit.solve.table_search import bin_powers
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
 
 Array = NDArray[np.float64]
@@ -49,7 +51,14 @@ class FakeEngine:
 
     def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> Array:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
-        share = np.exp(-bin_edges[:-1] / 20.0) * np.diff(bin_edges)
+        # Shares of the orders whose power series in the albedo follows the formula's mean image.
+        alphas = 1 - np.logspace(-4, -0.7, 40)
+        whites = [replace(medium, alpha=1.0) for medium in (tissue.enamel, tissue.dentin)]
+        white = self._formula(Tissue(*whites, tissue.shape), view)
+        image = image * white / self._formula(tissue, view)
+        grey = [self._formula(Tissue(*(replace(m, alpha=a) for m in whites), tissue.shape), view).mean() / white.mean() for a in alphas]
+        powers = bin_powers(alphas, bin_edges)
+        share = np.linalg.solve(powers.T @ powers + 1e-6 * np.eye(len(bin_edges) - 1), powers.T @ np.array(grey))
         return share[:, None, None] / share.sum() * image
 
     def _formula(self, tissue: Tissue, view: View) -> Array:

@@ -11,6 +11,10 @@ the optimum the comparison decides, close to it, where losses hardly differ, the
 * both together surely better, and not contradicting each other: taken;
 * surely worse, or less than promised: the model's curvature is at fault, the trust radius shrinks;
 * otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
+
+A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore settles it on the minimum of all
+that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts; its error is then that of the pooled
+gradient, and unbiased.
 """
 
 from __future__ import annotations
@@ -53,6 +57,10 @@ ADVICE = {
     Result.MAX_STEPS: "The fit still improved at its last step; raise max_steps.",
     Result.STALLED: "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the capture.",
 }
+
+
+DETERMINED = 3.0
+"""A direction counts as determined when its curvature exceeds so many of its own standard deviations."""
 
 
 class Problem(Protocol):
@@ -120,6 +128,8 @@ class Solution:
     advice: str
     steps: int
     samples: int
+    equations: NormalEquations | None
+    """All that is known around x; None where the last step discarded it."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +150,7 @@ class GaussNewton:
 
     def finish(self, state: State) -> Solution:
         """The outcome as a value."""
-        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples)
+        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples, state.memory)
 
     def step(self, problem: Problem, state: State) -> State:
         """One linearisation and up to ``max_trials`` comparisons.
@@ -162,7 +172,7 @@ class GaussNewton:
         # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never looks like convergence.
         _, promised = self._propose(equations, x, max(state.radius, 1.0))
         if promised <= noise_gain <= options.tolerance:
-            return replace(state, result=Result.CONVERGED, verdict="converged")
+            return self._settled(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
 
         radius, at_fault = state.radius, False
         for trial in range(options.max_trials if promised > noise_gain else 0):
@@ -196,7 +206,32 @@ class GaussNewton:
             return self._limited(replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced"))
         if state.samples < options.max_samples:
             return self._limited(replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled"))
-        return replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit")
+        return self._settled(problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations)
+
+    def _settled(self, problem: Problem, state: State, equations: NormalEquations) -> State:
+        # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step below one scale.
+        scale, x = self.domain.scale, state.x
+        eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
+        noise = equations.eigenvalue_noise(scale[:, None] * vectors)
+        spread = np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors), 0.0))
+        sure = vectors[:, (eigenvalues > DETERMINED * noise) & (eigenvalues > spread) & (eigenvalues > 1e-13 * abs(eigenvalues).max())]
+        curvature = np.einsum("ak,ab,bk->k", sure, equations.hessian * np.outer(scale, scale), sure)
+        step = scale * (sure @ (-(sure.T @ (scale * equations.gradient)) / curvature))
+        length = float(np.linalg.norm(step / scale))
+        if state.memory is None or length == 0:
+            return state
+        low, high = self.domain.bounds
+        step = np.clip(x + step / max(length, 1.0), low, high) - x
+
+        compared = problem.compare(x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials)
+        mean, precision = self.domain.prior
+        change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+        if change > self.options.sure_z * compared.se:
+            return state
+        if length > 1:
+            # Too far for one linear model: look again from there.
+            return self._limited(self._carry(replace(state, x=x + step, result=Result.RUNNING, verdict="settling"), step, 1.0))
+        return replace(state, x=x + step, memory=state.memory.moved(step), verdict=f"{state.verdict}, settled")
 
     def _propose(self, equations: NormalEquations, x: Array, radius: float) -> tuple[Array, float]:
         # Step within the radius and the gain that the model promises for it.
