@@ -110,14 +110,14 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
     _, report, _ = finished
     write_prepared(tmp_path)
 
-    class Stopped(Exception):
+    class StoppedError(Exception):
         pass
 
     def stop(event: StageEvent) -> None:
         if event.kind == "step" and event.data["step"] == stop_at:
-            raise Stopped
+            raise StoppedError
 
-    with pytest.raises(Stopped):
+    with pytest.raises(StoppedError):
         run(spec_for(tmp_path), LocalContext(tmp_path, 1, stop), engine=FAKE)
     events: list[StageEvent] = []
     assert without_time(fit(tmp_path, attempt=2, events=events)) == without_time(report)

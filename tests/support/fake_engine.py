@@ -7,6 +7,7 @@ The image of a pixel with enamel of thickness d under a light at angle c has a n
 so reduced quantities are fixed by the images and nothing else is. Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
 """
 
+# ruff: noqa: ARG002 - signatures are those of what is replaced
 from __future__ import annotations
 
 import time
@@ -100,7 +101,6 @@ def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _uniform(z: NDArray[np.uint64]) -> Array:
     return (_mix(z) >> np.uint64(11)).astype(np.float64) / 2.0**53 + 2.0**-54
-
 
 
 class SlowFakeEngine(FakeEngine):

@@ -1,7 +1,9 @@
 """The solver on problems whose truth is known: converges, never produces NaN, never takes a worse step."""
 
+# ruff: noqa: ARG002 - signatures are those of what is replaced
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,9 +41,7 @@ class Quadratic:
         symmetric = h * (shake + shake.T) / 2
         identity = np.eye(count)
         fourth = 0.5 * h**2 * (np.einsum("ac,bd->abcd", identity, identity) + np.einsum("ad,bc->abcd", identity, identity)).reshape(count**2, count**2)
-        return NormalEquations(
-            self.a + symmetric, self.a @ (x - self.best) + g * rng.standard_normal(count), fourth, g**2 * identity, np.zeros((count, count))
-        )
+        return NormalEquations(self.a + symmetric, self.a @ (x - self.best) + g * rng.standard_normal(count), fourth, g**2 * identity, np.zeros((count, count)))
 
     def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
         self.calls.append(("compare", samples))
@@ -161,7 +161,7 @@ def test_state_survives_the_journal_exactly() -> None:
     problem = Quadratic(np.diag([4.0, 1.0]), np.array([1.0, 2.0]), gradient_noise=1.0, hessian_noise=0.3, loss_noise=0.1)
     solver = GaussNewton(_domain(2), Options(max_steps=4))
     state = solver.step(problem, solver.init(np.array([2.0, 3.0]), 64))
-    again = state_from(__import__("json").loads(__import__("json").dumps(state_record(state))))
+    again = state_from(json.loads(json.dumps(state_record(state))))
     assert state_record(solver.step(problem, again)) == state_record(solver.step(problem, state))
 
 

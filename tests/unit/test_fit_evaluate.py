@@ -1,0 +1,43 @@
+"""Image error with both noises taken out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.fit.evaluate import ErrorSums, error_sums
+
+
+@pytest.mark.parametrize("truth_error", [0.0, 0.05, 0.2])
+def test_error_is_unbiased_by_either_noise(truth_error: float) -> None:
+    # Squared error over 400 draws, z < 4 (two-sided 6e-5 each).
+    rng, size = np.random.default_rng(int(100 * truth_error)), 500
+    reference = rng.uniform(0.5, 1.5, size)
+    model = reference * (1 + truth_error * rng.choice([-1, 1], size))
+    exact = float(((model - reference) ** 2).sum() / (reference**2).sum())
+    squares = []
+    for _ in range(400):
+        variance = np.full(size, 0.1**2)
+        noisy = reference + 0.1 * rng.standard_normal(size)
+        first, second = (model + 0.3 * rng.standard_normal(size) for _ in range(2))
+        sums = error_sums(first, second, noisy, variance, np.ones(size, dtype=bool))
+        squares.append((sums.product - sums.reference_variance) / (sums.reference_squared - sums.reference_variance))
+    z = (np.mean(squares) - exact) / (np.std(squares) / np.sqrt(len(squares)))
+    assert abs(z) < 4
+
+
+def test_masked_measurements_do_not_count_and_blocks_add() -> None:
+    rng = np.random.default_rng(5)
+    a, b, r = rng.uniform(0.5, 1.5, (3, 40))
+    v, chosen = np.full(40, 1e-4), rng.uniform(size=40) > 0.3
+    a[~chosen] = np.nan
+    whole = error_sums(a, b, r, v, chosen)
+    parts = error_sums(a[:15], b[:15], r[:15], v[:15], chosen[:15]) + error_sums(a[15:], b[15:], r[15:], v[15:], chosen[15:])
+    assert whole.error == pytest.approx(parts.error)
+    assert np.isfinite(whole.error or np.nan)
+
+
+def test_no_signal_has_no_error() -> None:
+    assert ErrorSums().error is None
+    assert ErrorSums(1.0, 1.0, 2.0).error is None
+    assert ErrorSums(-1.0, 1.0, 0.0).error == 0.0
