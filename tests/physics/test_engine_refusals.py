@@ -1,0 +1,172 @@
+"""What the engine and the slab cannot take is refused before any kernel runs, with a sentence that names parameter and value."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.core.errors import DentineError, InputError, MeshError, PlatformError
+from services.core.geometry import Mesh
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.slab.simulate import Layer, simulate_slab
+from services.fit.transport.engine import Engine
+from services.fit.transport.platform import require_llvm
+from services.fit.transport.recipe import SceneRecipe, View
+from tests.support.small_tooth import LIGHTS_MM, camera_at, ellipsoid, recipe, whole_view
+
+TISSUE = Tissue(Medium(2, 0.9, 0.9, 0.6, -0.2), Medium(4, 0.8), (0.5, 0.4))
+
+FORBIDDEN = [
+    ("sigma", 0.0, "0"), ("sigma", -3.0, "-3"), ("sigma", math.inf, "inf"), ("sigma", math.nan, "nan"),
+    ("alpha", -0.1, "-0.1"), ("alpha", 1.001, "1.001"), ("alpha", math.nan, "nan"),
+    ("beta", -0.2, "-0.2"), ("beta", 1.5, "1.5"),
+    ("g1", 1.0, "1"), ("g1", -1.0, "-1"), ("g2", 1.7, "1.7"), ("g2", -math.inf, "-inf"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return Engine(recipe())
+
+
+@pytest.fixture
+def no_kernel(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
+    """Fails the test if a walk is traced."""
+    from services.fit.transport.walk import Walk
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a kernel ran")
+
+    monkeypatch.setattr(Walk, "run", refuse)
+
+
+def require_sentence(error: DentineError, *parts: str) -> None:
+    """One sentence that names what is wrong."""
+    assert all(part in error.message for part in parts), error.message
+    assert error.message.endswith(".")
+    assert "\n" not in error.message
+
+
+@pytest.mark.parametrize(("field", "value", "shown"), FORBIDDEN)
+@pytest.mark.parametrize("part", ["enamel", "dentin"])
+def test_a_tissue_out_of_range_is_refused(engine: Engine, no_kernel: None, part: str, field: str, value: float, shown: str) -> None:
+    tissue = TISSUE.with_values({f"{part}.{field}": value})
+    view = whole_view(camera_at((0, 1, 0)))
+    for call in (
+        lambda: engine.images(tissue, view, samples=1, seed=1),
+        lambda: engine.jacobian(tissue, view, ("enamel.sigma",), samples=1, seed=1),
+    ):
+        with pytest.raises(InputError) as caught:
+            call()
+        require_sentence(caught.value, f"{part}.{field} = {shown} ")
+
+
+@pytest.mark.parametrize("shape", [(), (0.5,), (0.5, math.nan)])
+def test_blend_weights_that_do_not_fit_are_refused(engine: Engine, no_kernel: None, shape: tuple[float, ...]) -> None:
+    with pytest.raises(InputError) as caught:
+        engine.images(replace(TISSUE, shape=shape), whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
+    require_sentence(caught.value, "shape", str(shape))
+
+
+def test_an_empty_pixel_list_is_refused(engine: Engine, no_kernel: None) -> None:
+    view = View(camera_at((0, 1, 0)), np.zeros((0, 2), dtype=np.int32))
+    with pytest.raises(InputError) as caught:
+        engine.images(TISSUE, view, samples=1, seed=1)
+    require_sentence(caught.value, "c0", "no pixel")
+
+
+def test_an_unknown_parameter_is_refused(engine: Engine, no_kernel: None) -> None:
+    with pytest.raises(InputError) as caught:
+        engine.jacobian(TISSUE, whole_view(camera_at((0, 1, 0))), ("dentin.roughness",), samples=1, seed=1)
+    require_sentence(caught.value, "dentin.roughness", "dentin.sigma", "shape.1")
+
+
+def test_lights_that_give_no_light_are_refused() -> None:
+    scene = recipe()
+    dark = replace(scene, light_positions_mm=np.zeros((0, 3)), light_intensities=np.zeros(0))
+    for wrong, part in (
+        (dark, "no light"),
+        (replace(scene, light_intensities=np.full(len(LIGHTS_MM), -1.0)), "intensity"),
+        (replace(scene, light_intensities=np.full(len(LIGHTS_MM), np.nan)), "intensity"),
+        (replace(scene, light_positions_mm=np.full_like(LIGHTS_MM, np.inf)), "position"),
+        (replace(scene, ior=0.7), "ior = 0.7"),
+        (replace(scene, ior=math.nan), "ior = nan"),
+    ):
+        with pytest.raises(InputError) as caught:
+            Engine(wrong)
+        require_sentence(caught.value, part)
+
+
+def test_surfaces_that_bound_nothing_are_refused() -> None:
+    scene = recipe()
+    outer = scene.outer
+    hole = Mesh(outer.vertices_mm, outer.faces[1:])
+    flipped = Mesh(outer.vertices_mm, outer.faces[:, ::-1].copy())
+    in_metres = Mesh(outer.vertices_mm * 1e-3, outer.faces)
+    in_micrometres = Mesh(outer.vertices_mm * 1e3, outer.faces)
+    broken = Mesh(np.where(outer.vertices_mm == outer.vertices_mm[0], np.nan, outer.vertices_mm), outer.faces)
+    for mesh, part in ((hole, "3 edges"), (flipped, "inside out"), (in_metres, "millimetres"), (in_micrometres, "millimetres"), (broken, "non-finite")):
+        with pytest.raises(MeshError) as caught:
+            Engine(replace(scene, outer=mesh))
+        require_sentence(caught.value, "outer surface", part)
+        assert scene.dentin is not None
+        with pytest.raises(MeshError) as caught:
+            Engine(replace(scene, dentin=replace(scene.dentin, base=mesh)))
+        require_sentence(caught.value, "dentin surface", part)
+
+
+@pytest.mark.parametrize(
+    ("version", "parts"),
+    [((-1, -1, -1), ("No libLLVM",)), ((13, 0, 0), ("13.0", "17")), ((15, 0, 7), ("15.0", "17")), ((16, 0, 6), ("16.0", "17"))],
+)
+def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], parts: tuple[str, ...]) -> None:
+    with pytest.raises(PlatformError) as caught:
+        require_llvm(version)
+    require_sentence(caught.value, *parts, "libllvm19")
+    assert caught.value.exit_status == 4
+
+
+def test_libllvm_17_and_later_are_accepted() -> None:
+    for major in (17, 18, 19, 22):
+        require_llvm((major, 1, 0))
+
+
+@pytest.mark.parametrize(("field", "value", "shown"), FORBIDDEN)
+def test_a_layer_out_of_range_is_refused(no_kernel: None, field: str, value: float, shown: str) -> None:
+    layer = Layer(sigma=1, alpha=0.5, thickness_mm=1)
+    with pytest.raises(InputError) as caught:
+        simulate_slab((layer, layer.model_copy(update={field: value})))
+    require_sentence(caught.value, f"layer 2.{field} = {shown} ")
+
+
+def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
+    layer = Layer(sigma=1, alpha=0.5, thickness_mm=1)
+    deep, white = layer.model_copy(update={"thickness_mm": math.inf}), layer.model_copy(update={"alpha": 1.0, "thickness_mm": math.inf})
+    calls: list[tuple[tuple[Layer, ...], dict[str, Any], str]] = [
+        ((), {}, "no layer"),
+        ((layer.model_copy(update={"thickness_mm": 0.0}),), {}, "thickness_mm = 0"),
+        ((layer.model_copy(update={"thickness_mm": -1.0}),), {}, "thickness_mm = -1"),
+        ((deep, layer), {}, "layer 1.thickness_mm = inf"),
+        ((white,), {}, "half space"),
+        ((layer,), {"ior": 0.5}, "ior = 0.5"),
+        ((layer,), {"ior": math.nan}, "ior = nan"),
+        ((layer,), {"boundary": "glass"}, "boundary = glass"),
+        ((layer,), {"source": "laser"}, "source = laser"),
+        ((layer,), {"rel_error": 0.0}, "rel-error = 0"),
+    ]
+    for layers, options, part in calls:
+        with pytest.raises(InputError) as caught:
+            simulate_slab(layers, **options)
+        require_sentence(caught.value, part)
+
+
+def test_a_mesh_alone_knows_its_volume_and_edges() -> None:
+    # What the refusals above rest on: an ellipsoid of 3, 2, 4 mm, less what flat facets cut off.
+    mesh = ellipsoid(np.array([3.0, 2.0, 4.0]))
+    assert mesh.signed_volume_mm3() == pytest.approx(4 / 3 * np.pi * 24, rel=0.02)
+    assert (mesh.edge_counts() == 2).all()
+    assert isinstance(SceneRecipe(mesh, None, LIGHTS_MM, np.ones(5)).outer, Mesh)
