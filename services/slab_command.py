@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from enum import StrEnum
 from typing import Annotated, Any
 
@@ -38,13 +39,18 @@ def simulate_slab_command(
     rel_error: Annotated[float, typer.Option(min=1e-5, max=1, help="Relative standard error to reach.")] = 1e-3,
     gradient: Annotated[bool, typer.Option("--gradient", help="Also the derivatives with their standard errors.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
+    max_seconds: Annotated[float, typer.Option(min=0, help="Give the result as it stands after this time, marked as not complete.")] = 600.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Reflectance and transmittance of a slab by the walk that the fit uses."""
     from services.fit.slab.simulate import simulate_slab
 
     stack = _read_layers(layers, {"alpha": alpha, "sigma": sigma, "width": width}, g)
-    result = simulate_slab(stack, ior=ior, boundary=boundary.value, source=source.value, rel_error=rel_error, gradient=gradient, seed=seed)
+    result = simulate_slab(
+        stack, ior=ior, boundary=boundary.value, source=source.value, rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds
+    )
+    if not result.complete:
+        print("The time ran out before every standard error was reached; the ones printed are true, give --max-seconds for smaller ones.", file=sys.stderr)
     figures = result.as_json()
     print(json.dumps(figures) if as_json else _table(figures))
 

@@ -7,6 +7,7 @@ counted instead of connected to lamps.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -54,6 +55,7 @@ class SlabResult(Record):
     dR_se: dict[str, float] = Field(default_factory=dict)
     dT_se: dict[str, float] = Field(default_factory=dict)
     paths: int = Field(description="number of walks")
+    complete: bool = Field(description="whether every standard error asked for was reached before the time ran out")
 
     def as_json(self) -> dict[str, Any]:
         """Plain values for printing."""
@@ -107,12 +109,14 @@ def simulate_slab(
     rel_error: float = 1e-3,
     gradient: bool = False,
     seed: int = 1,
+    max_seconds: float = 600.0,
 ) -> SlabResult:
     """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as sure as asked.
 
     Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1, beta1,
     g1a, g1b, sigma2, ..., c`` for layers, c the depth of the first inner border at fixed total depth. A derivative's standard
-    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger.
+    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger. After
+    ``max_seconds`` the result is given as it stands, with ``complete`` false and its true standard errors.
 
     Raises:
         InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not finite.
@@ -129,12 +133,13 @@ def simulate_slab(
 
     if not 0 < rel_error < 1:
         raise InputError(f"rel-error = {rel_error:g} must lie between 0 and 1; 1e-3 is usual.")
-    names, sums = accumulate(layers, shortfall, ior=ior, boundary=boundary, source=source, gradient=gradient, seed=seed)
+    names, sums = accumulate(layers, shortfall, ior=ior, boundary=boundary, source=source, gradient=gradient, seed=seed, max_seconds=max_seconds)
     mean, error = sums.mean(), sums.standard_error()
     columns = [dict(zip(names, column[1:].tolist(), strict=True)) for column in (*mean.T, *error.T)]
     return SlabResult(
-        R=mean[0, 0], T=mean[0, 1], R_se=error[0, 0], T_se=error[0, 1], dR=columns[0], dT=columns[1], dR_se=columns[2], dT_se=columns[3], paths=sums.samples
-    )
+        R=mean[0, 0], T=mean[0, 1], R_se=error[0, 0], T_se=error[0, 1], dR=columns[0], dT=columns[1], dR_se=columns[2], dT_se=columns[3],
+        paths=sums.samples, complete=shortfall(sums) <= 1,
+    )  # fmt: skip
 
 
 def accumulate(
@@ -146,8 +151,14 @@ def accumulate(
     source: str = "normal",
     gradient: bool = False,
     seed: int = 1,
+    max_seconds: float = math.inf,
+    border_terms_only: bool = False,
 ) -> tuple[tuple[str, ...], Sums]:
     """Trace until ``shortfall``, the largest ratio of a standard error to what is asked of it, is at most 1.
+
+    The derivative to the border's depth c comes from the border terms, or from the extinction scores of both layers, to which
+    it is equal in a slab because R and T depend on sigma_i d_i alone: dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2.
+    The first pass tells which is less noisy; ``border_terms_only`` keeps the first.
 
     Returns:
         Names of the derivatives, and the sums: rows are the totals and then each derivative, columns R and T.
@@ -165,13 +176,27 @@ def accumulate(
     media = Media([_medium(layer) for layer in layers])
     plan = Plan(scores=tuple(Score(*score) for score in scores), shape=border, faces=True, bend=boundary == "smooth")
     sums = Sums(1 + len(scores) + border, _specular(ior, source))
+    spread = np.array([_spread_of_border(layers, score) for score in scores])
+    from_scores: bool | None = False if border_terms_only or not border else None
+    begun_s = time.monotonic()
     samples, missing = FIRST_SAMPLES, math.inf
-    while missing > 1 and sums.samples < MOST_PATHS:
+    while missing > 1 and sums.samples < MOST_PATHS and time.monotonic() < begun_s + max_seconds:
         start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend)
         totals, derivatives = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
-        sums.add(np.stack([totals, *derivatives], axis=1), samples)
+        table = np.stack([totals, *derivatives], axis=1)
+        if from_scores is not False:
+            equivalent = np.tensordot(table[:, 1:-1], spread, axes=(1, 0))
+            if from_scores is None:
+                from_scores = bool(equivalent.var(axis=0).max() < table[:, -1].var(axis=0).max())
+            if from_scores:
+                table[:, -1] = equivalent
+        sums.add(table, samples)
         missing = shortfall(sums)
-        samples = int(np.clip(sums.samples * (missing**2 * 1.05 - 1) / LANES, FIRST_SAMPLES, min(4 * samples, MOST_SAMPLES)))
+        # As many paths as the error asks for, but no pass far beyond the time that is left.
+        elapsed_s = time.monotonic() - begun_s
+        affordable = sums.samples / LANES * (max_seconds - elapsed_s) / elapsed_s
+        wanted = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MOST_SAMPLES)
+        samples = max(FIRST_SAMPLES, int(wanted))
     return (*names, "c") if border else names, sums
 
 
@@ -210,6 +235,13 @@ def _derivatives(layers: tuple[Layer, ...]) -> tuple[tuple[str, ...], tuple[tupl
         printed = {"g1": f"g{number}a", "g2": f"g{number}b"}
         pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in fields]
     return tuple(name for name, _ in pairs), tuple(score for _, score in pairs)
+
+
+def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> float:
+    """Coefficient of one score when the border's motion is spread evenly over the two layers it separates."""
+    number, name = score
+    layer = layers[number - 1]
+    return (1 if number == 1 else -1) * layer.sigma / layer.thickness_mm if name == "sigma" else 0.0
 
 
 def _specular(ior: float, source: str) -> float:
