@@ -47,6 +47,17 @@ class ErrorSums:
         return float(np.sqrt(max(self.product - self.reference_variance, 0.0) / signal)) if signal > 0 else None
 
     @property
+    def loss(self) -> float | None:
+        """Relative squared error, the reference's noise included, and not below its own standard error: what the samples resolve."""
+        signal = self.reference_squared
+        return float(max(self.product, np.sqrt(self.product_noise)) / signal) if signal > 0 else None
+
+    @property
+    def resolved_error(self) -> float | None:
+        """``error``, and not below what the samples resolve."""
+        return None if self.error is None or self.error_se is None else max(self.error, self.error_se)
+
+    @property
     def error_se(self) -> float | None:
         """One standard error of ``error`` by Monte Carlo noise; at error 0 the error whose square is one standard error of the square."""
         error, signal = self.error, self.reference_squared - self.reference_variance

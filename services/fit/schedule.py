@@ -66,7 +66,7 @@ class StepReport:
     step: int
     stage_step: int
     loss: float
-    """Relative squared error on fitted images, sensor noise included; dimensionless."""
+    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below what the step's samples resolve."""
     fit_error: float | None
     held_out_error: float | None
     parameters: dict[str, float]
@@ -236,9 +236,12 @@ class ChannelSchedule:
             for leaf in ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         }
         values |= {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
-        loss = fitted.product / fitted.reference_squared
+        loss = fitted.loss or 0.0
         self.report(
-            StepReport(self.files.channel, stage, self.steps, state.step, loss, fitted.error, held_out.error, values, state.samples, state.verdict), evaluation
+            StepReport(
+                self.files.channel, stage, self.steps, state.step, loss, fitted.resolved_error, held_out.resolved_error, values, state.samples, state.verdict
+            ),
+            evaluation,
         )
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:

@@ -41,3 +41,11 @@ def test_no_signal_has_no_error() -> None:
     assert ErrorSums().error is None
     assert ErrorSums(1.0, 1.0, 2.0).error is None
     assert ErrorSums(-1.0, 1.0, 0.0).error == 0.0
+
+
+def test_errors_of_a_step_stop_at_what_its_samples_resolve() -> None:
+    noisy = ErrorSums(-0.01, 1.0, 0.0, 0.02**2)
+    assert noisy.loss == pytest.approx(0.02)
+    assert noisy.resolved_error == pytest.approx(np.sqrt(0.02))
+    clear = ErrorSums(0.25, 1.0, 0.0, 0.02**2)
+    assert clear.resolved_error == clear.error == 0.5
