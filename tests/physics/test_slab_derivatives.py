@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.transport.platform import prepare_device
+from tests.support.one_sided_border import leave_out_scattering
 from tests.support.slab_tables import SlabCase, derivative_cases, named, passes, simulate, zero_cases
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
 
@@ -62,19 +62,10 @@ def is_zero(value: float, error: float) -> bool:
 
 @pytest.mark.parametrize("case", ["Z1", "Z2", "Z3", "Z4", "Z5", "Z6", "Z7"])
 def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    prepare_device()
-    from services.fit.transport import walk
-
-    class WithoutScattering(walk.Walk):
-        """Teeth 2018 Eq. 32 alone: transmittance changes as the border moves, scattering does not."""
-
-        def _start_secondary(self, walker, ended, tally):  # noqa: ARG002
-            return ended
-
     (slab,) = named(zero_cases(), case)
     seed = 600 + int(case[1])
     sums = simulate(slab, passes(2), seed)
-    monkeypatch.setattr(walk, "Walk", WithoutScattering)
+    leave_out_scattering(monkeypatch)
     one_sided = simulate(slab, passes(1), seed)
 
     # Rows: total reflectance first, dR/dc last.

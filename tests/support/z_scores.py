@@ -17,10 +17,10 @@ LARGEST_Z = 4.5
 RMS_FALSE_ALARM = 1e-3
 
 
-def rms_bounds(independent: int) -> tuple[float, float]:
-    """Bounds on the rms of z-scores of which ``independent`` are independent; fewer count as the wider case."""
+def rms_bounds(independent: int, rule: tuple[float, float] = (0.8, 1.25)) -> tuple[float, float]:
+    """The rule's bounds on the rms of z-scores, widened where ``independent`` is too small for them; fewer count as the wider case."""
     tails = stats.chi2.ppf([RMS_FALSE_ALARM / 2, 1 - RMS_FALSE_ALARM / 2], independent) / independent
-    return min(0.8, math.sqrt(tails[0])), max(1.25, math.sqrt(tails[1]))
+    return min(rule[0], math.sqrt(tails[0])), max(rule[1], math.sqrt(tails[1]))
 
 
 def z_scores(values: ArrayLike, truth: ArrayLike, standard_errors: ArrayLike) -> NDArray[np.float64]:
@@ -40,7 +40,7 @@ def require_unbiased(scores: ArrayLike, independent: int) -> None:
     assert low <= np.sqrt(np.mean(scores**2)) <= high
 
 
-def student_to_normal(t: ArrayLike, freedom: int) -> NDArray[np.float64]:
+def student_to_normal(t: ArrayLike, freedom: ArrayLike) -> NDArray[np.float64]:
     """Student's t mapped onto a standard normal of equal tail probability, through the smaller tail."""
     t = np.asarray(t, dtype=np.float64)
     return np.copysign(stats.norm.isf(stats.t.sf(np.abs(t), freedom)), t)

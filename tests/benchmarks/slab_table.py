@@ -1,0 +1,63 @@
+"""Every value of the slab tables with its error, z-score and cost, as JSON rows.
+
+python -m tests.benchmarks.slab_table derivatives --passes 3 --out slab_derivatives.json
+python -m tests.benchmarks.slab_table totals --passes 4 --out slab_totals.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tests.support.slab_tables import SlabCase, derivative_cases, passes, simulate, total_cases
+
+TOTAL_TOLERANCE = 1e-3
+
+
+def measure(case: SlabCase, count: int, seed: int) -> Iterator[dict[str, object]]:
+    """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the rule."""
+    began = time.perf_counter()
+    sums = simulate(case, passes(count), seed)
+    seconds = time.perf_counter() - began
+    mean, error = sums.mean(), sums.standard_error()
+    tolerance = np.vstack([np.full((1, 2), TOTAL_TOLERANCE), case.derivative_tolerance()] if case.names else [np.full((1, 2), TOTAL_TOLERANCE)])
+    for row, name in enumerate(("total", *case.names)):
+        for column, side in enumerate("RT"):
+            value, truth, spread = mean[row, column], case.values[row, column], error[row, column]
+            yield {
+                "case": case.name,
+                "boundary": case.boundary,
+                "value_of": f"{side} {name}",
+                "value": value,
+                "reference": truth,
+                "se": spread,
+                "z": (value - truth) / spread if spread > 0 else 0.0,
+                "reached": 3 * spread / tolerance[row, column],
+                "paths": sums.samples,
+                "seconds": round(seconds, 2),
+            }
+
+
+def main() -> None:
+    """Write one table and print its summary."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=("derivatives", "totals"))
+    parser.add_argument("--passes", type=int, default=2, help="of 262144 paths, each next one up to four times as long")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    cases = derivative_cases() if arguments.table == "derivatives" else total_cases()
+    rows = [row for number, case in enumerate(cases) for row in measure(case, arguments.passes, arguments.seed + number)]
+    arguments.out.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
+    z = np.array([row["z"] for row in rows], dtype=np.float64)
+    fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)
+    print(f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a third of their tolerance")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Every derivative against central differences with common random numbers, on a small tooth.
+
+Each is compared on the scalar that shows it best: the image projected on the derivative's own picture, taken from another
+seed. Two steps tell the differences' bias apart: it grows as the square of the step, so (4 fd(h/2) - fd(h)) / 3 is free of
+it to fourth order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from services.core.records import Boundary
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from tests.support.one_sided_border import leave_out_scattering
+from tests.support.small_tooth import camera_at, recipe, whole_view
+
+SEEDS = 8
+LARGEST_ERROR = 0.05
+"""Standard error of score and of extrapolated difference, as a fraction of the derivative."""
+FAMILY_FALSE_ALARM = 1e-3
+"""Chance that any t-test of a group fails a correct engine (Bonferroni)."""
+STEPS = {"sigma": 0.3, "alpha": 0.04, "beta": 0.2, "g1": 0.12, "g2": 0.2, "shape": 0.3}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Derivatives tested at one tissue, and the paths per pixel, seed and image that 5 % takes."""
+
+    tissue: Tissue
+    samples: dict[str, int]
+    score_samples: int
+
+
+MEDIA = Group(
+    Tissue(Medium(1, 0.95, 0.6, 0.6, -0.3), Medium(2, 0.8, 0.5, 0.6, -0.3), (0.5, 0.4)),
+    {f"{part}.{field}": 1536 if part == "enamel" else 3072 for part in ("enamel", "dentin") for field in ("sigma", "g1", "g2")}
+    | {f"{part}.{field}": 1024 for part in ("enamel", "dentin") for field in ("alpha", "beta")}
+    | {"shape.0": 1024},
+    2048,
+)
+SHAPE = Group(Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4)), {"shape.0": 1024, "shape.1": 2048}, 4096)
+"""Dentin clearer than enamel: of both modes, Eq. 32 alone is 2.5 times the derivative, and noise stays small."""
+
+
+def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """By name, over seeds: scores and extrapolated central differences, both relative to the mean score."""
+    engine, view, names = Engine(recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1), tuple(group.samples)
+    pictures = engine.jacobian(group.tissue, view, names, samples=4 * group.score_samples, seed=10_000).jacobian
+    slopes = [engine.jacobian(group.tissue, view, names, samples=group.score_samples, seed=11_000 + seed).jacobian for seed in range(SEEDS)]
+    compared = {}
+    for name, picture, slope in zip(names, pictures, np.stack(slopes, axis=1), strict=True):
+        scores = np.einsum("sln,ln->s", slope, picture)
+        middle, step = group.tissue.value(name), STEPS.get(name.split(".")[1], STEPS["shape"])
+
+        def value(parameter: float, seed: int, name: str = name, picture: NDArray[np.float64] = picture) -> float:
+            tissue = group.tissue.with_values({name: parameter})
+            return float((engine.images(tissue, view, samples=group.samples[name], seed=12_000 + seed).mean * picture).sum())
+
+        differences = [[(value(middle + h, seed) - value(middle - h, seed)) / (2 * h) for seed in range(SEEDS)] for h in (step, step / 2)]
+        extrapolated = (4 * np.array(differences[1]) - np.array(differences[0])) / 3
+        compared[name] = scores / scores.mean(), extrapolated / scores.mean()
+    return compared
+
+
+def standard_error(values: NDArray[np.float64]) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+@pytest.mark.parametrize(
+    ("group", "boundary"),
+    [
+        pytest.param(MEDIA, "matched", id="media-matched"),
+        pytest.param(SHAPE, "matched", id="shape-matched"),
+        pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
+        pytest.param(SHAPE, "thin", id="shape-thin"),
+    ],
+)
+def test_scores_are_the_images_derivatives(group: Group, boundary: Boundary) -> None:
+    compared = compare(group, boundary)
+    limit = stats.t.isf(FAMILY_FALSE_ALARM / (2 * len(compared)), SEEDS - 1)
+    for name, (scores, differences) in compared.items():
+        assert standard_error(scores) <= LARGEST_ERROR, name
+        assert standard_error(differences) <= LARGEST_ERROR, name
+        # Seeds are unrelated, so their pairing is arbitrary: a paired t-test with seven degrees of freedom.
+        gap = scores - differences
+        assert abs(gap.mean()) <= limit * standard_error(gap), name
+
+
+def test_equation_32_alone_is_no_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_scattering(monkeypatch)
+    fewer = replace(SHAPE, samples=dict.fromkeys(SHAPE.samples, 512), score_samples=1024)
+    for name, (scores, differences) in compare(fewer, "matched").items():
+        assert standard_error(scores) <= LARGEST_ERROR, name
+        assert abs((scores - differences).mean()) > 10 * standard_error(scores - differences), name

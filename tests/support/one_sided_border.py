@@ -1,0 +1,21 @@
+"""The walk as teeth 2018 has it: the moving border changes transmittance (Eq. 32) but not scattering."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from services.fit.transport.platform import prepare_device
+
+
+def leave_out_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the scattering partner out of every border derivative for the rest of the test."""
+    prepare_device()
+    from services.fit.transport import walk
+
+    class WithoutScattering(walk.Walk):
+        def _start_secondary(self, walker: Any, ended: Any, tally: Any) -> Any:  # noqa: ARG002
+            return ended
+
+    monkeypatch.setattr(walk, "Walk", WithoutScattering)
