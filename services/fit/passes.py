@@ -202,7 +202,7 @@ class StackProblem:
         label = f"{self._prefix}-{step}-trial-{trial}"
         old, new = self._image_media(x_old), self._image_media(x_new)
         seeds = self._seed(step, "compare-1", trial), self._seed(step, "compare-2", trial)
-        parts = self.passes.run(label, old, max(samples // 2, 16), compare_task, new, seeds)
+        parts = self.passes.run(label, old, max(samples // 2, 1), compare_task, new, seeds)
         self.passes.record([row for _, row in parts])
         total: LossChange = parts[0][0]
         for change, _ in parts[1:]:

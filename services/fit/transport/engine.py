@@ -53,7 +53,7 @@ class Engine:
         """Radiance of ``view``'s pixels under each light.
 
         Args:
-            samples: paths per pixel, rounded up to a multiple of ``batches``.
+            samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many batches.
             seed: with pixel and sample number it fixes every random number.
             batches: independent batches whose spread gives the variance.
 
@@ -125,6 +125,7 @@ class Engine:
         self._geometry.reshape(tissue.shape)
 
         kernel_media = Media(media)
+        batches = min(batches, samples)
         per_batch = -(-samples // batches)
         slots = len(self.recipe.light_positions_mm) * max(len(plan.order_edges) - 1, 1)
         tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)
