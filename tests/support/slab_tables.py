@@ -37,10 +37,17 @@ class SlabCase:
         return 0.01 * np.maximum(size, 1e-3 * size.max())
 
 
-def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int) -> Sums:
-    """Trace until ``shortfall`` is at most 1; with derivatives where the case has any."""
-    gradient = bool(case.names)
-    names, sums = accumulate(case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=gradient, seed=seed)
+def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int, *, border_terms_only: bool = False) -> Sums:
+    """Trace until ``shortfall`` is at most 1; with derivatives where the case has any.
+
+    Args:
+        border_terms_only: take the derivative to the border's depth from the two border terms, as a tooth does, not from
+            the extinction scores to which it is equal in a slab.
+    """
+    names, sums = accumulate(
+        case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=bool(case.names), seed=seed,
+        border_terms_only=border_terms_only,
+    )  # fmt: skip
     assert names[-len(case.names) :] == case.names
     return sums
 
