@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from services.core.geometry import Tooth
+from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
@@ -47,7 +47,7 @@ class FitDriver:
         spec, folder = self.spec, self.context.root / CHECKPOINT
         folder.mkdir(parents=True, exist_ok=True)
         observations = read_observations(self.context.root, spec)
-        dentin = dentin_shape(observations.tooth, spec)
+        dentin = dentin_shape(observations.tooth, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
         files = {channel: write_channel(folder / "inputs", observations, channel, views[channel], dentin, spec) for channel in channels}
@@ -81,7 +81,7 @@ class FitDriver:
         def tell(step: StepReport, evaluation: Evaluation) -> None:
             expected = self.spec.max_steps + 10
             done = (place[0] + min(step.step / expected, 0.99)) / place[1]
-            data = asdict(step) | {"held_out_error": step.held_out_error}
+            data = asdict(step)
             message = f"{step.channel} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
             self.context.report(StageEvent(stage="fit", kind="step", message=message, done=done, data=data))
             key = f"{files.channel}/history/{step.step}"
@@ -130,15 +130,20 @@ class FitDriver:
         return estimates(fit.tissue, parts, known, fitted_shape)
 
 
-def dentin_shape(tooth: Tooth, spec: JobSpec) -> DentinShape | None:
-    """The dentin surface the job asks for: the given one, a blend shape made from the enamel, or none."""
+def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
+    """The dentin surface the job asks for: the given one, a blend shape made from the enamel, or none.
+
+    The blend modes' axes follow from the mesh and from where the cameras stand.
+    """
     if spec.dentin == "known":
         assert tooth.dentin is not None
         return DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
     if spec.dentin == "fit":
         from services.fit.anatomy.blend import dentin_blend_shape
+        from services.fit.anatomy.frame import estimate_frame
 
-        return dentin_blend_shape(tooth.outer)
+        centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
+        return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm))
     return None
 
 

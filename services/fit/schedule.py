@@ -51,6 +51,8 @@ START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
+SEARCH_SAMPLES = 64
+"""Least paths per pixel of the search, which looks at a few hundred pixels only."""
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
@@ -69,6 +71,8 @@ class StepReport:
     """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below what the step's samples resolve."""
     fit_error: float | None
     held_out_error: float | None
+    held_out_se: float | None
+    """Monte Carlo standard error of ``held_out_error``."""
     parameters: dict[str, float]
     samples: int
     verdict: str
@@ -150,7 +154,7 @@ class ChannelSchedule:
                 medium = Medium(node.sigma, 1.0, g1=node.g)
                 tissue = Tissue(medium, medium, (START_SHAPE,) * self.modes if self.modes else self.shape)
                 label = f"{self.files.channel}-search-{n}"
-                for task in passes.tasks(label, tissue, self.spec.samples_per_pixel):
+                for task in passes.tasks(label, tissue, max(self.spec.samples_per_pixel, SEARCH_SAMPLES)):
                     for k in (1, 2):
                         seed = passes.seeds("search", n, k)
                         pending.append(passes.executor.submit(f"{label}-{task.index}-{k}", orders_task, task, edges, seed))
@@ -216,7 +220,7 @@ class ChannelSchedule:
             self.pause()
             stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
             equations = NormalEquations.of(stored)
-        evaluation = self._evaluate("final", problem.base, samples)
+        evaluation = self._evaluate("final", problem.base, self.spec.max_samples_per_pixel)
         fitted, held_out = evaluation.fitted.error or 0.0, evaluation.held_out.error
         return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
 
@@ -239,7 +243,17 @@ class ChannelSchedule:
         loss = fitted.loss or 0.0
         self.report(
             StepReport(
-                self.files.channel, stage, self.steps, state.step, loss, fitted.resolved_error, held_out.resolved_error, values, state.samples, state.verdict
+                self.files.channel,
+                stage,
+                self.steps,
+                state.step,
+                loss,
+                fitted.resolved_error,
+                held_out.resolved_error,
+                held_out.error_se,
+                values,
+                state.samples,
+                state.verdict,
             ),
             evaluation,
         )

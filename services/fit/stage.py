@@ -12,7 +12,7 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 
 if TYPE_CHECKING:
-    from services.core.geometry import Tooth
+    from services.core.geometry import Camera, Tooth
 
 ENGINE = "services.fit.transport.engine:Engine"
 CHECKPOINT = "fit-checkpoint"
@@ -67,7 +67,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
     writer = StageWriter(context.root, "asset", context.attempt)
     channels = tuple(report.parameters)
-    tooth = fitted_tooth(prepared_folder, prepared.fdi[0], spec, report)
+    tooth = fitted_tooth(prepared_folder, prepared.fdi[0], prepared.cameras, spec, report)
     index = [prepared.channels.index(channel) for channel in channels]
     lights = tuple(
         light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
@@ -91,14 +91,14 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     return manifest
 
 
-def fitted_tooth(prepared_folder: Path, fdi: int, spec: JobSpec, report: FitReport) -> Tooth:
+def fitted_tooth(prepared_folder: Path, fdi: int, cameras: tuple[Camera, ...], spec: JobSpec, report: FitReport) -> Tooth:
     """The tooth with the dentin surface the fit ended with."""
     from services.core.geometry import Mesh, Tooth
     from services.core.meshfiles import read_teeth
     from services.fit.driver import dentin_shape
 
     (tooth,) = read_teeth(prepared_folder, (fdi,))
-    dentin = dentin_shape(tooth, spec)
+    dentin = dentin_shape(tooth, cameras, spec)
     if dentin is None:
         return Tooth(fdi, tooth.outer)
     return Tooth(fdi, tooth.outer, Mesh(dentin.vertices_mm(report.shape), dentin.base.faces))
