@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo test test-quick lint bench dashboard setup
+.PHONY: demo test test-all lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -7,12 +7,13 @@ demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and repor
 	@test -e demo/mouth/capture.json || $(BIN)/dentine phantom --out demo/mouth --pixel-mm 0.5 --cameras 3 --lights 8 --samples 2048
 	@$(BIN)/dentine run deploy/examples/demo.toml --out demo
 
-test: ## everything; what the machine cannot run is skipped with its reason
+test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
+	@deploy/setup.sh dashboard browser
+	@$(BIN)/python -m pytest -m "not slow"
+
+test-all: ## the slow ones too: fits of the real incisor, long slab tables
 	@deploy/setup.sh dashboard browser
 	@$(BIN)/python -m pytest
-
-test-quick: setup ## without the tests that take minutes
-	@$(BIN)/python -m pytest -m "not slow and not browser"
 
 lint: setup
 	@$(BIN)/ruff check .
