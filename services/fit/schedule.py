@@ -121,7 +121,7 @@ class ChannelSchedule:
         if self.has_dentin:
             short = replace(options, max_steps=min(HOMOGENEOUS_STEPS, spec.max_steps), max_samples=2 * samples)
             tissue, _ = self._solve("homogeneous", shared_domain(), tissue, short, samples, SIMILAR_G)
-            tissue = self._best_start(tissue, replace(options, max_steps=START_STEPS, max_samples=2 * samples))
+            tissue = self._best_start(tissue, replace(options, max_steps=min(START_STEPS, spec.max_steps), max_samples=2 * samples))
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
         if self.modes:
