@@ -3,7 +3,8 @@
     err^2 = [sum (C1 - ref)(C2 - ref) - sum var_ref] / [sum ref^2 - sum var_ref]
 
 over valid pixels, linear radiance, C1 and C2 two independent renders. Monte Carlo noise cancels in the product, sensor noise in the subtraction, so a
-perfect model scores 0 on average whatever the noise; a negative square is noise and counts as 0.
+perfect model scores 0 on average whatever the noise; a negative square is noise and counts as 0. What is reported is
+never below its own Monte Carlo error, so that few samples cannot look like a perfect fit.
 """
 
 from __future__ import annotations

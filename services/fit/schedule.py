@@ -221,7 +221,7 @@ class ChannelSchedule:
             stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
             equations = NormalEquations.of(stored)
         evaluation = self._evaluate("final", problem.base, self.spec.max_samples_per_pixel)
-        fitted, held_out = evaluation.fitted.error or 0.0, evaluation.held_out.error
+        fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
         return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
 
     def _evaluate(self, label: str, tissue: Tissue, samples: int) -> Evaluation:
