@@ -200,7 +200,9 @@ def _local_cluster(workers: int) -> Iterator[Client]:
 
     with (
         dask.config.set(_WORKER_CONFIG),
-        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, resources={"DOME": 1}, silence_logs=50) as cluster,
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
+        ) as cluster,
         Client(cluster) as client,
     ):
         yield client

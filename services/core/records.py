@@ -158,7 +158,7 @@ class FitReport(Record):
     """Published by the fit stage, and as parameters.json and errors.json by export."""
 
     converged: bool
-    advice: str = Field(description="what to do when it did not converge; empty otherwise")
+    advice: str = Field(description="what to do when it did not converge, or for a better answer; may be empty")
     parameters: dict[str, dict[str, Estimate]] = Field(description="per channel: name -> estimate, derived quantities included")
     fit_error: dict[str, float] = Field(description="per channel: relative image error on fitted images")
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
