@@ -93,6 +93,7 @@ def test_lights_that_give_no_light_are_refused() -> None:
         (replace(scene, light_intensities=np.full(len(LIGHTS_MM), -1.0)), "intensity"),
         (replace(scene, light_intensities=np.full(len(LIGHTS_MM), np.nan)), "intensity"),
         (replace(scene, light_positions_mm=np.full_like(LIGHTS_MM, np.inf)), "position"),
+        (replace(scene, light_positions_mm=np.zeros_like(LIGHTS_MM)), "outside"),
         (replace(scene, ior=0.7), "ior = 0.7"),
         (replace(scene, ior=math.nan), "ior = nan"),
     ):

@@ -23,10 +23,10 @@ SceneDict = dict[str, Any]
 
 def medium_dict(medium: Medium) -> SceneDict:
     """A homogeneous medium; two lobes become a blended phase function."""
-    first: SceneDict = {"type": "hg", "g": medium.g1}
-    second: SceneDict = {"type": "hg", "g": medium.g2}
-    phase = first if medium.beta >= 1 else {"type": "blendphase", "weight": 1 - medium.beta, "first": first, "second": second}
-    return {"type": "homogeneous", "sigma_t": medium.sigma, "albedo": medium.alpha, "phase": phase}
+    first: SceneDict = {"type": "hg", "g": float(medium.g1)}
+    second: SceneDict = {"type": "hg", "g": float(medium.g2)}
+    phase = first if medium.beta >= 1 else {"type": "blendphase", "weight": float(1 - medium.beta), "first": first, "second": second}
+    return {"type": "homogeneous", "sigma_t": float(medium.sigma), "albedo": float(medium.alpha), "phase": phase}
 
 
 def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:

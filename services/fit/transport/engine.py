@@ -37,6 +37,11 @@ class Engine:
             raise InputError("The scene has no light; list at least one with a position and an intensity.")
         if not np.isfinite(recipe.light_positions_mm).all() or not (np.isfinite(recipe.light_intensities) & (recipe.light_intensities > 0)).all():
             raise InputError("Every light needs a finite position_mm and a positive intensity; correct the rig's calibration.")
+        reach_mm = float(np.linalg.norm(recipe.outer.vertices_mm, axis=1).max())
+        if (np.linalg.norm(recipe.light_positions_mm, axis=1) <= reach_mm).any():
+            raise InputError(
+                f"A light is within {reach_mm:.0f} mm of the origin, where the tooth is; lights must be outside it, with position_mm in millimetres."
+            )
         if not math.isfinite(recipe.ior) or recipe.ior < 1:
             raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
         prepare_device(threads)
@@ -46,7 +51,7 @@ class Engine:
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities)
-        self._radius_mm = float(np.linalg.norm(recipe.outer.vertices_mm, axis=1).max())
+        self._radius_mm = reach_mm
         self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
