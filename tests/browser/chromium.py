@@ -16,7 +16,7 @@ ARGUMENTS = (
 )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     """Skips where no Chromium is installed."""
     path = shutil.which("chromium") or shutil.which("google-chrome")
