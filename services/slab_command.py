@@ -47,8 +47,9 @@ def simulate_slab_command(
 
     stack = _read_layers(layers, {"alpha": alpha, "sigma": sigma, "width": width}, g)
     result = simulate_slab(
-        stack, ior=ior, boundary=boundary.value, source=source.value, rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds
-    )
+        stack, ior=ior, boundary=boundary.value, source=source.value, rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds,
+        numbered=layers is not None,
+    )  # fmt: skip
     if not result.complete:
         print("The time ran out before every standard error was reached; the ones printed are true, give --max-seconds for smaller ones.", file=sys.stderr)
     figures = result.as_json()

@@ -110,11 +110,12 @@ def simulate_slab(
     gradient: bool = False,
     seed: int = 1,
     max_seconds: float = 600.0,
+    numbered: bool = False,
 ) -> SlabResult:
     """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as sure as asked.
 
     Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1, beta1,
-    g1a, g1b, sigma2, ..., c`` for layers, c the depth of the first inner border at fixed total depth. A derivative's standard
+    g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner border at fixed total depth. A derivative's standard
     error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger. After
     ``max_seconds`` the result is given as it stands, with ``complete`` false and its true standard errors.
 
@@ -135,6 +136,8 @@ def simulate_slab(
         raise InputError(f"rel-error = {rel_error:g} must lie between 0 and 1; 1e-3 is usual.")
     names, sums = accumulate(layers, shortfall, ior=ior, boundary=boundary, source=source, gradient=gradient, seed=seed, max_seconds=max_seconds)
     mean, error = sums.mean(), sums.standard_error()
+    if numbered:
+        names = tuple({"sigma": "sigma1", "alpha": "alpha1", "g": "g1a"}.get(name, name) for name in names)
     columns = [dict(zip(names, column[1:].tolist(), strict=True)) for column in (*mean.T, *error.T)]
     return SlabResult(
         R=mean[0, 0], T=mean[0, 1], R_se=error[0, 0], T_se=error[0, 1], dR=columns[0], dT=columns[1], dR_se=columns[2], dT_se=columns[3],
