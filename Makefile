@@ -4,7 +4,7 @@
 BIN := .venv/bin
 
 demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and report, below demo/
-	@test -e demo/mouth/capture.json || $(BIN)/dentine phantom --out demo/mouth --pixel-mm 0.5 --cameras 3 --lights 8 --samples 2048
+	@test -e demo/mouth/capture.json || $(BIN)/dentine phantom --out demo/mouth --pixel-mm 0.5 --cameras 3 --lights 8 --samples 8192
 	@$(BIN)/dentine run deploy/examples/demo.toml --out demo
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
