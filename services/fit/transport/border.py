@@ -50,7 +50,6 @@ class Crossing:
 
 def no_crossing(modes: int) -> Crossing:
     """An empty reservoir."""
-    zero = mi.Float(0)
     return Crossing(
         mi.Point3f(0),
         mi.Vector3f(0, 0, 1),
@@ -60,7 +59,7 @@ def no_crossing(modes: int) -> Crossing:
         mi.Float(0),
         [mi.Float(0) for _ in range(modes)],
         mi.Float(0),
-        zero,
+        mi.Float(0),
     )
 
 
