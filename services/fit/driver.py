@@ -68,6 +68,7 @@ class FitDriver:
         prefix = hashlib.sha256(f"{journal.path}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[:12]
         with executor(self.engine, prefix) as run_on:
             for number, channel in enumerate(order):
+                self.context.report(StageEvent(stage="fit", kind="log", message=f"{channel}: renderers start, then the table is searched."))
                 schedule = self._schedule(observations, files[channel], views[channel], journal, run_on, (number, len(order)))
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 fits[channel] = schedule.run()
