@@ -28,8 +28,8 @@ from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
 from services.fit.transport.recipe import DentinShape
 
 CHECKPOINT = "fit-checkpoint"
-UNEXPLAINED = 0.25
-"""Relative error on the fitted images above which a fit is not called converged, however its solver ended."""
+UNEXPLAINED = 0.15
+"""Relative error on the fitted or on the held-out images above which a fit is not called converged, however its solver ended."""
 PREVIEW_EVERY = 3
 """A preview after the first step and after every so many."""
 
@@ -116,11 +116,9 @@ class FitDriver:
         known = {c: uncertainty(fit.domain, fit.solution.x, fit.equations) for c, fit in fits.items()}
         tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
-        unexplained = [c for c, fit in fits.items() if fit.fit_error > UNEXPLAINED]
-        advice += [
-            f"{c}: the fitted images are still {100 * fits[c].fit_error:.0f} % off; check mesh, lights and boundary model, or raise the samples."
-            for c in unexplained
-        ]
+        off = {c: max(fit.fit_error, fit.held_out_error or 0.0) for c, fit in fits.items()}
+        unexplained = [c for c, error in off.items() if error > UNEXPLAINED]
+        advice += [f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples." for c in unexplained]
         return FitReport(
             converged=not unexplained and all(fit.solution.result.converged for fit in fits.values()),
             advice=" ".join(advice),
