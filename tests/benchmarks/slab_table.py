@@ -1,6 +1,7 @@
 """Every value of the slab tables with its error, z-score and cost, as JSON rows.
 
 python -m tests.benchmarks.slab_table derivatives --passes 3 --out slab_derivatives.json
+python -m tests.benchmarks.slab_table derivatives --cases S01,S02 --seconds 600 --out slab_derivatives.json
 python -m tests.benchmarks.slab_table totals --passes 4 --out slab_totals.json
 """
 
@@ -9,23 +10,36 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tests.support.slab_tables import SlabCase, derivative_cases, passes, simulate, total_cases
+from services.fit.slab.simulate import Sums
+from tests.support.slab_tables import SlabCase, derivative_cases, named, passes, simulate, total_cases
 
 TOTAL_TOLERANCE = 1e-3
 
 
-def measure(case: SlabCase, count: int, seed: int) -> Iterator[dict[str, object]]:
+def tolerances(case: SlabCase) -> NDArray[np.float64]:
+    """Of each value (rows, 2)."""
+    totals = np.full((1, 2), TOTAL_TOLERANCE)
+    return np.vstack([totals, case.derivative_tolerance()]) if case.names else totals
+
+
+def rule(case: SlabCase, seconds: float) -> Callable[[Sums], float]:
+    """The shortfall from a third of every tolerance, 0 once the time is up."""
+    allowed, begun_s = tolerances(case) / 3, time.monotonic()
+    return lambda sums: float((sums.standard_error() / allowed).max()) if time.monotonic() < begun_s + seconds else 0.0
+
+
+def measure(case: SlabCase, shortfall: Callable[[Sums], float], seed: int) -> Iterator[dict[str, object]]:
     """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the rule."""
     began = time.perf_counter()
-    sums = simulate(case, passes(count), seed)
+    sums = simulate(case, shortfall, seed)
     seconds = time.perf_counter() - began
-    mean, error = sums.mean(), sums.standard_error()
-    tolerance = np.vstack([np.full((1, 2), TOTAL_TOLERANCE), case.derivative_tolerance()] if case.names else [np.full((1, 2), TOTAL_TOLERANCE)])
+    mean, error, tolerance = sums.mean(), sums.standard_error(), tolerances(case)
     for row, name in enumerate(("total", *case.names)):
         for column, side in enumerate("RT"):
             value, truth, spread = mean[row, column], case.values[row, column], error[row, column]
@@ -48,11 +62,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=("derivatives", "totals"))
     parser.add_argument("--passes", type=int, default=2, help="of 262144 paths, each next one up to four times as long")
+    parser.add_argument("--seconds", type=float, help="instead of passes: until a third of every tolerance, at most so long per case")
+    parser.add_argument("--cases", help="only these, separated by commas; a first word, as S01")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     cases = derivative_cases() if arguments.table == "derivatives" else total_cases()
-    rows = [row for number, case in enumerate(cases) for row in measure(case, arguments.passes, arguments.seed + number)]
+    if arguments.cases:
+        cases = named(cases, *arguments.cases.split(","))
+    rows: list[dict[str, object]] = []
+    for number, case in enumerate(cases):
+        shortfall = rule(case, arguments.seconds) if arguments.seconds else passes(arguments.passes)
+        rows += measure(case, shortfall, arguments.seed + number)
     arguments.out.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
     z = np.array([row["z"] for row in rows], dtype=np.float64)
     fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)

@@ -84,6 +84,15 @@ def test_events_show_a_falling_loss_and_previews(finished: tuple[Path, FitReport
     assert all(e.done is None or 0 <= e.done <= 1 for e in events)
 
 
+def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path: Path) -> None:
+    # Alternate photographs differ by a factor 1.5: the best common scale leaves 0.2 of the images, above the 0.15 that still counts as explained.
+    write_prepared(tmp_path, uneven=0.5)
+    report = fit(tmp_path)
+    assert max(report.fit_error["green"], report.held_out_error["green"]) > 0.15
+    assert not report.converged
+    assert "the images are still" in report.advice
+
+
 def test_publishes_history_trace_and_pictures(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
     root, report, _ = finished
     folder, stored = open_stage(root, "fit", FitReport)

@@ -45,9 +45,14 @@ def write_prepared(
     held_out: tuple[tuple[str, str], ...] = (("c0", "l4"), ("c1", "l4")),
     masked: bool = False,
     dark: bool = False,
+    uneven: float = 0.0,
     seed: int = 5,
 ) -> PreparedManifest:
-    """Publish ``prepared`` with two cameras of 20 x 24 pixels."""
+    """Publish ``prepared`` with two cameras of 20 x 24 pixels.
+
+    Args:
+        uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
+    """
     writer = StageWriter(root, "prepared", 1)
     cameras, all_lights, rng = (camera("c0"), camera("c1")), lights(light_count), np.random.default_rng(seed)
     width, height = SIZE
@@ -65,6 +70,7 @@ def write_prepared(
     for c, one in enumerate(cameras):
         image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
+        image[::2] *= 1 + uneven
         spread = np.maximum(noise * image, 1e-4)
         radiance[c] = (image + spread * rng.standard_normal(image.shape)).astype(np.float32)
         variance[c] = (spread**2).astype(np.float32)
