@@ -6,12 +6,14 @@ of, for slabs the number of the layer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from services.fit.transport.clearance import Clearance
 from services.fit.transport.recipe import SceneRecipe
@@ -105,10 +107,12 @@ class MeshGeometry:
         dr.eval(self._normals)
         self._current = shape
 
-    def reshape(self, shape: tuple[float, ...]) -> None:
-        """Move the dentin surface to blend weights ``shape``, if they changed."""
-        if self.modes and tuple(shape) != self._current:
+    def reshape(self, shape: tuple[float, ...]) -> bool:
+        """Move the dentin surface to blend weights ``shape``; returns whether they changed."""
+        changed = self.modes > 0 and tuple(shape) != self._current
+        if changed:
             self._build(tuple(shape))
+        return changed
 
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the place
         """Next surface, by ray tracing."""
@@ -157,12 +161,13 @@ class SlabGeometry:
 
     epsilon = 0.0
 
-    def __init__(self, thicknesses_mm: tuple[float, ...], *, moving_border: bool) -> None:
-        depths = [0.0]
+    def __init__(self, thicknesses_mm: Sequence[float | NDArray[np.float64]], *, moving_border: bool) -> None:
+        """Take each layer's thickness once for all lanes, or as an array of one per lane."""
+        depths: list[float | NDArray[np.float64]] = [0.0]
         for thickness in thicknesses_mm:
             depths.append(depths[-1] + thickness)
         self.layers = len(thicknesses_mm)
-        self._planes = [dr.opaque(mi.Float, depth) for depth in depths]
+        self._planes = [mi.Float(depth.astype(np.float32)) if isinstance(depth, np.ndarray) else dr.opaque(mi.Float, depth) for depth in depths]
         self.modes = int(moving_border)
 
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:

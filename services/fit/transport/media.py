@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from services.core.errors import InputError
 from services.fit.optics import phase
@@ -45,20 +46,24 @@ class Score:
 class Media:
     """Parameters of media 1..M; index 0 is empty space."""
 
-    def __init__(self, media: Sequence[Medium]) -> None:
+    def __init__(self, media: Sequence[Medium | Sequence[Medium]]) -> None:
+        """Take each medium once for all lanes, or as a sequence of one per lane."""
         self.count = len(media)
-        self.two_lobes = any(m.beta < 1 for m in media)
+        self.two_lobes = any(m.beta < 1 for entry in media for m in ([entry] if isinstance(entry, Medium) else entry))
 
-        def opaque(values: list[float]) -> list[mi.Float]:
-            return [dr.opaque(mi.Float, value) for value in values]
+        def opaque(value: Callable[[Medium], float]) -> list[mi.Float]:
+            return [
+                dr.opaque(mi.Float, value(entry)) if isinstance(entry, Medium) else mi.Float(np.array([value(m) for m in entry], dtype=np.float32))
+                for entry in media
+            ]
 
-        self.sigma = opaque([m.sigma for m in media])
-        self.sigma_s = opaque([m.sigma * m.alpha for m in media])
-        self.log_alpha = opaque([math.log(max(m.alpha, 1e-30)) for m in media])
-        self.inverse_alpha = opaque([1 / max(m.alpha, 1e-30) for m in media])
-        self.beta = opaque([m.beta for m in media])
-        self.g1 = opaque([m.g1 for m in media])
-        self.g2 = opaque([m.g2 for m in media])
+        self.sigma = opaque(lambda m: m.sigma)
+        self.sigma_s = opaque(lambda m: m.sigma * m.alpha)
+        self.log_alpha = opaque(lambda m: math.log(max(m.alpha, 1e-30)))
+        self.inverse_alpha = opaque(lambda m: 1 / max(m.alpha, 1e-30))
+        self.beta = opaque(lambda m: m.beta)
+        self.g1 = opaque(lambda m: m.g1)
+        self.g2 = opaque(lambda m: m.g2)
 
     def pick(self, values: list[mi.Float], index: mi.UInt32) -> mi.Float:
         """Value of the medium an index names; the last one where it names empty space."""

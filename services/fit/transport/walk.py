@@ -37,6 +37,8 @@ class Plan:
     """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
+    most_steps: int | None = None
+    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
 
 
 def one_minus_exp(x: mi.Float) -> mi.Float:
@@ -108,6 +110,8 @@ class Walker:
     """Throughput against which roulette compares."""
     counts: list[mi.UInt32]
     """Scatters so far in each medium."""
+    steps: list[mi.UInt32]
+    """Flights so far; empty unless they are limited."""
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     kept: Crossing
@@ -150,7 +154,8 @@ class Walk:
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         self.book = Scores(plan, media)
         self.modes = geometry.modes if plan.shape else 0
-        self.slots = 2 if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
+        self.limited = int(plan.most_steps is not None)
+        self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
 
     def run(self, samples: int) -> Tally:
         """Trace ``samples`` paths in every lane; returns their sums, evaluated."""
@@ -170,6 +175,7 @@ class Walk:
             weight=path.weight,
             reference=mi.Float(path.weight),
             counts=[mi.UInt32(0) for _ in range(self.media.count)],
+            steps=[mi.UInt32(0) for _ in range(self.limited)],
             sums=self.book.zero(),
             border_sums=zeros(self.modes),
             kept=no_crossing(self.modes),
@@ -192,6 +198,8 @@ class Walk:
             self._connect(walker, flight, tally)
         self._turn(walker, flight)
         ended = self._end(walker, flight)
+        if self.plan.most_steps is not None:
+            ended = self._cut(walker, ended, self.plan.most_steps, tally)
         if self.plan.shape:
             ended = self._start_secondary(walker, ended, tally)
         self._renew(walker, ended, limit)
@@ -336,6 +344,14 @@ class Walk:
             ended |= walker.active & (walker.scatters_so_far() >= self.plan.order_edges[-1])
         return ended
 
+    def _cut(self, walker: Walker, ended: mi.Bool, most_steps: int, tally: Tally) -> mi.Bool:
+        """End paths that took their last step, and count what they still carried."""
+        walker.steps = [count + 1 for count in walker.steps]
+        cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
+        if self.plan.faces:
+            tally.add(walker.lane, mi.UInt32(2), self._carried(walker), cut & ~walker.secondary)
+        return ended | cut
+
     def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
         """Send the kept crossing's secondary walk from paths that ended; returns those that are finished altogether."""
         begins = ended & ~walker.secondary & (walker.kept.total > 0)
@@ -365,12 +381,13 @@ class Walk:
             walker.reference = mi.Float(walker.weight)
             walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
             walker.counts = [dr.zeros(mi.UInt32) for _ in walker.counts]
+            walker.steps = [dr.zeros(mi.UInt32) for _ in walker.steps]
             walker.secondary = mi.Bool(True)
             walker.rng = rng
             return walker
 
         walker_after = dr.if_stmt((walker, begins), begins, begin, lambda walker, _: walker, label="secondary walk")
-        for field in ("rng", "origin", "omega", "place", "weight", "reference", "counts", "secondary", "shape_factor"):
+        for field in ("rng", "origin", "omega", "place", "weight", "reference", "counts", "steps", "secondary", "shape_factor"):
             setattr(walker, field, getattr(walker_after, field))
         return (ended & ~begins) | (begins & (walker.weight == 0))
 
@@ -383,6 +400,7 @@ class Walk:
             walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
             walker.weight, walker.reference = path.weight, mi.Float(path.weight)
             walker.counts = [mi.UInt32(0) for _ in walker.counts]
+            walker.steps = [mi.UInt32(0) for _ in walker.steps]
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
             walker.kept.total = mi.Float(0)
