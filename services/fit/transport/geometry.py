@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.transport.clearance import Clearance
+from services.fit.transport.nesting import require_nested
 from services.fit.transport.recipe import SceneRecipe
 
 ENAMEL, DENTIN = 1, 2
@@ -72,6 +73,9 @@ class MeshGeometry:
         self.outer_faces = len(recipe.outer.faces)
         self._outer_vertices = len(recipe.outer.vertices_mm)
         self.modes = 0 if self.shape is None else len(self.shape.modes_mm)
+        self.epsilon = RAY_EPSILON * (1 + float(np.abs(recipe.outer.vertices_mm).max()))
+        if self.shape is not None:
+            require_nested(recipe.outer, self.shape.base, 2 * self.epsilon)
         faces = [recipe.outer.faces]
         if self.shape is not None:
             faces.append(self.shape.base.faces + self._outer_vertices)
@@ -81,7 +85,6 @@ class MeshGeometry:
         self._build((0.0,) * self.modes)
         if self.shape is not None:
             self._mode_tables = [mi.Float(np.ascontiguousarray(mode[self.shape.base.faces].reshape(-1), dtype=np.float32)) for mode in self.shape.modes_mm]
-        self.epsilon = RAY_EPSILON * (1 + float(np.abs(recipe.outer.vertices_mm).max()))
 
     def _build(self, shape: tuple[float, ...]) -> None:
         vertices = [self.recipe.outer.vertices_mm]

@@ -220,7 +220,8 @@ class Walk:
         inside = walker.active & (medium != 0)
         traced = walker.active & (distance >= self.geometry.clearance(walker.origin, inside))
         hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, traced)
-        scatters = walker.active & (distance < hit.distance)
+        # A lane with no surface ahead has left the tooth, whatever its place says: it meets nothing and ends.
+        scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
         if self.ior is not None:
