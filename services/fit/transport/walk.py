@@ -262,7 +262,8 @@ class Walk:
         distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
         first = scatters & (walker.scatters_so_far() == 0) & ~walker.secondary
         walker.weight *= remains
-        walker.reference = dr.select(first, walker.weight, walker.reference)
+        # Judged by what one scattering leaves of it, single scattering survives at any albedo.
+        walker.reference = dr.select(first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference)
         return Flight(medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects)
 
     def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
