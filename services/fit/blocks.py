@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,15 @@ class Block:
     """Weight in the fitted loss, 1/variance units; 0 where masked or held out."""
     held_out: NDArray[np.bool_]
     """Valid and kept from the fit."""
+
+    @property
+    def fitted_view(self) -> View:
+        """The view without lights under which no pixel is fitted: those are not rendered."""
+        return self.view_under(np.any(self.fit_weight > 0, axis=1))
+
+    def view_under(self, lights: NDArray[np.bool_]) -> View:
+        """The view under some of the lights, (L,); under all where that leaves none."""
+        return replace(self.view, lights=tuple(np.flatnonzero(lights).tolist())) if lights.any() and not lights.all() else self.view
 
 
 def pixels_per_block(lights: int) -> int:

@@ -118,7 +118,9 @@ class BlockErrors:
 def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown) -> BlockErrors:
     """Errors of one block."""
     start, block = time.time(), read_block(task.block)
-    first, second = (host.call("images", task.recipe, task.tissue, block.view, samples=task.samples, seed=seed).mean for seed in seeds)
+    used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
+    used[[light for name, light in shown if name == block.view.camera.name]] = True
+    first, second = (host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed).mean for seed in seeds)
     fitted, held_out = (error_sums(first, second, block.reference, block.variance, chosen) for chosen in (block.fit_weight > 0, block.held_out))
     camera = block.view.camera.name
     renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in shown if name == camera}

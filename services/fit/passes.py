@@ -104,7 +104,7 @@ class Products:
 def image_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
     """Render a block and subtract the reference."""
     start, block = time.time(), read_block(task.block)
-    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.view, samples=task.samples, seed=seed)
+    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed)
     return Residual(stack.mean - block.reference, stack.variance, trace_row("image", task, start))
 
 
@@ -129,7 +129,7 @@ def compare_task(host: EngineHost, task: BlockTask, new: Tissue, seeds: tuple[in
 
     def residuals(tissue: Tissue) -> tuple[Array, Array]:
         first, second = (
-            (host.call("images", task.recipe, tissue, block.view, samples=task.samples, seed=seed).mean - block.reference).reshape(-1) for seed in seeds
+            (host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed).mean - block.reference).reshape(-1) for seed in seeds
         )
         return first, second
 
@@ -139,7 +139,7 @@ def compare_task(host: EngineHost, task: BlockTask, new: Tissue, seeds: tuple[in
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:
     """Render a block split by scattering order at albedo 1, (K, L, N)."""
     start, block = time.time(), read_block(task.block)
-    orders = host.call("order_images", task.recipe, task.tissue, block.view, bin_edges=edges, samples=task.samples, seed=seed)
+    orders = host.call("order_images", task.recipe, task.tissue, block.fitted_view, bin_edges=edges, samples=task.samples, seed=seed)
     return np.asarray(orders, dtype=np.float64), trace_row("orders", task, start)
 
 
@@ -242,7 +242,7 @@ def _similar_parameters(name: str) -> tuple[str, ...]:
 
 
 def _render_jacobians(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> tuple[Array, Array]:
-    view = read_block(task.block).view
+    view = read_block(task.block).fitted_view
 
     def render(seed: int) -> Array:
         estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, parameters, samples=task.samples, seed=seed)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from services.core.errors import DentineError, InputError, MeshError, PlatformError
+from services.core.errors import DentineError, InputError, MeshError, NonFiniteError, PlatformError
 from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab
@@ -79,10 +84,40 @@ def test_an_empty_pixel_list_is_refused(engine: Engine, no_kernel: None) -> None
     require_sentence(caught.value, "c0", "no pixel")
 
 
+@pytest.mark.parametrize("pixel", [(8, 0), (0, 8), (-1, 3)])
+def test_a_pixel_outside_the_image_is_refused(engine: Engine, no_kernel: None, pixel: tuple[int, int]) -> None:
+    view = View(camera_at((0, 1, 0)), np.array([(2, 2), pixel], dtype=np.int32))
+    with pytest.raises(InputError) as caught:
+        engine.images(TISSUE, view, samples=1, seed=1)
+    require_sentence(caught.value, "c0", str(pixel), "8 x 8")
+
+
+@pytest.mark.parametrize("lights", [(), (5,), (-1,), (2, 2)])
+def test_lights_that_do_not_exist_are_refused(engine: Engine, no_kernel: None, lights: tuple[int, ...]) -> None:
+    view = replace(whole_view(camera_at((0, 1, 0))), lights=lights)
+    with pytest.raises(InputError) as caught:
+        engine.images(TISSUE, view, samples=1, seed=1)
+    require_sentence(caught.value, "c0", f"lights = {lights}")
+
+
+@pytest.mark.parametrize("counts", [{"samples": 0}, {"samples": -4}, {"samples": 8, "batches": 0}])
+def test_counts_of_paths_that_are_not_positive_are_refused(engine: Engine, no_kernel: None, counts: dict[str, int]) -> None:
+    with pytest.raises(InputError) as caught:
+        engine.images(TISSUE, whole_view(camera_at((0, 1, 0))), seed=1, **counts)
+    require_sentence(caught.value, *(f"{name} = {value}" for name, value in counts.items()))
+
+
 def test_an_unknown_parameter_is_refused(engine: Engine, no_kernel: None) -> None:
     with pytest.raises(InputError) as caught:
         engine.jacobian(TISSUE, whole_view(camera_at((0, 1, 0))), ("dentin.roughness",), samples=1, seed=1)
     require_sentence(caught.value, "dentin.roughness", "dentin.sigma", "shape.1")
+
+
+def with_light(number: int, *, intensity: float = 1.0, position: tuple[float, float, float] = (0.0, 600.0, 0.0)) -> SceneRecipe:
+    """The small tooth with one light replaced."""
+    positions, intensities = LIGHTS_MM.copy(), np.ones(len(LIGHTS_MM))
+    positions[number], intensities[number] = position, intensity
+    return replace(recipe(), light_positions_mm=positions, light_intensities=intensities)
 
 
 def test_lights_that_give_no_light_are_refused() -> None:
@@ -90,10 +125,12 @@ def test_lights_that_give_no_light_are_refused() -> None:
     dark = replace(scene, light_positions_mm=np.zeros((0, 3)), light_intensities=np.zeros(0))
     for wrong, part in (
         (dark, "no light"),
-        (replace(scene, light_intensities=np.full(len(LIGHTS_MM), -1.0)), "intensity"),
-        (replace(scene, light_intensities=np.full(len(LIGHTS_MM), np.nan)), "intensity"),
-        (replace(scene, light_positions_mm=np.full_like(LIGHTS_MM, np.inf)), "position"),
-        (replace(scene, light_positions_mm=np.zeros_like(LIGHTS_MM)), "outside"),
+        (with_light(3, intensity=-1.0), "Light 3 has intensity = -1,"),
+        (with_light(2, intensity=0.0), "Light 2 has intensity = 0,"),
+        (with_light(4, intensity=math.nan), "Light 4 has intensity = nan,"),
+        (with_light(1, position=(0.0, math.inf, 0.0)), "Light 1 has position_mm = [0.0, inf, 0.0]"),
+        (with_light(0, position=(0.0, 1.0, 0.5)), "Light 0 at position_mm = [0.0, 1.0, 0.5]"),
+        (replace(scene, light_positions_mm=LIGHTS_MM * 1e-3), "in millimetres"),
         (replace(scene, ior=0.7), "ior = 0.7"),
         (replace(scene, ior=math.nan), "ior = nan"),
     ):
@@ -131,6 +168,27 @@ def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], pa
     assert caught.value.exit_status == 4
 
 
+def test_a_missing_libllvm_ends_with_a_sentence(tmp_path: Path) -> None:
+    # The whole way, in a process that cannot find the library: an empty file where it is looked for.
+    library = tmp_path / "libLLVM.so"
+    library.touch()
+    script = "from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe; Engine(recipe())"
+    root = Path(__file__).resolve().parents[2]
+    ended = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=root,
+        env=os.environ | {"DRJIT_LIBLLVM_PATH": str(library)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert ended.returncode == 1
+    last = ended.stderr.strip().splitlines()[-1]
+    assert "PlatformError: No libLLVM was found" in last
+    assert last.endswith("DRJIT_LIBLLVM_PATH to such a libLLVM.so.")
+
+
 def test_libllvm_17_and_later_are_accepted() -> None:
     for major in (17, 18, 19, 22):
         require_llvm((major, 1, 0))
@@ -163,6 +221,28 @@ def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
         with pytest.raises(InputError) as caught:
             simulate_slab(layers, **options)
         require_sentence(caught.value, part)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("derivative", [False, True])
+def test_a_result_that_is_not_finite_raises_with_its_pixels(engine: Engine, monkeypatch: pytest.MonkeyPatch, wrong: float, derivative: bool) -> None:
+    from services.fit.transport.tally import Tally
+
+    view, broken = whole_view(camera_at((0, 1, 0))), [5, 11, 40, 63]
+    honest = Tally.arrays
+
+    def spoil(tally: Tally) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        # One path of one light in the last batch of each of these pixels.
+        sums, derivatives = honest(tally)
+        table = derivatives[1] if derivative else sums
+        table[[len(table) - len(view) + k for k in broken], 2] = wrong
+        return sums, derivatives
+
+    monkeypatch.setattr(Tally, "arrays", spoil)
+    with pytest.raises(NonFiniteError) as caught:
+        engine.jacobian(TISSUE, view, ("enamel.alpha", "dentin.sigma"), samples=4, seed=1)
+    require_sentence(caught.value, "4 of 64 pixels", "c0", "(5, 0), (3, 1), (0, 5)")
+    assert caught.value.exit_status == 6
 
 
 def test_a_mesh_alone_knows_its_volume_and_edges() -> None:

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import InputError, NonFiniteError
+from services.core.errors import InputError
 from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.checks import require_finite, require_lights, require_view
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
 
 if TYPE_CHECKING:
+    from services.fit.transport.lights import PointLights
     from services.fit.transport.walk import Plan
 
 LANE_BUDGET = 24_000_000
@@ -33,15 +35,8 @@ class Engine:
         recipe.outer.require_solid("outer surface")
         if recipe.dentin is not None:
             recipe.dentin.base.require_solid("dentin surface")
-        if len(recipe.light_positions_mm) == 0:
-            raise InputError("The scene has no light; list at least one with a position and an intensity.")
-        if not np.isfinite(recipe.light_positions_mm).all() or not (np.isfinite(recipe.light_intensities) & (recipe.light_intensities > 0)).all():
-            raise InputError("Every light needs a finite position_mm and a positive intensity; correct the rig's calibration.")
         reach_mm = float(np.linalg.norm(recipe.outer.vertices_mm, axis=1).max())
-        if (np.linalg.norm(recipe.light_positions_mm, axis=1) <= reach_mm).any():
-            raise InputError(
-                f"A light is within {reach_mm:.0f} mm of the origin, where the tooth is; lights must be outside it, with position_mm in millimetres."
-            )
+        require_lights(recipe.light_positions_mm, recipe.light_intensities, reach_mm)
         if not math.isfinite(recipe.ior) or recipe.ior < 1:
             raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
         prepare_device(threads)
@@ -51,6 +46,7 @@ class Engine:
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities)
+        self._some_lights: dict[tuple[int, ...], PointLights] = {}
         self._radius_mm = reach_mm
         self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
 
@@ -120,8 +116,10 @@ class Engine:
         from services.fit.transport.starts import CameraStart
         from services.fit.transport.walk import Walk
 
-        if len(view) == 0:
-            raise InputError(f"Camera {view.camera.name} lists no pixel; its valid mask is empty.")
+        count = len(self.recipe.light_positions_mm)
+        require_view(view, count)
+        if samples < 1 or batches < 1:
+            raise InputError(f"samples = {samples} and batches = {batches} must be at least 1; ask for one path per pixel or more.")
         media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
         for part, medium in zip(self._parts(), media, strict=True):
             require_medium(part, medium)
@@ -129,22 +127,36 @@ class Engine:
             raise InputError(f"shape = {tissue.shape} must be {self._geometry.modes} finite blend weights, one per dentin mode.")
         self._geometry.reshape(tissue.shape)
 
-        kernel_media = Media(media)
+        lights, kernel_media = self._lights_of(view), Media(media)
         batches = min(batches, samples)
         per_batch = -(-samples // batches)
-        slots = len(self.recipe.light_positions_mm) * max(len(plan.order_edges) - 1, 1)
+        bins = max(len(plan.order_edges) - 1, 1)
+        slots = lights.count * bins
         tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)
         slice_size = max(1, LANE_BUDGET // (batches * slots * tables))
         pieces = []
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
             start = CameraStart(piece, batches, seed, self._radius_mm)
-            tally = Walk(self._geometry, kernel_media, self._lights, start, plan, self._ior).run(per_batch)
+            tally = Walk(self._geometry, kernel_media, lights, start, plan, self._ior).run(per_batch)
             sums, derivatives = tally.arrays()
             pieces.append([array.reshape(batches, len(piece), slots) / per_batch for array in (sums, *derivatives)])
         whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
-        _require_finite(whole, view)
+        require_finite(whole, view)
+        if view.lights is not None:
+            whole = [_among_all(array, view.lights, count, bins) for array in whole]
         return whole[0], whole[1:]
+
+    def _lights_of(self, view: View) -> PointLights:
+        """The lights that a view needs; none of the others is in its kernel."""
+        from services.fit.transport.lights import PointLights
+
+        if view.lights is None:
+            return self._lights
+        if view.lights not in self._some_lights:
+            chosen = list(view.lights)
+            self._some_lights[view.lights] = PointLights(self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen])
+        return self._some_lights[view.lights]
 
 
 def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -154,12 +166,9 @@ def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64
     return batches.mean(axis=0).T, variance.T
 
 
-def _require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
-    bad = np.zeros(len(view), dtype=bool)
-    for array in arrays:
-        bad |= ~np.isfinite(array).all(axis=(0, 2))
-    if bad.any():
-        where = ", ".join(f"({x}, {y})" for x, y in view.pixels[bad][:3])
-        raise NonFiniteError(
-            f"{int(bad.sum())} of {len(view)} pixels of camera {view.camera.name} came out non-finite, first at {where}; report the parameters."
-        )
+def _among_all(array: NDArray[np.float64], chosen: tuple[int, ...], count: int, bins: int) -> NDArray[np.float64]:
+    """(batches, N, slots) of the chosen lights put among all ``count``; the others are 0."""
+    batches, pixels, _ = array.shape
+    whole = np.zeros((batches, pixels, count, bins))
+    whole[:, :, list(chosen)] = array.reshape(batches, pixels, len(chosen), bins)
+    return whole.reshape(batches, pixels, count * bins)

@@ -40,11 +40,13 @@ class SceneRecipe:
 
 @dataclass(frozen=True)
 class View:
-    """The pixels of one camera that count."""
+    """The pixels of one camera that count, and the lights."""
 
     camera: Camera
     pixels: NDArray[np.int32]
     """(N, 2) integer x, y of the valid pixels."""
+    lights: tuple[int, ...] | None = None
+    """Indices of the lights that count in some of these pixels; None for all. The others are not sampled: their images are 0 with variance 0."""
 
     def __len__(self) -> int:
         return len(self.pixels)

@@ -406,7 +406,8 @@ class Walk:
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
             walker.kept.total = mi.Float(0)
-            walker.secondary = mi.Bool(False)
+            if self.plan.shape:
+                walker.secondary = mi.Bool(False)
             walker.active = walker.sample < limit
             return walker
 

@@ -1,0 +1,64 @@
+"""What the engine refuses, each with the name and the value of what is wrong. Media check themselves (``media.require_medium``), meshes too."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import InputError, NonFiniteError
+from services.fit.transport.recipe import View
+
+
+def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], reach_mm: float) -> None:
+    """Refuse lights that cannot light a tooth about the origin that reaches ``reach_mm`` far.
+
+    Raises:
+        InputError: no light, or one that is not finite, dark, or where the tooth is.
+    """
+    if len(positions_mm) == 0:
+        raise InputError("The scene has no light; list at least one with a position and an intensity.")
+    for number, (position, intensity) in enumerate(zip(positions_mm, intensities, strict=True)):
+        if not np.isfinite(position).all():
+            raise InputError(f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's calibration.")
+        if not math.isfinite(intensity) or intensity <= 0:
+            raise InputError(f"Light {number} has intensity = {intensity:g}, which must be positive and finite; correct the rig's calibration.")
+        if np.linalg.norm(position) <= reach_mm:
+            raise InputError(
+                f"Light {number} at position_mm = {position.tolist()} is within {reach_mm:.0f} mm of the origin, where the tooth is; "
+                "lights must be outside it, in millimetres."
+            )
+
+
+def require_view(view: View, lights: int) -> None:
+    """Refuse a view without pixels, or with pixels or lights that do not exist.
+
+    Raises:
+        InputError: names the camera.
+    """
+    name = view.camera.name
+    if len(view) == 0:
+        raise InputError(f"Camera {name} lists no pixel; its valid mask is empty.")
+    outside = ((view.pixels < 0) | (view.pixels >= view.camera.size)).any(axis=1)
+    if outside.any():
+        x, y = view.pixels[outside][0]
+        raise InputError(f"Camera {name} lists pixel ({x}, {y}), outside its {view.camera.size[0]} x {view.camera.size[1]}; correct the list.")
+    if view.lights is not None and not (view.lights and set(view.lights) <= set(range(lights)) and len(set(view.lights)) == len(view.lights)):
+        raise InputError(f"Camera {name} lists lights = {view.lights}; they must be different indices below {lights}, at least one.")
+
+
+def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
+    """Refuse results (batches, N, slots) that hold NaN or infinity, whatever the slot.
+
+    Raises:
+        NonFiniteError: gives the count and the first pixels.
+    """
+    bad = np.zeros(len(view), dtype=bool)
+    for array in arrays:
+        bad |= ~np.isfinite(array).all(axis=(0, 2))
+    if bad.any():
+        where = ", ".join(f"({x}, {y})" for x, y in view.pixels[bad][:3])
+        raise NonFiniteError(
+            f"{int(bad.sum())} of {len(view)} pixels of camera {view.camera.name} came out non-finite, first at {where}; report the parameters."
+        )

@@ -1,0 +1,42 @@
+"""What a view does not need is not rendered: lights it does not list come out as zero, and the rest as if those had never been there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from tests.support.small_tooth import LIGHTS_MM, camera_at, recipe, whole_view
+
+NAMES = ("enamel.sigma", "dentin.alpha", "shape.1")
+TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3), (0.5, 0.4))
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return Engine(recipe())
+
+
+@pytest.mark.parametrize("seen", [(1, 4), (4, 0)])
+def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, seen: tuple[int, int]) -> None:
+    scene, view = recipe(), whole_view(camera_at((0.2, 1, 0.1)))
+    smaller = Engine(replace(scene, light_positions_mm=LIGHTS_MM[list(seen)], light_intensities=scene.light_intensities[list(seen)]))
+    some, unseen = replace(view, lights=seen), [k for k in range(len(LIGHTS_MM)) if k not in seen]
+    image, alone = (one.images(TISSUE, v, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
+    slope, slope_alone = (one.jacobian(TISSUE, v, NAMES, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
+    edges = np.array([0, 3, 40])
+    orders, orders_alone = (one.order_images(TISSUE, v, bin_edges=edges, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
+    for ours, theirs, axis in (
+        (image.mean, alone.mean, 0),
+        (image.variance, alone.variance, 0),
+        (slope.jacobian, slope_alone.jacobian, 1),
+        (slope.jacobian_variance, slope_alone.jacobian_variance, 1),
+        (orders, orders_alone, 1),
+    ):
+        assert ours.shape[axis] == len(LIGHTS_MM)
+        assert not np.take(ours, unseen, axis=axis).any()
+        np.testing.assert_array_equal(np.take(ours, seen, axis=axis), theirs)
+        assert theirs.any()
