@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from typing import Literal
 
 from services.core.errors import PlatformError
 
@@ -23,19 +24,20 @@ def require_llvm(version: tuple[int, int, int]) -> None:
         raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {remedy}.")
 
 
-def prepare_device(threads: int | None = None, backend: str = "llvm") -> None:
+def prepare_device(threads: int | None = None, backend: str = "llvm", colours: Literal["mono", "rgb"] = "mono") -> None:
     """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same back end do nothing.
 
     Args:
         threads: CPU threads of this process; None keeps Dr.Jit's default.
         backend: ``llvm`` or ``cuda``.
+        colours: ``mono`` for everything that fits; ``rgb`` for pictures of other people's scenes.
 
     Raises:
         PlatformError: the back end is not usable here, or another one is already in use.
     """
     drjit = importlib.import_module("drjit")
     mitsuba = importlib.import_module("mitsuba")
-    variant = f"{backend}_ad_mono"
+    variant = f"{backend}_ad_{colours}"
     if mitsuba.variant() == variant:
         return
     if mitsuba.variant() is not None:

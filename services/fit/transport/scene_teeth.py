@@ -1,0 +1,121 @@
+"""Teeth among the shapes of somebody else's Mitsuba scene: which surface bounds which medium."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import InputError
+from services.core.geometry import Mesh
+from services.fit.transport.clearance import CELL_MM, Clearance
+from services.fit.transport.geometry import DENTIN, ENAMEL
+
+CLEARANCE_CELLS = 4_000_000
+"""A distance grid of more cells takes longer to build than it saves."""
+
+
+@dataclass(frozen=True)
+class ToothShapes:
+    """Shape ids of the surfaces around enamel, and of those around dentin inside them."""
+
+    enamel: tuple[str, ...]
+    dentin: tuple[str, ...] = ()
+
+
+class SceneTeeth:
+    """The teeth of one scene at their present places.
+
+    A lane's *place* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may not overlap.
+    """
+
+    def __init__(self, scene: Any, shapes: ToothShapes) -> None:
+        """Find and check the surfaces.
+
+        Raises:
+            InputError: no shape of such an id, or one that cannot be a tooth's surface. MeshError: a surface cannot bound a medium.
+        """
+        self._shapes = shapes
+        self._state = _state(scene, shapes)
+        by_id = {shape.id(): shape for shape in scene.shapes()}
+        outer, inner = ([_solid(by_id[name]) for name in names] for names in (shapes.enamel, shapes.dentin))
+        self.centre = np.concatenate([mesh.vertices_mm for mesh in outer]).mean(axis=0)
+
+        # A shape is known by its number among all objects of the renderer.
+        part = dict.fromkeys(shapes.enamel, ENAMEL) | dict.fromkeys(shapes.dentin, DENTIN)
+        numbers = _numbers(scene)
+        table = np.zeros(int(numbers.max()) + 1, dtype=np.uint32)
+        table[numbers] = [part.get(shape.id(), 0) for shape in scene.shapes()]
+        self._parts = mi.UInt32(table)
+        dr.eval(self._parts)
+        self._clearance = _clearance(outer, inner, [shape.bbox() for shape in scene.shapes() if shape.id() not in part])
+
+    def describe(self, scene: Any) -> bool:
+        """Whether this is still true of a scene: its shapes are the same and none has moved."""
+        now = _state(scene, self._shapes)
+        return len(now) == len(self._state) and all(np.array_equal(a, b) for a, b in zip(now, self._state, strict=True))
+
+    def part(self, found: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
+        """Of the surface that was hit: ENAMEL, DENTIN, or 0 where it belongs to no tooth."""
+        return dr.gather(mi.UInt32, self._parts, dr.reinterpret_array(mi.UInt32, found.shape), active)
+
+    def medium(self, place: mi.UInt32) -> mi.UInt32:
+        """Dentin over enamel over whatever is outside (0)."""
+        return dr.select((place & DENTIN) != 0, DENTIN, place & ENAMEL)
+
+    def beyond(self, place: mi.UInt32, part: mi.UInt32, cosine: mi.Float) -> mi.UInt32:
+        """Place after crossing a surface at ``cosine`` between direction and outward normal; a missed hit heals at the next."""
+        return dr.select(cosine < 0, place | part, place & ~part)
+
+    def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Distance within which no surface lies; 0 where that is not known."""
+        return mi.Float(0) if self._clearance is None else self._clearance(point, active)
+
+
+def _numbers(scene: Any) -> NDArray[np.uint32]:
+    return np.asarray(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy())
+
+
+def _state(scene: Any, shapes: ToothShapes) -> list[NDArray[Any]]:
+    by_id = {shape.id(): shape for shape in scene.shapes()}
+    for name in (*shapes.enamel, *shapes.dentin):
+        if name not in by_id:
+            known = ", ".join(sorted(filter(None, by_id))) or "no shape with an id"
+            raise InputError(f"The scene has no shape '{name}' but {known}; correct the id, and load the scene with optimize=False so that ids survive.")
+        if not by_id[name].is_mesh():
+            raise InputError(f"Shape '{name}' is no triangle mesh; give the tooth's surface as a mesh file.")
+        if by_id[name].is_emitter():
+            raise InputError(f"Shape '{name}' is a light, which a tooth's surface cannot be; remove its emitter.")
+    boxes = [(shape.bbox().min, shape.bbox().max) for shape in by_id.values()]
+    vertices = [np.array(mi.traverse(by_id[name])["vertex_positions"]) for name in (*shapes.enamel, *shapes.dentin)]
+    return [np.array([shape.id() for shape in scene.shapes()]), _numbers(scene), np.array(boxes), *vertices]
+
+
+def _solid(shape: Any) -> Mesh:
+    arrays = mi.traverse(shape)
+    vertices = np.array(arrays["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    faces = np.array(arrays["faces"]).reshape(-1, 3)
+    # Vertices that were split for texture seams or normals become one again.
+    welded, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces].astype(np.int32)
+    mesh = Mesh(welded, faces[:, ::-1] if shape.has_flipped_normals() else faces)
+    mesh.require_solid(f"'{shape.id()}'", extent_mm=(0.0, np.inf))
+    return mesh
+
+
+def _clearance(outer: list[Mesh], inner: list[Mesh], other_boxes: list[Any]) -> Clearance | None:
+    # Only for one tooth that nothing else can reach into; elsewhere every flight is traced.
+    low, high = outer[0].vertices_mm.min(axis=0), outer[0].vertices_mm.max(axis=0)
+    near = any((np.array(box.min) < high).all() and (np.array(box.max) > low).all() for box in other_boxes)
+    if len(outer) > 1 or near or np.prod((high - low) / CELL_MM + 2) > CLEARANCE_CELLS:
+        return None
+    grid = Clearance(outer[0].vertices_mm, outer[0].faces)
+    if inner:
+        first = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in inner[:-1]])
+        faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(inner, first, strict=True)])
+        grid.move_inner(np.concatenate([mesh.vertices_mm for mesh in inner]), faces.astype(np.int32))
+    return grid

@@ -1,0 +1,269 @@
+"""The integrator plug-in against stock Mitsuba and the project's own engine.
+
+Images are compared in blocks of pixels by the rule of ``test_images_against_mitsuba``; an honest integrator fails one run of
+such a comparison in 500. Seeds are fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.core.errors import DentineError, InputError, MeshError, PlatformError
+from services.core.geometry import Mesh
+from services.core.meshfiles import write_mesh
+from services.core.records import Boundary
+from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.platform import prepare_device
+from services.fit.transport.recipe import DentinShape, SceneRecipe
+from tests.physics.test_images_against_mitsuba import BATCHES, pixel_scores, require_same_pictures
+from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
+
+Array = NDArray[np.float64]
+SceneDict = dict[str, Any]
+
+TISSUE = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5))
+SIZE, BLOCK = 32, 2
+CAMERA = camera_at((0.2, 1, 0.1), size=SIZE, span_mm=9.0)
+OUTER, SHAPE = ellipsoid(SEMI_AXES_MM), dentin_shape()
+CORE = Mesh(SHAPE.vertices_mm((0.5, 0.4)), OUTER.faces)
+STOCK = {"type": "prbvolpath", "max_depth": 5000, "rr_depth": 100}
+LAMP = {
+    "type": "rectangle",
+    # 8 mm wide, 12 mm towards the camera and above the tooth, facing it.
+    "to_world": np.array([[4.0, 0, 0, -6], [0, 0, -1, 12], [0, 4, 0, 6], [0, 0, 0, 1]]),
+    "emitter": {"type": "area", "radiance": 8.0},
+}
+SKY = {"type": "constant", "radiance": 0.3}
+
+
+def table(height_mm: float, reflectance: float | SceneDict) -> SceneDict:
+    place = np.diag([40.0, 40.0, 1.0, 1.0])
+    place[2, 3] = height_mm
+    return {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+
+
+@pytest.fixture(scope="module")
+def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the small tooth's two surfaces; the plug-in is registered."""
+    prepare_device()
+    from services.fit.transport.integrator import register_integrator
+
+    register_integrator()
+    folder = tmp_path_factory.mktemp("tooth")
+    write_mesh(folder / "outer.ply", OUTER)
+    write_mesh(folder / "dentin.ply", CORE)
+    return folder
+
+
+@contextmanager
+def variant(name: str) -> Iterator[None]:
+    """Another variant, for the time of a block."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    mi.set_variant(name)
+    try:
+        yield
+    finally:
+        mi.set_variant(before)
+
+
+def properties(*tissues: Tissue, **others: Any) -> SceneDict:
+    """The integrator, matched unless told otherwise, for tissues of one or three channels."""
+    from services.fit.transport.integrator import medium_properties
+
+    media = {k: v for part in ("enamel", "dentin") for k, v in medium_properties(part, tuple(getattr(t, part) for t in tissues or (TISSUE,))).items()}
+    return {"type": "dentine", "enamel": "outer_11", "dentin": "dentin_11", "boundary": "matched"} | media | others
+
+
+def scene_dict(folder: Path, **shapes: SceneDict) -> SceneDict:
+    """The tooth in stock media under a point light, with other shapes: stock integrators and ours render the same scene."""
+    return nested_scene({"11": (folder / "outer.ply", folder / "dentin.ply")}, TISSUE, (CAMERA,), LIGHTS_MM[0], INTENSITY) | shapes
+
+
+def render(scene: Any, integrator: SceneDict, samples: int, seed: int) -> tuple[Array, Array]:
+    """Mean and its variance, both (H, W) or (H, W, 3), from independent batches."""
+    import mitsuba as mi
+
+    chosen = mi.load_dict(integrator)
+    stack = np.stack([np.array(mi.render(scene, integrator=chosen, spp=samples // BATCHES, seed=1009 * seed + b), dtype=np.float64) for b in range(BATCHES)])
+    return stack.mean(axis=0).squeeze(), (stack.var(axis=0, ddof=1) / BATCHES).squeeze()
+
+
+def engine_images(boundary: Boundary, tissue: Tissue, light: int, intensity: float, seed: int) -> tuple[Array, Array]:
+    """What the project's own engine sees, mean and its variance."""
+    dentin = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3)))
+    engine = Engine(SceneRecipe(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
+    image = engine.images(tissue, whole_view(CAMERA), samples=512, seed=seed, batches=BATCHES)
+    return image.mean[0].reshape(SIZE, SIZE), image.variance[0].reshape(SIZE, SIZE)
+
+
+def compare(ours: tuple[Array, Array], truth: tuple[Array, Array], least: int = 140) -> None:
+    require_same_pictures(pixel_scores([ours[0], truth[0]], [ours[1], truth[1]], BLOCK), least)
+
+
+def test_a_tooth_among_other_things_looks_as_in_mitsuba(tooth: Path) -> None:
+    # Connections through the tooth, lights that paths find by chance, light that the table returns.
+    scene = load_scene(scene_dict(tooth, table=table(-4.05, 0.5), lamp=LAMP, sky=SKY))
+    compare(render(scene, properties(), 256, 1), render(scene, STOCK, 256, 2), least=200)
+
+
+@pytest.mark.parametrize("boundary", ["matched", "thin"])
+def test_point_lights_give_the_engines_images(tooth: Path, boundary: Boundary) -> None:
+    scene = scene_dict(tooth, second={"type": "point", "position": LIGHTS_MM[3].tolist(), "intensity": INTENSITY})
+    # One run per light, so that the variances add.
+    runs = [engine_images(boundary, TISSUE, light, INTENSITY, seed=30 + light) for light in (0, 3)]
+    compare(render(load_scene(scene), properties(boundary=boundary), 512, 4), (runs[0][0] + runs[1][0], runs[0][1] + runs[1][1]))
+
+
+def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
+    # The tooth lies below the table; on it a ball of rough glass and one of metal.
+    sensor = sensor_dict(CAMERA)
+    sensor["to_world"][2, 3] += 6.3
+    ball = {"type": "sphere", "radius": 1.2}
+    surroundings = {
+        "table": table(5.0, {"type": "checkerboard", "color0": 0.2, "color1": 0.7}),
+        "glass": ball | {"center": [-1.5, 0, 6.3], "bsdf": {"type": "roughdielectric", "alpha": 0.2}},
+        "metal": ball | {"center": [1.5, 0, 6.3], "bsdf": {"type": "roughconductor", "alpha": 0.3}},
+        "lamp": LAMP,
+        "sky": SKY,
+        "camera_c0": sensor,
+    }
+    scene = load_scene(scene_dict(tooth, **surroundings))
+    compare(render(scene, properties(), 512, 5), render(scene, {"type": "path", "max_depth": -1}, 512, 6), least=200)
+
+
+def test_each_colour_has_its_own_media(tooth: Path) -> None:
+    # Each channel against the engine, which knows one channel at a time.
+    from services.fit.transport.integrator import register_integrator
+
+    tissues = (TISSUE, Tissue(Medium(0.8, 0.99, g1=0.3), Medium(6.0, 0.5, g1=0.1)), Tissue(Medium(3.0, 0.6, g1=-0.4), Medium(1.0, 0.99, 0.5, 0.7, -0.2)))
+    scene = scene_dict(tooth)
+    scene["camera_c0"]["film"]["pixel_format"] = "rgb"
+    scene["light"]["intensity"] = {"type": "rgb", "value": [INTENSITY, 2 * INTENSITY, 3 * INTENSITY]}
+    with variant("llvm_ad_rgb"):
+        register_integrator()
+        mean, variance = render(load_scene(scene), properties(*tissues), 768, 7)
+    for channel, tissue in enumerate(tissues):
+        truth = engine_images("matched", tissue, light=0, intensity=(channel + 1) * INTENSITY, seed=40 + channel)
+        compare((mean[..., channel], variance[..., channel]), truth)
+
+
+def white(tissue: Tissue) -> Tissue:
+    return Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0))
+
+
+def test_a_white_tooth_vanishes_in_a_uniform_room(tooth: Path) -> None:
+    scene = load_scene(scene_dict(tooth, light={"type": "constant"}))
+    mean, variance = render(scene, properties(white(TISSUE)), 512, 8)
+    compare((mean, variance), (np.ones_like(mean), np.zeros_like(mean)))
+
+
+def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
+    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, under 1 %; without, the image is missing.
+    scene = load_scene(scene_dict(tooth, light={"type": "constant"}))
+    brightness = []
+    for roughness in ({"roughness": 0.05}, {}):
+        mean, variance = render(scene, properties(white(TISSUE), boundary="thin", **roughness), 512, 9)
+        seen = variance > 0
+        assert np.sqrt(variance[seen].sum()) / seen.sum() < 0.01 / 3
+        brightness.append(mean[seen].mean())
+    assert abs(brightness[0] - 1) < 0.01
+    # Towards the viewer the face reflects at least what it does at normal incidence.
+    assert brightness[1] < 1 - ((1.631 - 1) / (1.631 + 1)) ** 2 + 0.01
+
+
+def test_a_moved_tooth_is_seen_where_it_is(tooth: Path) -> None:
+    import mitsuba as mi
+
+    scene = load_scene(scene_dict(tooth))
+    integrator = mi.load_dict(properties())
+    before = np.array(mi.render(scene, integrator=integrator, spp=64, seed=1))[..., 0]
+    arrays = mi.traverse(scene)
+    for shape in ("outer_11", "dentin_11"):
+        vertices = arrays[f"{shape}.vertex_positions"].numpy().reshape(-1, 3)
+        arrays[f"{shape}.vertex_positions"] = mi.Float((vertices + np.array([0, 0, 1.5], dtype=np.float32)).reshape(-1))
+    arrays.update()
+    after = np.array(mi.render(scene, integrator=integrator, spp=64, seed=1))[..., 0]
+    fresh = np.array(mi.render(scene, integrator=mi.load_dict(properties()), spp=64, seed=1))[..., 0]
+    np.testing.assert_array_equal(after, fresh)
+    assert not np.array_equal(after, before)
+
+
+def sentence(problem: BaseException) -> str:
+    """Mitsuba wraps what a plug-in raises: of what it loads in text, of what it renders as the cause."""
+    while problem.__cause__ is not None and not isinstance(problem, DentineError):
+        problem = problem.__cause__
+    return str(problem)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"enamel_alpha": 1.2}, "enamel.alpha = 1.2 must lie in 0 to 1; correct it."),
+        ({"dentin_sigma": 0.0}, "dentin.sigma = 0 must be positive"),
+        ({"enamel_g1": [0.1, 0.2, 0.3]}, "enamel_g1 has 3 values"),
+        ({"enamel_sigma": "thick"}, "enamel_sigma = thick is no number"),
+        ({"enamel": ""}, "needs 'enamel'"),
+        ({"dentin": ""}, "is given but no dentin surface"),
+        ({"enamel_sigmas": 1.0}, "no property 'enamel_sigmas'"),
+        ({"boundary": "rough"}, "boundary = rough must be"),
+        ({"roughness": 0.1}, "no mirror image"),
+        ({"boundary": "thin", "roughness": 3.0}, "roughness = 3.0 must lie in 0.001 to 1"),
+        ({"ior": 0.5}, "ior = 0.5 must be at least 1"),
+        ({"max_depth": 0}, "max_depth = 0 must be"),
+    ],
+)
+def test_impossible_properties_are_refused(tooth: Path, given: SceneDict, words: str) -> None:
+    import mitsuba as mi
+
+    from services.fit.transport.integrator import read_properties
+
+    wrong = {name: value for name, value in (properties() | given).items() if name != "type"}
+    with pytest.raises(InputError) as refused:
+        read_properties(wrong, channels=1)
+    assert words in str(refused.value)
+    with pytest.raises(RuntimeError, match="InputError") as loading:
+        mi.load_dict({"type": "dentine"} | wrong)
+    assert str(loading.value).rstrip().endswith(str(refused.value))
+
+
+def test_impossible_scenes_are_refused(tooth: Path, tmp_path: Path) -> None:
+    import mitsuba as mi
+
+    write_mesh(tmp_path / "open.ply", Mesh(OUTER.vertices_mm, OUTER.faces[:-2]))
+    write_mesh(tmp_path / "inverted.ply", Mesh(OUTER.vertices_mm, OUTER.faces[:, ::-1]))
+    shapes = {
+        "open": {"type": "ply", "filename": str(tmp_path / "open.ply")},
+        "inverted": {"type": "ply", "filename": str(tmp_path / "inverted.ply")},
+        "ball": {"type": "sphere"},
+        "shining": {"type": "ply", "filename": str(tooth / "outer.ply"), "emitter": {"type": "area"}},
+    }
+    scene = load_scene(scene_dict(tooth, **shapes))
+    for name, kind, words in (
+        ("molar", InputError, "no shape 'molar' but ball, dentin_11"),
+        ("open", MeshError, "is not watertight"),
+        ("inverted", MeshError, "is inside out"),
+        ("ball", InputError, "no triangle mesh"),
+        ("shining", InputError, "is a light"),
+    ):
+        with pytest.raises(RuntimeError) as refused:
+            mi.render(scene, integrator=mi.load_dict(properties(enamel=name)), spp=1)
+        assert words in sentence(refused.value), kind
+
+
+def test_a_variant_without_arrays_is_refused(tooth: Path) -> None:
+    from services.fit.transport.integrator import register_integrator
+
+    with variant("scalar_rgb"), pytest.raises(PlatformError, match="not scalar_rgb"):
+        register_integrator()
