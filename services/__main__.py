@@ -270,7 +270,13 @@ def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
         raise typer.Exit(failure["exit_status"])
 
 
-_BENCHMARKS = MappingProxyType({"slab": "services.fit.bench.slab:run", "transport-stack": "services.fit.bench.transport_stack:run"})
+_BENCHMARKS = MappingProxyType(
+    {
+        "slab": "services.fit.bench.slab:run",
+        "transport-skip": "services.fit.bench.transport_skip:run",
+        "transport-stack": "services.fit.bench.transport_stack:run",
+    }
+)
 """Name -> ``module:function``; the function takes ``quick`` and returns JSON values."""
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from services.fit.bench.transport_skip import Case, cases, kernel_operations
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from tests.support.small_tooth import LIGHTS_MM, camera_at, recipe, whole_view
@@ -40,3 +41,28 @@ def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, s
         assert not np.take(ours, unseen, axis=axis).any()
         np.testing.assert_array_equal(np.take(ours, seen, axis=axis), theirs)
         assert theirs.any()
+
+
+FEATURES = ("scores", "shape", "dentin", "second lobe", "thin faces", "order bins", "unseen lights", "masked pixels")
+
+
+@pytest.fixture(scope="module")
+def features() -> dict[str, Case]:
+    found = {case.name: case for case in cases()}
+    assert set(found) == set(FEATURES)
+    return found
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_what_is_off_is_not_in_the_kernel(features: dict[str, Case], feature: str) -> None:
+    case = features[feature]
+    off, without, on = (kernel_operations(call, 16) for call in (case.off, case.without, case.on))
+    assert off == without
+    # No kernel knows how many pixels there are.
+    assert on == off if feature == "masked pixels" else on > off
+
+
+@pytest.mark.parametrize("feature", FEATURES[:-2])
+def test_what_is_off_changes_no_bit(features: dict[str, Case], feature: str) -> None:
+    case = features[feature]
+    np.testing.assert_array_equal(case.off(16, 3).mean, case.without(16, 3).mean)

@@ -16,7 +16,9 @@ from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEs
 
 if TYPE_CHECKING:
     from services.fit.transport.lights import PointLights
-    from services.fit.transport.walk import Plan
+    from services.fit.transport.media import Media
+    from services.fit.transport.starts import CameraStart
+    from services.fit.transport.walk import Plan, Walk
 
 LANE_BUDGET = 24_000_000
 """Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
@@ -64,7 +66,7 @@ class Engine:
         from services.fit.transport.walk import Plan
 
         sums, _ = self._trace(tissue, view, Plan(), samples, seed, batches)
-        return StackEstimate(*_mean_and_variance(sums))
+        return StackEstimate(*self._among_all(view, *_mean_and_variance(sums)))
 
     def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
         """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
@@ -86,9 +88,9 @@ class Engine:
         scores = tuple(Score(PART_NUMBER[name.split(".")[0]], name.split(".")[1]) for name in medium_names)
         plan = Plan(scores=scores, shape=any(name.startswith("shape.") for name in names))
         sums, derivatives = self._trace(tissue, view, plan, samples, seed, batches)
-        mean, variance = _mean_and_variance(sums)
+        mean, variance = self._among_all(view, *_mean_and_variance(sums))
         place = {name: k for k, name in enumerate(medium_names + [f"shape.{k}" for k in range(modes)])}
-        pairs = [_mean_and_variance(derivatives[place[name]]) for name in names]
+        pairs = [self._among_all(view, *_mean_and_variance(derivatives[place[name]])) for name in names]
         empty = np.zeros((0, *mean.shape))
         return JacobianEstimate(names, mean, variance, np.stack([p[0] for p in pairs]) if pairs else empty, np.stack([p[1] for p in pairs]) if pairs else empty)
 
@@ -105,7 +107,8 @@ class Engine:
         sums, _ = self._trace(white, view, Plan(order_edges=tuple(int(edge) for edge in bin_edges)), samples, seed, batches)
         bins = len(bin_edges) - 1
         _, count, slots = sums.shape
-        return np.moveaxis(sums.mean(axis=0).reshape(count, slots // bins, bins), (0, 1, 2), (2, 1, 0))
+        (orders,) = self._among_all(view, sums.mean(axis=0).reshape(count, slots // bins, bins).T)
+        return orders
 
     def _parts(self) -> tuple[str, ...]:
         return ("enamel",) if self.recipe.dentin is None else ("enamel", "dentin")
@@ -114,7 +117,6 @@ class Engine:
         """Means per batch, (batches, N, slots), of contributions and of each derivative."""
         from services.fit.transport.media import Media, require_medium
         from services.fit.transport.starts import CameraStart
-        from services.fit.transport.walk import Walk
 
         count = len(self.recipe.light_positions_mm)
         require_view(view, count)
@@ -138,14 +140,25 @@ class Engine:
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
             start = CameraStart(piece, batches, seed, self._radius_mm)
-            tally = Walk(self._geometry, kernel_media, lights, start, plan, self._ior).run(per_batch)
-            sums, derivatives = tally.arrays()
+            sums, derivatives = self._walk(kernel_media, lights, start, plan).run(per_batch).arrays()
             pieces.append([array.reshape(batches, len(piece), slots) / per_batch for array in (sums, *derivatives)])
         whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
         require_finite(whole, view)
-        if view.lights is not None:
-            whole = [_among_all(array, view.lights, count, bins) for array in whole]
         return whole[0], whole[1:]
+
+    def _among_all(self, view: View, *arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Arrays (..., lights of the view, N) with zeros in place of the lights that were not sampled."""
+        if view.lights is None:
+            return arrays
+        whole = tuple(np.zeros((*array.shape[:-2], len(self.recipe.light_positions_mm), array.shape[-1])) for array in arrays)
+        for target, array in zip(whole, arrays, strict=True):
+            target[..., list(view.lights), :] = array
+        return whole
+
+    def _walk(self, media: Media, lights: PointLights, start: CameraStart, plan: Plan) -> Walk:
+        from services.fit.transport.walk import Walk
+
+        return Walk(self._geometry, media, lights, start, plan, self._ior)
 
     def _lights_of(self, view: View) -> PointLights:
         """The lights that a view needs; none of the others is in its kernel."""
@@ -164,11 +177,3 @@ def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64
     count = len(batches)
     variance = batches.var(axis=0, ddof=1) / count if count > 1 else np.full(batches.shape[1:], np.nan)
     return batches.mean(axis=0).T, variance.T
-
-
-def _among_all(array: NDArray[np.float64], chosen: tuple[int, ...], count: int, bins: int) -> NDArray[np.float64]:
-    """(batches, N, slots) of the chosen lights put among all ``count``; the others are 0."""
-    batches, pixels, _ = array.shape
-    whole = np.zeros((batches, pixels, count, bins))
-    whole[:, :, list(chosen)] = array.reshape(batches, pixels, len(chosen), bins)
-    return whole.reshape(batches, pixels, count * bins)

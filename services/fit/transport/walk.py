@@ -283,7 +283,7 @@ class Walk:
                 walker.kept, dr.fma(omega, hit.distance, walker.origin), omega, hit, walker.place, behind, carried, shifts, walker.rng.next_float32(), at_border
             )
         reached = self.geometry.advance(walker.origin, omega, hit, crosses)
-        walker.origin = dr.select(flight.scatters, dr.fma(omega, length, walker.origin), dr.select(flight.meets, reached, walker.origin))
+        walker.origin = dr.select(flight.scatters, dr.fma(omega, flight.distance, walker.origin), dr.select(flight.meets, reached, walker.origin))
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
         walker.place = dr.select(crosses, behind, walker.place)
         walker.counts = [dr.select(flight.scatters & (flight.medium == k + 1), count + 1, count) for k, count in enumerate(walker.counts)]

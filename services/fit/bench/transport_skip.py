@@ -1,0 +1,157 @@
+"""What a scene lacks costs nothing: each feature switched off, against a scene that never had it and against itself switched on.
+
+Of every case three calls are compared: ``off``, where the feature is there and not used; ``without``, where there is nothing to switch off; and
+``on``. Operations are those of a call's largest kernel, by Dr.Jit's kernel history. Times are medians over interleaved pairs of ``off`` and
+``without`` with equal seeds, each going first in every other pair; all kernels are compiled before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Mesh
+from services.fit.anatomy.blend import dentin_blend_shape
+from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.bench import Row
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+
+PAIRS = 30
+LIGHTS, FEW_LIGHTS = 18, (2, 7, 11)
+PIXEL_MM = 0.5
+ONE_LOBE = Medium(4.5, 0.99, 1.0, 0.75)
+TWO_LOBES = replace(ONE_LOBE, beta=0.9, g2=-0.3)
+TISSUE = Tissue(ONE_LOBE, replace(ONE_LOBE, sigma=9.0), (0.5, 0.3, 0.4))
+ORDER_EDGES = np.array([0, 4, 16, 1 << 20])
+
+Call = Callable[[int, int], Any]
+"""(samples, seed) -> an estimate, of as many batches in every call."""
+
+
+class SkipRow(Row):
+    """A row with the size of its kernel, and in a peer's summary row the comparison."""
+
+    operations: int
+    time_ratio: float | None = None
+    """Median over the pairs of our time, feature off, by the time without it."""
+    operations_on: int | None = None
+    seconds_on: float | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One feature."""
+
+    name: str
+    off: Call
+    without: Call
+    on: Call
+
+
+def run(*, quick: bool) -> list[dict[str, Any]]:
+    """Per feature a row of this engine with the feature off, a row of the peer without it, and the peer's summary row."""
+    samples = 16 if quick else 128
+    return [row.model_dump() for case in cases() for row in _compare(case, samples)]
+
+
+def cases() -> list[Case]:
+    """Everything that a kernel is specialised for, on a procedural incisor."""
+    from services.fit.bench.plain_walk import PlainEngine
+
+    incisor = build_incisor()
+    rig = dome_lights(LIGHTS, ("green",), seed=1)
+    positions, intensities = np.array([light.position_mm for light in rig]), np.array([light.intensity[0] for light in rig])
+    homogeneous = SceneRecipe(incisor.outer, None, positions, intensities)
+    few = replace(homogeneous, light_positions_mm=positions[list(FEW_LIGHTS)], light_intensities=intensities[list(FEW_LIGHTS)])
+    dentin = dentin_blend_shape(incisor.outer)
+    modelled = Mesh(dentin.vertices_mm(TISSUE.shape), dentin.base.faces)
+    plain, unable = Engine(homogeneous), PlainEngine(homogeneous)
+    blend = Engine(replace(homogeneous, dentin=dentin))
+    known = Engine(replace(homogeneous, dentin=DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape)))))
+    camera = dome_cameras(1, PIXEL_MM, (incisor.outer,))[0]
+    every_pixel, (crop, cropped_camera) = _view(camera), _crop(camera)
+    one, unused, ready, two, layered = (
+        replace(TISSUE, shape=()),
+        Tissue(ONE_LOBE, TWO_LOBES),
+        Tissue(replace(ONE_LOBE, g2=-0.3), ONE_LOBE),
+        Tissue(TWO_LOBES, ONE_LOBE),
+        TISSUE,
+    )
+
+    def images(engine: Engine, tissue: Tissue = one, view: View = every_pixel) -> Call:
+        return lambda samples, seed: engine.images(tissue, view, samples=samples, seed=seed)
+
+    def jacobian(engine: Engine, tissue: Tissue, *names: str) -> Call:
+        return lambda samples, seed: engine.jacobian(tissue, every_pixel, names, samples=samples, seed=seed, batches=16)
+
+    def orders(samples: int, seed: int) -> NDArray[np.float64]:
+        return plain.order_images(one, every_pixel, bin_edges=ORDER_EDGES, samples=samples, seed=seed, batches=16)
+
+    bare = images(unable)
+    return [
+        Case("scores", jacobian(plain, one), bare, jacobian(plain, one, "enamel.sigma", "enamel.alpha", "enamel.g1")),
+        Case("shape", images(blend, layered), images(known), jacobian(blend, layered, "shape.0")),
+        Case("dentin", images(plain, unused), bare, images(known)),
+        Case("second lobe", images(plain, ready), bare, images(plain, two)),
+        Case("thin faces", images(Engine(replace(homogeneous, boundary="thin", ior=1.0))), bare, images(Engine(replace(homogeneous, boundary="thin")))),
+        Case("order bins", images(plain), bare, orders),
+        Case("unseen lights", images(plain, view=replace(every_pixel, lights=FEW_LIGHTS)), images(Engine(few)), images(plain)),
+        Case("masked pixels", images(plain, view=crop), images(plain, view=_view(cropped_camera)), images(plain)),
+    ]
+
+
+def kernel_operations(call: Call, samples: int) -> int:
+    """Operations of the largest kernel that a call launches."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        call(samples, 0)
+        return max(int(kernel["operation_count"]) for kernel in dr.kernel_history([dr.KernelType.JIT]))
+
+
+def _compare(case: Case, samples: int) -> list[SkipRow]:
+    calls = (case.off, case.without, case.on)
+    off, without, on = (kernel_operations(call, samples) for call in calls)
+    seconds, estimates = np.zeros((PAIRS, 2)), []
+    for pair in range(PAIRS):
+        for which in (0, 1) if pair % 2 else (1, 0):
+            begun = time.perf_counter()
+            estimate = calls[which](samples, pair + 1)
+            seconds[pair, which] = time.perf_counter() - begun
+            estimates.append((which, estimate))
+    begun = time.perf_counter()
+    case.on(samples, 1)
+    seconds_on = time.perf_counter() - begun
+
+    # One image's error, from the variances of all of them.
+    errors = [np.sqrt(np.mean([(e.variance.sum() / np.sum(e.mean**2)) for w, e in estimates if w == which])) for which in (0, 1)]
+    ratio = float(np.median(seconds[:, 0] / seconds[:, 1]))
+    name, (ours, theirs) = f"transport-skip {case.name}", np.median(seconds, axis=0)
+    peer = SkipRow(benchmark=name, peer="without", seconds=theirs, error=errors[1], operations=without)
+    summary = {"efficiency_ratio": float(errors[1] ** 2 / errors[0] ** 2 / ratio), "time_ratio": ratio, "operations_on": on, "seconds_on": seconds_on}
+    return [SkipRow(benchmark=name, peer="dentine", seconds=ours, error=errors[0], operations=off), peer, peer.model_copy(update=summary)]
+
+
+def _view(camera: Camera) -> View:
+    width, height = camera.size
+    y, x = np.mgrid[0:height, 0:width]
+    return View(camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.int32))
+
+
+def _crop(camera: Camera) -> tuple[View, Camera]:
+    """The middle quarter of an image: as the list of pixels that a mask leaves, and as a camera that has no others."""
+    size = (camera.size[0] // 2, camera.size[1] // 2)
+    corner = np.array([size[0] // 2, size[1] // 2])
+    smaller = np.array(camera.K)
+    smaller[:2, 2] -= corner
+    whole = Camera(name=camera.name, size=size, K=smaller.tolist(), camera_from_world=camera.camera_from_world)
+    return View(camera, (_view(whole).pixels + corner).astype(np.int32)), whole
