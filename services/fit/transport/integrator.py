@@ -31,8 +31,9 @@ import numpy as np
 
 from services.core.errors import InputError, PlatformError
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
+from services.fit.transport.channel_media import ToothOptics
 from services.fit.transport.media import require_medium
-from services.fit.transport.scene_path import ScenePaths, ToothOptics
+from services.fit.transport.scene_path import ScenePaths
 from services.fit.transport.scene_teeth import SceneTeeth, ToothShapes
 
 PLUGIN = "dentine"

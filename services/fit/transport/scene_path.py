@@ -14,10 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics import fresnel
-from services.fit.optics.parameters import Medium
+from services.fit.transport.channel_media import ChannelMedia, ToothOptics
 from services.fit.transport.geometry import ENAMEL
 from services.fit.transport.gloss import Gloss
-from services.fit.transport.media import Media, PhaseFunction
 from services.fit.transport.scene_teeth import SceneTeeth
 from services.fit.transport.walk import ROULETTE_WEIGHT, minus_log1m
 
@@ -27,19 +26,6 @@ CONNECTION_FLOOR = 0.02
 SCALE_SAMPLES = 4096
 DARK_DEPTH = 40.0
 """Optical depth past which a straight line is dark in single precision."""
-
-
-@dataclass(frozen=True)
-class ToothOptics:
-    """What teeth are made of: one medium per colour channel, lengths in scene units (mm where the fit's values are used)."""
-
-    enamel: tuple[Medium, ...]
-    dentin: tuple[Medium, ...]
-    """Empty where no dentin surface is named."""
-    ior: float | None = None
-    """Of ``thin`` outer faces; None where they are index-matched."""
-    roughness: float | None = None
-    """GGX roughness of the outer face's mirror image; None leaves that image out, as a fit does."""
 
 
 @dataclass
@@ -57,15 +43,57 @@ class Path:
     """... with this density, 1/sr ..."""
     certain: mi.Bool
     """... or without a choice that an emitter connection could have made (camera, mirror)."""
-    channel: mi.UInt32
-    """The one colour channel this path follows inside teeth."""
-    divided: mi.Bool
-    """Whether it has been inside one, and so carries that channel alone."""
+    leader: mi.UInt32
+    """Colour channel whose flights and turns this path takes."""
+    likely: mi.Spectrum
+    """How likely each channel would have led the same path, relative to the likeliest; throughput is short of this."""
     from_tooth: mi.Bool
     """Whether the last scattering was inside a tooth."""
     depth: mi.UInt32
     valid: mi.Bool
     active: mi.Bool
+
+
+@dataclass
+class Flight:
+    """What one flight met."""
+
+    si: mi.SurfaceInteraction3f
+    part: mi.UInt32
+    """Of the surface: ENAMEL, DENTIN or 0."""
+    cosine: mi.Float
+    """Between flight and outward normal."""
+    distance: mi.Float
+    meets: mi.Bool
+    """A surface, or ..."""
+    scatters: mi.Bool
+    """... scatters before one, in a tooth."""
+    ordinary: mi.Bool
+    """Meets a surface that is no tooth's."""
+    mirrors: mi.Bool
+    """Turned back by a smooth face."""
+    glossy: mi.Bool
+    """Turned back by a rough one, from among ..."""
+    shines: mi.Bool
+    """... those that could have been."""
+    reflected: mi.Float
+    """Reflectance of the outer face that is met."""
+
+    @property
+    def turns(self) -> mi.Bool:
+        """Whether it ends at a vertex with a choice of directions."""
+        return self.scatters | self.ordinary | self.glossy
+
+
+@dataclass
+class Turn:
+    """Choice of the onward direction at a vertex."""
+
+    direction: mi.Vector3f
+    density: mi.Float
+    weight: mi.Spectrum
+    certain: mi.Bool
+    """Whether no emitter connection could have made it."""
 
 
 @dataclass
@@ -90,12 +118,7 @@ class ScenePaths:
     """Estimates the radiance along rays into one scene."""
 
     def __init__(self, scene: Any, teeth: SceneTeeth, optics: ToothOptics, max_depth: int) -> None:
-        self.scene, self.teeth = scene, teeth
-        self.channels = len(optics.enamel)
-        self.parts = 2 if optics.dentin else 1
-        # Every channel has media of its own, numbered one channel after the other.
-        pairs = zip(optics.enamel, optics.dentin, strict=True) if optics.dentin else ((medium,) for medium in optics.enamel)
-        self.media = Media([medium for channel in pairs for medium in channel])
+        self.scene, self.teeth, self.media = scene, teeth, ChannelMedia(optics)
         self.ior = None if optics.ior is None else dr.opaque(mi.Float, optics.ior)
         self.gloss = None if self.ior is None or optics.roughness is None else Gloss(optics.roughness, self.ior)
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
@@ -112,20 +135,17 @@ class ScenePaths:
 
     def radiance(self, sampler: Any, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
         """Radiance estimates along camera rays, and whether they met anything."""
-        channel = mi.UInt32(0)
-        if self.channels > 1:
-            channel = dr.minimum(mi.UInt32(sampler.next_1d(active) * self.channels), self.channels - 1)
         path = Path(
             sampler=sampler,
             ray=mi.Ray3f(ray),
             place=mi.UInt32(0),
             throughput=mi.Spectrum(1),
+            leader=self.media.pick_leader(sampler.next_1d(active)),
+            likely=mi.Spectrum(1),
             radiance=mi.Spectrum(0),
             last=dr.zeros(mi.Interaction3f),
             density=mi.Float(1),
             certain=mi.Bool(True),
-            channel=channel,
-            divided=mi.Bool(False),
             from_tooth=mi.Bool(False),
             depth=mi.UInt32(0),
             valid=mi.Bool(False),
@@ -134,135 +154,146 @@ class ScenePaths:
         (path,) = dr.while_loop((path,), lambda path: path.active, lambda path: (self._step(path),), label="paths through teeth")
         return path.radiance, path.valid
 
-    def _medium(self, path: Path) -> mi.UInt32:
-        index = self.teeth.medium(path.place)
-        return index if self.channels == 1 else dr.select(index == 0, 0, index + self.parts * path.channel)
-
     def _step(self, path: Path) -> Path:
-        sampler = path.sampler
+        flight = self._fly(path)
+        self._collect(path, flight)
+        path.valid |= flight.meets
+        path.active &= flight.meets | flight.scatters
+        if self.ior is not None:
+            self._reflect(path, flight, self.ior)
 
-        # Free flight; one that ends within the known clearance meets no surface and traces no ray.
-        medium = self._medium(path)
-        sigma = self.media.extinction(medium)
-        inside = path.active & (medium != 0)
-        distance = dr.select(inside, minus_log1m(sampler.next_1d(inside)) / sigma, dr.largest(mi.Float))
+        vertex = self._vertex(path, flight)
+        ends = flight.turns & (path.depth + 1 >= self.max_depth)
+        turn = self._join_and_turn(path, flight, vertex, (flight.turns | flight.shines) & ~ends)
+        self._go_on(path, flight, vertex, turn)
+
+        # Paths that faded survive in proportion to what they carry.
+        left = dr.max(path.throughput * self.media.share(path.likely)) / ROULETTE_WEIGHT
+        path.active &= ~ends & (path.sampler.next_1d(path.active) < left)
+        path.throughput *= dr.select(left < 1, dr.rcp(dr.maximum(left, 1e-20)), 1)
+        return path
+
+    def _fly(self, path: Path) -> Flight:
+        # One that ends within the known clearance meets no surface and traces no ray.
+        part = self.teeth.medium(path.place)
+        sigmas = self.media.extinction(part)
+        sigma = self.media.of_leader(path.leader, sigmas)
+        inside = path.active & (part != 0)
+        distance = dr.select(inside, minus_log1m(path.sampler.next_1d(inside)) / sigma, dr.largest(mi.Float))
         path.ray.maxt = distance
         traced = path.active & (distance >= self.teeth.clearance(path.ray.o, inside))
         found = self.scene.ray_intersect_preliminary(path.ray, coherent=False, active=traced)
         meets = traced & found.is_valid()
         scatters = inside & ~meets
         si = found.compute_surface_interaction(path.ray, +mi.RayFlags.All, meets)
-        part = self.teeth.part(found, meets)
-        ordinary, face = meets & (part == 0), meets & (part == ENAMEL)
 
-        # Light that the path has found by itself.
-        self._collect(path, si, ordinary | (path.active & ~meets & ~scatters))
-        path.valid |= meets
-        path.active &= meets | scatters
+        # The density that each channel would have flown so far with, relative to the leader's.
+        length = dr.select(meets, found.t, distance)
+        path.likely = self.media.rival(path.likely, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside)
+        met = self.teeth.part(found, meets)
+        never = mi.Bool(False)
+        return Flight(si, met, dr.dot(path.ray.d, si.n), distance, meets, scatters, meets & (met == 0), never, never, never, mi.Float(0))
 
-        # What a tooth's outer face reflects. Without gloss, what arrives from elsewhere shows no mirror image.
-        cosine = dr.dot(path.ray.d, si.n)
-        enters = face & (cosine < 0)
-        mirrors, glossy, shines = mi.Bool(False), mi.Bool(False), mi.Bool(False)
-        if self.ior is not None:
-            reflected = fresnel.reflectance(dr.abs(cosine), self.ior)
-            u = sampler.next_1d(face)
-            if self.gloss is None:
-                hidden = enters & ~path.from_tooth
-                path.throughput *= dr.select(hidden, 1 - reflected, 1)
-                mirrors = face & ~hidden & (u < reflected)
-            else:
-                shines = enters & (si.wi.z > 0)
-                glossy = shines & (u < reflected)
-                mirrors = face & ~enters & (u < reflected)
-        crosses = meets & (part != 0) & ~mirrors & ~glossy
+    def _collect(self, path: Path, flight: Flight) -> None:
+        """Light that the path has found by itself, on a surface or in the environment."""
+        active = flight.ordinary | (path.active & ~flight.meets & ~flight.scatters)
+        emitter = flight.si.emitter(self.scene, active)
+        there = mi.DirectionSample3f(self.scene, flight.si, path.last)
+        joined = self.scene.pdf_emitter_direction(path.last, there, active & ~path.certain)
+        share = dr.select(path.certain, 1, power(path.density, joined))
+        carried = path.throughput * self.media.share(path.likely)
+        path.radiance += dr.select(active, carried * emitter.eval(flight.si, active) * share, 0)
 
-        # Vertices: a scattering, an ordinary surface, a glossy face.
-        path.throughput *= dr.select(scatters, dr.exp(self.media.pick(self.media.log_alpha, medium)), 1)
+    def _reflect(self, path: Path, flight: Flight, ior: mi.Float) -> None:
+        """What a thin outer face turns back. Without gloss, light from elsewhere shows no mirror image: its loss is a weight."""
+        face, enters = flight.meets & (flight.part == ENAMEL), flight.cosine < 0
+        flight.reflected = fresnel.reflectance(dr.abs(flight.cosine), ior)
+        turned = face & (path.sampler.next_1d(face) < flight.reflected)
+        if self.gloss is None:
+            hidden = enters & ~path.from_tooth
+            path.throughput *= dr.select(face & hidden, 1 - flight.reflected, 1)
+            flight.mirrors = turned & ~hidden
+        else:
+            flight.shines = face & enters & (flight.si.wi.z > 0)
+            flight.glossy = turned & flight.shines
+            flight.mirrors = turned & ~enters
+
+    def _vertex(self, path: Path, flight: Flight) -> mi.Interaction3f:
+        # Of an albedo, 1 - alpha below single precision is lost here, unlike in the walk: a picture does not show 1e-7.
+        path.throughput *= dr.select(flight.scatters, self.media.albedo(self.teeth.medium(path.place)), 1)
         vertex = dr.zeros(mi.Interaction3f)
-        vertex.p = dr.select(scatters, path.ray(distance), si.p)
-        vertex.n = dr.select(scatters, 0, si.n)
+        vertex.p = dr.select(flight.scatters, path.ray(flight.distance), flight.si.p)
+        vertex.n = dr.select(flight.scatters, 0, flight.si.n)
         vertex.time, vertex.wavelengths = path.ray.time, path.ray.wavelengths
-        ends = (scatters | ordinary | glossy) & (path.depth + 1 >= self.max_depth)
-        joined = (scatters | ordinary | shines) & ~ends
+        return vertex
 
-        # Sample an emitter, and what each kind of vertex sends into its direction; sample onward directions.
-        light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(joined), False, joined)
-        phase = PhaseFunction(self.media, medium)
+    def _join_and_turn(self, path: Path, flight: Flight, vertex: mi.Interaction3f, joins: mi.Bool) -> Turn:
+        """Join the vertex to one emitter, and choose where the path goes; stock surfaces do both in one call."""
+        sampler, si, scatters, ordinary = path.sampler, flight.si, flight.scatters, flight.ordinary
+        light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(joins), False, joins)
+
+        # A scattering in a tooth.
+        part = self.teeth.medium(path.place)
         u_lobe = sampler.next_1d(scatters) if self.media.two_lobes else None
-        scattered = phase.density(path.ray.d, light.d)
-        onward = phase.sample(path.ray.d, u_lobe, sampler.next_1d(scatters), sampler.next_1d(scatters))
+        onward = self.media.turn(part, path.leader, path.ray.d, u_lobe, sampler.next_2d(scatters))
+        to_light, to_onward = self.media.phase(part, path.ray.d, light.d), self.media.phase(part, path.ray.d, onward)
+
+        # An ordinary surface.
         value, density, bounce, weight = si.bsdf().eval_pdf_sample(
             mi.BSDFContext(), si, si.to_local(light.d), sampler.next_1d(ordinary), sampler.next_2d(ordinary), ordinary
         )
-        value = dr.select(scatters, mi.Spectrum(scattered), value)
-        density = dr.select(scatters, scattered, density)
-        direction = dr.select(scatters, onward, si.to_world(bounce.wo))
-        chosen = dr.select(scatters, phase.density(path.ray.d, onward), bounce.pdf)
-        weight = dr.select(scatters, mi.Spectrum(1), weight)
+        value = dr.select(scatters, to_light, value)
+        density = dr.select(scatters, self.media.mean(path.likely, to_light), density)
+        turn = Turn(
+            dr.select(scatters, onward, si.to_world(bounce.wo)),
+            dr.select(scatters, self.media.mean(path.likely, to_onward), bounce.pdf),
+            dr.select(scatters, 1, weight),
+            ordinary & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta),
+        )
+
+        # The outside of a glossy face.
         if self.gloss is not None:
-            shine, shine_density = self.gloss.evaluate(si, light.d)
-            value = dr.select(shines, mi.Spectrum(shine), value)
-            density = dr.select(shines, reflected * shine_density, density)
-            image = self.gloss.sample(si, sampler.next_2d(glossy))
-            shine, shine_density = self.gloss.evaluate(si, image)
-            direction = dr.select(glossy, image, direction)
-            chosen = dr.select(glossy, reflected * shine_density, chosen)
-            weight = dr.select(glossy, mi.Spectrum(dr.select(shine_density > 0, shine / (reflected * shine_density), 0)), weight)
+            shine, chance = self.gloss.evaluate(si, light.d)
+            value, density = dr.select(flight.shines, shine, value), dr.select(flight.shines, flight.reflected * chance, density)
+            image = self.gloss.sample(si, sampler.next_2d(flight.glossy))
+            shine, chance = self.gloss.evaluate(si, image)
+            turn.direction = dr.select(flight.glossy, image, turn.direction)
+            turn.density = dr.select(flight.glossy, flight.reflected * chance, turn.density)
+            turn.weight = dr.select(flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), turn.weight)
 
-        # Join; inside a tooth only with a probability in proportion to what the emitter could bring.
-        value = path.throughput * value * brought
+        self._join(path, flight, vertex, light, value * brought, density, joins)
+        path.likely = self.media.rival(path.likely, to_onward, scatters)
+        return turn
+
+    def _join(
+        self, path: Path, flight: Flight, vertex: mi.Interaction3f, light: mi.DirectionSample3f, value: mi.Spectrum, density: mi.Float, joins: mi.Bool
+    ) -> None:
+        # In a tooth only with a probability in proportion to what the emitter could bring.
+        value = path.throughput * self.media.share(path.likely) * value
         chance = dr.clip(CONNECTION_GAIN * dr.max(value) * self.inverse_irradiance, CONNECTION_FLOOR, 1)
-        chance = dr.select(scatters, chance, 1)
-        joined &= (light.pdf > 0) & (dr.max(value) > 0) & (sampler.next_1d(joined) < chance)
-        start = si.spawn_ray(light.d)
-        start.o = dr.select(scatters, vertex.p, start.o)
-        start.maxt = light.dist * (1 - mi.math.ShadowEpsilon)
+        chance = dr.select(flight.scatters, chance, 1)
+        joins &= (light.pdf > 0) & (dr.max(value) > 0) & (path.sampler.next_1d(joins) < chance)
+        line = flight.si.spawn_ray(light.d)
+        line.o = dr.select(flight.scatters, vertex.p, line.o)
+        line.maxt = light.dist * (1 - mi.math.ShadowEpsilon)
         share = dr.select(light.delta, 1, power(light.pdf, density)) / chance
-        path.radiance += dr.select(joined, value * share * self._transmittance(start, path.place, joined), 0)
+        path.radiance += dr.select(joins, value * share * self._transmittance(line, path.place, joins), 0)
 
-        # Go on.
-        turns = scatters | ordinary | glossy
-        direction = dr.select(turns, direction, dr.select(mirrors, path.ray.d - mi.Vector3f(si.n) * (2 * cosine), path.ray.d))
-        place = self.teeth.beyond(path.place, part, cosine)
-        path.place = dr.select(crosses, place, path.place)
-        origin = vertex.p
-        onward_ray = si.spawn_ray(direction)
-        onward_ray.o = dr.select(scatters, origin, onward_ray.o)
-        path.ray = onward_ray
-        path.throughput *= dr.select(turns, weight, 1)
+    def _go_on(self, path: Path, flight: Flight, vertex: mi.Interaction3f, turn: Turn) -> None:
+        turns, mirrors = flight.turns, flight.mirrors
+        crosses = flight.meets & ~turns & ~mirrors
+        path.place = dr.select(crosses, self.teeth.beyond(path.place, flight.part, flight.cosine), path.place)
+        mirrored = path.ray.d - mi.Vector3f(flight.si.n) * (2 * flight.cosine)
+        direction = dr.select(turns, turn.direction, dr.select(mirrors, mirrored, path.ray.d))
+        onward = flight.si.spawn_ray(direction)
+        onward.o = dr.select(flight.scatters, vertex.p, onward.o)
+        path.ray = onward
+        path.throughput *= dr.select(turns, turn.weight, 1)
         path.last = dr.select(turns, vertex, path.last)
-        path.density = dr.select(turns, chosen, path.density)
-        delta = ordinary & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
-        path.certain = dr.select(turns, delta, path.certain | mirrors)
-        path.from_tooth = dr.select(turns, scatters, path.from_tooth)
+        path.density = dr.select(turns, turn.density, path.density)
+        path.certain = dr.select(turns, turn.certain, path.certain | mirrors)
+        path.from_tooth = dr.select(turns, flight.scatters, path.from_tooth)
         path.depth += dr.select(turns, mi.UInt32(1), 0)
-        if self.channels > 1:
-            self._divide(path, crosses)
-
-        # Paths that faded survive in proportion to what they carry.
-        left = dr.max(path.throughput) / ROULETTE_WEIGHT
-        path.active &= ~ends & (left > 0) & (sampler.next_1d(path.active) < left)
-        path.throughput *= dr.select(left < 1, dr.rcp(dr.maximum(left, 1e-20)), 1)
-        return path
-
-    def _divide(self, path: Path, crosses: mi.Bool) -> None:
-        # Media differ per channel: from its first entry on, a path carries one channel for all.
-        divides = crosses & ~path.divided & (path.place != 0)
-        kept = mi.Spectrum([dr.select(path.channel == k, mi.Float(self.channels), 0) for k in range(self.channels)])
-        path.throughput *= dr.select(divides, kept, 1)
-        path.divided |= divides
-
-    def _collect(self, path: Path, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
-        emitter = si.emitter(self.scene, active)
-        there = mi.DirectionSample3f(self.scene, si, path.last)
-        other = self.scene.pdf_emitter_direction(path.last, there, active & ~path.certain)
-        share = dr.select(path.certain, 1, power(path.density, other))
-        path.radiance += dr.select(active, path.throughput * emitter.eval(si, active) * share, 0)
-
-    def _extinction(self, place: mi.UInt32) -> mi.Spectrum:
-        index = self.teeth.medium(place)
-        return mi.Spectrum([dr.select(index == 0, 0, self.media.pick(self.media.sigma, index + self.parts * k)) for k in range(self.channels)])
 
     def _transmittance(self, ray: mi.Ray3f, place: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Of the straight line along ``ray``, through teeth as far as its maxt."""
@@ -273,7 +304,7 @@ class ScenePaths:
             si = found.compute_surface_interaction(shadow.ray, +mi.RayFlags.Minimal, meets)
             part = self.teeth.part(found, meets)
             length = dr.select(meets, found.t, dr.select((shadow.place != 0) & shadow.alive, shadow.ray.maxt, 0))
-            shadow.depth += self._extinction(shadow.place) * length
+            shadow.depth += self.media.extinction(self.teeth.medium(shadow.place)) * length
             cosine = dr.dot(shadow.ray.d, si.n)
             if self.ior is not None:
                 shadow.surface *= dr.select(meets & (part == ENAMEL), 1 - fresnel.reflectance(dr.abs(cosine), self.ior), 1)
