@@ -1,17 +1,14 @@
 """The walk as it would be had it never learnt anything but the plainest tooth: one medium of one lobe, index-matched, images only.
 
-Everything around it (starts, ray tracing, connections to lights, sums) is the engine's own; what is written out here is the state
-that a path carries from step to step and the operations on it. The engine's kernel for such a scene must be no larger.
+Starts, ray tracing, connections to lights and sums are the engine's own; what happens to a path from step to step is written
+out here without a choice left to make. The engine's kernel for such a scene must be no larger, and its images the same bits.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
-from services.fit.transport.border import no_crossing
 from services.fit.transport.engine import Engine
 from services.fit.transport.lights import PointLights
 from services.fit.transport.media import Media, PhaseFunction
@@ -31,79 +28,41 @@ class PlainEngine(Engine):
         return PlainWalk(self._geometry, media, lights, start, plan, None)
 
 
-@dataclass
-class Path:
-    """All that a path of the plain walk carries."""
-
-    rng: mi.PCG32
-    origin: mi.Point3f
-    omega: mi.Vector3f
-    place: mi.UInt32
-    weight: mi.Float
-    reference: mi.Float
-    scatters: mi.UInt32
-    lane: mi.UInt32
-    sample: mi.UInt32
-    active: mi.Bool
-
-
 class PlainWalk(Walk):
-    """Free flights, crossings, connections, turns and roulette, with no choice left to make."""
+    """Free flights, crossings, connections, turns and roulette; of a walker's state only what these need is ever touched."""
 
-    def run(self, samples: int) -> Tally:
-        """Trace ``samples`` paths in every lane; returns their sums, evaluated."""
-        tally = Tally(self.start.lanes, self.slots, 0)
-        limit, lane = dr.opaque(mi.UInt32, samples), dr.arange(mi.UInt32, self.start.lanes)
-        path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
-        first = Path(
-            path.rng, path.origin, path.omega, path.place, path.weight, mi.Float(path.weight), mi.UInt32(0), lane, mi.UInt32(0), lane < self.start.lanes
-        )  # fmt: skip
-        dr.while_loop((first,), lambda path: path.active, lambda path: (self._advance(path, tally, limit),), label="plain walk")
-        tally.evaluate()
-        return tally
-
-    def _advance(self, path: Path, tally: Tally, limit: mi.UInt32) -> Path:
+    def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
         # Fly to a scattering or to the surface.
         geometry = self.geometry
-        medium = path.place & 1
+        medium = walker.place & 1
         sigma = dr.select(medium == 0, 0, self.media.sigma[0])
-        distance = dr.select(sigma > 0, minus_log1m(path.rng.next_float32()) / sigma, dr.inf)
-        traced = path.active & (distance >= geometry.clearance(path.origin, path.active & (medium != 0)))
-        hit = geometry.intersect(path.origin, path.omega, path.place, traced)
-        scatters = path.active & (distance < hit.distance) & (hit.valid | ~traced)
-        crosses = path.active & ~scatters & hit.valid
-        beyond = geometry.advance(path.origin, path.omega, hit, crosses)
-        path.origin = dr.select(scatters, dr.fma(path.omega, distance, path.origin), dr.select(crosses, beyond, path.origin))
-        path.place = dr.select(crosses, geometry.beyond(path.place, path.omega, hit), path.place)
-        path.scatters = dr.select(scatters & (medium == 1), path.scatters + 1, path.scatters)
+        distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
+        traced = walker.active & (distance >= geometry.clearance(walker.origin, walker.active & (medium != 0)))
+        hit = geometry.intersect(walker.origin, walker.omega, walker.place, traced)
+        scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
+        crosses = walker.active & ~scatters & hit.valid
+        beyond = geometry.advance(walker.origin, walker.omega, hit, crosses)
+        walker.origin = dr.select(scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin))
+        walker.place = dr.select(crosses, geometry.beyond(walker.place, walker.omega, hit), walker.place)
+        walker.counts = [dr.select(scatters & (medium == 1), walker.counts[0] + 1, walker.counts[0])]
 
         # Connect to the lights, then turn.
-        connecting = self._as_walker(path)
-        self._connect(connecting, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False)), tally)
-        path.rng = connecting.rng
-        onward = PhaseFunction(self.media, medium).sample(path.omega, None, path.rng.next_float32(), path.rng.next_float32())
-        path.omega = dr.select(scatters, onward, path.omega)
+        self._connect(walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False)), tally)
+        onward = PhaseFunction(self.media, medium).sample(walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32())
+        walker.omega = dr.select(scatters, onward, walker.omega)
 
         # Faint paths survive in proportion to what they carry.
-        share = path.weight * dr.exp(mi.Float(path.scatters) * self.media.log_alpha[0]) / (ROULETTE_WEIGHT * path.reference)
-        faded = (share < 1) & (path.rng.next_float32() >= share)
-        path.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
-        return self._next(path, path.active & ((~scatters & ~crosses) | faded), limit)
+        share = walker.weight * dr.exp(mi.Float(walker.counts[0]) * self.media.log_alpha[0]) / (ROULETTE_WEIGHT * walker.reference)
+        faded = (share < 1) & (walker.rng.next_float32() >= share)
+        walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
+        ended = walker.active & ((~scatters & ~crosses) | faded)
 
-    def _as_walker(self, path: Path) -> Walker:
-        nothing: list[mi.Float] = []
-        return Walker(
-            path.rng, path.origin, path.omega, path.place, path.weight, path.reference, [path.scatters], [], nothing, nothing, no_crossing(0),
-            mi.Bool(False), nothing, path.lane, path.sample, path.active,
-        )  # fmt: skip
+        def renew(walker: Walker, ended: mi.Bool) -> Walker:
+            walker.sample = walker.sample + 1
+            fresh = self.start.begin(walker.lane, walker.sample, ended)
+            walker.rng, walker.origin, walker.omega, walker.place = fresh.rng, fresh.origin, fresh.omega, fresh.place
+            walker.weight, walker.reference, walker.counts = fresh.weight, mi.Float(fresh.weight), [mi.UInt32(0)]
+            walker.active = walker.sample < limit
+            return walker
 
-    def _next(self, path: Path, ended: mi.Bool, limit: mi.UInt32) -> Path:
-        def renew(path: Path, ended: mi.Bool) -> Path:
-            path.sample = path.sample + 1
-            fresh = self.start.begin(path.lane, path.sample, ended)
-            path.rng, path.origin, path.omega, path.place = fresh.rng, fresh.origin, fresh.omega, fresh.place
-            path.weight, path.reference, path.scatters = fresh.weight, mi.Float(fresh.weight), mi.UInt32(0)
-            path.active = path.sample < limit
-            return path
-
-        return dr.if_stmt((path, ended), ended, renew, lambda path, _: path, label="next sample")
+        return dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
