@@ -3,47 +3,65 @@
 from __future__ import annotations
 
 import multiprocessing
+from dataclasses import fields
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from services.core.records import Boundary
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View
-from tests.support.render_once import NAMES, TISSUE, picture, render_into
+from tests.support.render_once import NAMES, TISSUE, Picture, picture, render_into
 from tests.support.small_tooth import camera_at, recipe, whole_view
 
-Picture = tuple[NDArray[np.float64], NDArray[np.float64]]
+BOUNDARIES: tuple[Boundary, ...] = ("matched", "thin")
 
 
-def picture_of_another_process(threads: int) -> Picture:
+def picture_of_another_process(threads: int, boundary: Boundary) -> Picture:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=render_into, args=(theirs, threads))
+    process = context.Process(target=render_into, args=(theirs, threads, boundary))
     process.start()
     theirs.close()
     try:
-        result: Picture = ours.recv()
+        used, result = ours.recv()
     finally:
         process.join(60)
     assert process.exitcode == 0
+    assert used == threads
+    assert isinstance(result, Picture)
     return result
 
 
-def test_a_scene_built_twice_gives_the_same_bits() -> None:
-    first, second = picture(Engine(recipe("thin"))), picture(Engine(recipe("thin")))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-    assert np.abs(first[0]).sum() > 0
-    assert (np.abs(first[1]).sum(axis=(1, 2)) > 0).all()
+def require_same_bits(first: Picture, second: Picture) -> None:
+    for field in fields(Picture):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name), err_msg=field.name)
 
 
-def test_processes_and_thread_counts_agree() -> None:
-    one, again, two = (picture_of_another_process(threads) for threads in (1, 1, 2))
-    np.testing.assert_array_equal(one[0], again[0])
-    np.testing.assert_array_equal(one[1], again[1])
-    assert np.linalg.norm(two[0] - one[0]) <= 1e-5 * np.linalg.norm(one[0])
-    for ours, theirs in zip(two[1], one[1], strict=True):
-        assert np.linalg.norm(ours - theirs) <= 1e-4 * np.linalg.norm(theirs)
+def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Relative to the norm."""
+    return float(np.linalg.norm(first - second) / np.linalg.norm(second))
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+def test_a_scene_built_twice_gives_the_same_bits(boundary: Boundary) -> None:
+    first, second = picture(Engine(recipe(boundary))), picture(Engine(recipe(boundary)))
+    require_same_bits(first, second)
+    assert (first.image.sum(axis=1) > 0).all()
+    assert (np.abs(first.jacobian).sum(axis=(1, 2)) > 0).all()
+    assert (first.orders.sum(axis=(1, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+def test_processes_and_thread_counts_agree(boundary: Boundary) -> None:
+    one, one_again, two, two_again = (picture_of_another_process(threads, boundary) for threads in (1, 1, 2, 2))
+    require_same_bits(one, one_again)
+    require_same_bits(two, two_again)
+    assert distance(two.image, one.image) <= 1e-5
+    assert distance(two.orders, one.orders) <= 1e-5
+    for ours, theirs in zip(two.jacobian, one.jacobian, strict=True):
+        assert distance(ours, theirs) <= 1e-4
 
 
 def test_blocks_do_not_change_a_pixel() -> None:

@@ -1,12 +1,14 @@
-"""Run in a fresh process: build the small tooth's engine and print a digest of its image and derivatives, with their values."""
+"""Run in a fresh process: build the small tooth's engine and send back its images and derivatives."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from tests.support.small_tooth import camera_at, recipe, whole_view
@@ -15,14 +17,32 @@ NAMES = ("enamel.sigma", "dentin.alpha", "enamel.g1", "shape.0")
 TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3), (0.5, 0.4))
 
 
-def picture(engine: Engine) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Image (L, N) and derivatives (F, L, N) of a fixed seed."""
-    view = whole_view(camera_at((0.2, 1, 0.1)))
-    image = engine.images(TISSUE, view, samples=64, seed=5).mean
-    return image, engine.jacobian(TISSUE, view, NAMES, samples=64, seed=6).jacobian
+@dataclass(frozen=True)
+class Picture:
+    """What a scene gives for fixed seeds."""
+
+    image: NDArray[np.float64]
+    """(L, N)"""
+    variance: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    """(F, L, N)"""
+    orders: NDArray[np.float64]
+    """(K, L, N)"""
 
 
-def render_into(connection: Connection, threads: int) -> None:
-    """Send ``picture`` of an engine with this many threads."""
-    connection.send(picture(Engine(recipe("thin"), threads)))
+def picture(engine: Engine) -> Picture:
+    """Render 16 x 16 pixels: 4,096 lanes, which Dr.Jit splits over its threads."""
+    view = whole_view(camera_at((0.2, 1, 0.1), size=16))
+    image = engine.images(TISSUE, view, samples=32, seed=5)
+    jacobian = engine.jacobian(TISSUE, view, NAMES, samples=32, seed=6, batches=16)
+    orders = engine.order_images(TISSUE, view, bin_edges=np.array([0, 2, 8, 64]), samples=16, seed=7, batches=16)
+    return Picture(image.mean, image.variance, jacobian.jacobian, orders)
+
+
+def render_into(connection: Connection, threads: int, boundary: Boundary) -> None:
+    """Send the number of threads in use, and ``picture`` of an engine built with so many."""
+    import drjit as dr
+
+    result = picture(Engine(recipe(boundary), threads))
+    connection.send((dr.thread_count(), result))
     connection.close()
