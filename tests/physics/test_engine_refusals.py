@@ -27,6 +27,7 @@ TISSUE = Tissue(Medium(2, 0.9, 0.9, 0.6, -0.2), Medium(4, 0.8), (0.5, 0.4))
 
 FORBIDDEN = [
     ("sigma", 0.0, "0"), ("sigma", -3.0, "-3"), ("sigma", math.inf, "inf"), ("sigma", math.nan, "nan"),
+    ("sigma", 1e39, "1e+39"), ("sigma", 1e-50, "1e-50"), ("g1", 0.999999999, "0.999999999"), ("g2", -0.999999999, "-0.999999999"),
     ("alpha", -0.1, "-0.1"), ("alpha", 1.001, "1.001"), ("alpha", math.nan, "nan"),
     ("beta", -0.2, "-0.2"), ("beta", 1.5, "1.5"),
     ("g1", 1.0, "1"), ("g1", -1.0, "-1"), ("g2", 1.7, "1.7"), ("g2", -math.inf, "-inf"),
@@ -70,7 +71,7 @@ def test_a_tissue_out_of_range_is_refused(engine: Engine, no_kernel: None, part:
         require_sentence(caught.value, f"{part}.{field} = {shown} ")
 
 
-@pytest.mark.parametrize("shape", [(), (0.5,), (0.5, math.nan)])
+@pytest.mark.parametrize("shape", [(), (0.5,), (0.5, math.nan), (-0.5, 0.5), (0.2, 1.01), (math.inf, 0.0)])
 def test_blend_weights_that_do_not_fit_are_refused(engine: Engine, no_kernel: None, shape: tuple[float, ...]) -> None:
     with pytest.raises(InputError) as caught:
         engine.images(replace(TISSUE, shape=shape), whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
@@ -118,6 +119,20 @@ def with_light(number: int, *, intensity: float = 1.0, position: tuple[float, fl
     positions, intensities = LIGHTS_MM.copy(), np.ones(len(LIGHTS_MM))
     positions[number], intensities[number] = position, intensity
     return replace(recipe(), light_positions_mm=positions, light_intensities=intensities)
+
+
+def test_dentin_that_breaks_through_the_enamel_is_refused() -> None:
+    scene = recipe()
+    assert scene.dentin is not None
+    base = scene.dentin.base
+    aside, larger = Mesh(base.vertices_mm + np.array([1.0, 0, 0]), base.faces), Mesh(base.vertices_mm * 1.2, base.faces)
+    # One cusp of an otherwise nested surface.
+    top = np.argmax(base.vertices_mm[:, 2])
+    spike = Mesh(base.vertices_mm + 0.5 * np.eye(3)[2] * (np.arange(len(base.vertices_mm)) == top)[:, None], base.faces)
+    for mesh in (aside, larger, spike):
+        with pytest.raises(MeshError) as caught:
+            Engine(replace(scene, dentin=replace(scene.dentin, base=mesh)))
+        require_sentence(caught.value, "dentin surface", "outer surface", "mm")
 
 
 def test_lights_that_give_no_light_are_refused() -> None:

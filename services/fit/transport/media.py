@@ -16,23 +16,24 @@ from services.fit.optics.parameters import Medium
 
 
 def require_medium(name: str, medium: Medium) -> None:
-    """Refuse parameters outside their physical range, before any kernel.
+    """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, where they must lie inside it too.
 
     Raises:
         InputError: names parameter and value.
     """
     for field, low, high, rule in (
-        ("sigma", 0.0, math.inf, "must be positive, per mm"),
+        ("sigma", 0.0, math.inf, "must be positive and finite in single precision, per mm"),
         ("alpha", 0.0, 1.0, "must lie in 0 to 1"),
         ("beta", 0.0, 1.0, "must lie in 0 to 1"),
-        ("g1", -1.0, 1.0, "must lie between -1 and 1, ends excluded"),
-        ("g2", -1.0, 1.0, "must lie between -1 and 1, ends excluded"),
+        ("g1", -1.0, 1.0, "must lie between -1 and 1 in single precision, ends excluded"),
+        ("g2", -1.0, 1.0, "must lie between -1 and 1 in single precision, ends excluded"),
     ):
         value = getattr(medium, field)
         closed = field in {"alpha", "beta"}
-        inside = low <= value <= high if closed else low < value < high
-        if not math.isfinite(value) or not inside:
-            raise InputError(f"{name}.{field} = {value:g} {rule}; correct it.")
+        with np.errstate(over="ignore"):
+            rounded = float(np.float32(value))
+        if not all(math.isfinite(v) and (low <= v <= high if closed else low < v < high) for v in (value, rounded)):
+            raise InputError(f"{name}.{field} = {value:.10g} {rule}; correct it.")
 
 
 @dataclass(frozen=True)
