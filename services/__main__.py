@@ -273,6 +273,7 @@ def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
 _BENCHMARKS = MappingProxyType(
     {
         "slab": "services.fit.bench.slab:run",
+        "stability": "services.fit.bench.stability:run",
         "transport-skip": "services.fit.bench.transport_skip:run",
         "transport-stack": "services.fit.bench.transport_stack:run",
     }

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from services.core.errors import InputError, NonFiniteError
@@ -178,7 +178,7 @@ def accumulate(
     geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
     media = Media([_medium(layer) for layer in layers])
     plan = Plan(scores=tuple(Score(*score) for score in scores), shape=border, faces=True, bend=boundary == "smooth")
-    sums = Sums(1 + len(scores) + border, _specular(ior, source))
+    sums = Sums(1 + len(scores) + border, float(specular_share(ior, source)))
     spread = np.array([_spread_of_border(layers, score) for score in scores])
     from_scores: bool | None = False if border_terms_only or not border else None
     begun_s = time.monotonic()
@@ -247,16 +247,18 @@ def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> floa
     return (1 if number == 1 else -1) * layer.sigma / layer.thickness_mm if name == "sigma" else 0.0
 
 
-def _specular(ior: float, source: str) -> float:
-    """Share of the incident flux that the lit face reflects; Lambertian light by Gauss-Legendre in float64."""
+def specular_share(ior: ArrayLike, source: str) -> NDArray[np.float64]:
+    """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre in float64."""
+    eta = np.asarray(ior, dtype=np.float64)
     if source == "normal":
-        return ((ior - 1) / (ior + 1)) ** 2
+        return ((eta - 1) / (eta + 1)) ** 2
+    eta = eta[..., None]
     nodes, weights = np.polynomial.legendre.leggauss(400)
     cosine = 0.5 * (nodes + 1)
-    transmitted = np.sqrt(1 - (1 - cosine**2) / ior**2)
-    s = (cosine - ior * transmitted) / (cosine + ior * transmitted)
-    p = (ior * cosine - transmitted) / (ior * cosine + transmitted)
-    return float(np.sum(weights * cosine * 0.5 * (s**2 + p**2)))
+    transmitted = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    s = (cosine - eta * transmitted) / (cosine + eta * transmitted)
+    p = (eta * cosine - transmitted) / (eta * cosine + transmitted)
+    return np.asarray(np.sum(weights * cosine * 0.5 * (s**2 + p**2), axis=-1))
 
 
 def _pass_seed(seed: int, number: int) -> int:

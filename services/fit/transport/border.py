@@ -110,9 +110,9 @@ class BorderScattering:
         return self._sides(direction)[0] + self._sides(direction)[1]
 
     def balance(self, direction: mi.Vector3f) -> mi.Float:
-        """(sigma_s,A f_A - sigma_s,B f_B) / (sigma_s,A f_A + sigma_s,B f_B), -1 to 1."""
+        """(sigma_s,A f_A - sigma_s,B f_B) / (sigma_s,A f_A + sigma_s,B f_B), -1 to 1; 0 where neither side scatters."""
         a, b = self._sides(direction)
-        return (a - b) / (a + b)
+        return dr.select(a + b > 0, (a - b) / (a + b), 0)
 
     def _sides(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         omega = self.crossing.omega

@@ -1,0 +1,196 @@
+"""The kernels' formulas in single precision, and the fit's domains in double, against independent forms in NumPy float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.bench.corners import REGIONS, SMOOTH, Corners
+from services.fit.optics import fresnel, phase
+from services.fit.optics.domain import BOUNDS, natural_derivative, to_dual, to_natural
+from services.fit.transport.media import Media
+from services.fit.transport.walk import minus_log1m, one_minus_exp
+
+Floats = NDArray[np.float64]
+ROUNDING = 2.0**-24
+"""Half a unit in the last place of single precision."""
+DARK = 40.0
+"""Optical depth, and exponent of the albedos, past which nothing is left to compare."""
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula, how its error is measured, and how large it may be."""
+
+    name: str
+    relative_error: Callable[[Corners, np.random.Generator], Floats]
+    """(N,) for the sets, each at one random argument."""
+    bound: float
+    reason: str
+    """Where the bound comes from."""
+
+
+def kernel(function: Callable[..., Any], *columns: Floats) -> Floats:
+    """Values of a kernel function; the arguments must be representable in single precision."""
+    return np.array(function(*(mi.Float(column.astype(np.float32)) for column in columns)), dtype=np.float64)
+
+
+def single(values: Floats) -> Floats:
+    """Rounded to single precision, what a kernel is given."""
+    return values.astype(np.float32).astype(np.float64)
+
+
+def _deviations(corners: Corners, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Mean cosine of the first layer's first lobe, and deviations 1 - sign(g) cos(theta) from its tip to straight behind."""
+    g = single(corners.g1[0])
+    return g, single(np.minimum((1 - np.abs(g)) ** 2 * 10.0 ** rng.uniform(-3, 9, len(g)), 2.0))
+
+
+def _lobe(g: Floats, m: Floats) -> tuple[Floats, Floats, Floats]:
+    """|g|, 1 + g^2 - 2 |g| (1 - m) and the Henyey-Greenstein value there."""
+    a = np.abs(g)
+    d = (1 - a) ** 2 + 2 * a * m
+    return a, d, (1 - a**2) / (4 * np.pi * d**1.5)
+
+
+def phase_density(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Relative to the value."""
+    g, m = _deviations(corners, rng)
+    truth = _lobe(g, m)[2]
+    return np.abs(kernel(phase.density, g, m) / truth - 1)
+
+
+def phase_score(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Relative to the size of the two terms, whose difference passes through zero."""
+    g, m = _deviations(corners, rng)
+    a, d, _ = _lobe(g, m)
+    truth = np.copysign(1.0, g) * (-2 * a / (1 - a**2) + 3 * (1 - a - m) / d)
+    size = 2 * a / (1 - a**2) + 3 * (1 - a + m) / d
+    return np.abs(kernel(phase.score_g, g, m) - truth) / size
+
+
+def phase_sampling(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Of the sampled deviation, through the distribution that it should invert."""
+    g = single(corners.g1[0])
+    u = single(np.where(rng.random(len(g)) < 0.5, rng.random(len(g)), 1 - 10.0 ** rng.uniform(-7, 0, len(g))))
+    u = np.minimum(u, 1 - ROUNDING)
+    m = kernel(phase.sample_deviation, g, u)
+    a, d, value = _lobe(g, m)
+    root = np.sqrt(d)
+    below = (1 + a) * m / (root * (root + 1 - a))
+    return np.abs(below - (1 - u)) / (2 * np.pi * value * np.maximum(m, 1e-300))
+
+
+def fresnel_reflectance(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Relative; next to the critical angle, to what one rounding of the index changes."""
+    eta = single(np.where(corners.boundary == SMOOTH, 1 / corners.ior, corners.ior))
+    cosine = single(np.where(rng.random(len(eta)) < 0.5, rng.random(len(eta)), 10.0 ** rng.uniform(-6, 0, len(eta))))
+
+    def truth(eta: Floats) -> Floats:
+        beyond = np.sqrt((1 - (1 - cosine**2) / eta**2).astype(complex))
+        s, p = (cosine - eta * beyond) / (cosine + eta * beyond), (eta * cosine - beyond) / (eta * cosine + beyond)
+        return (np.abs(s) ** 2 + np.abs(p) ** 2) / 2
+
+    right = truth(eta)
+    steepness = np.abs(truth(eta * (1 + ROUNDING)) - truth(eta * (1 - ROUNDING))) / ROUNDING
+    differs = eta != 1
+    return np.abs(kernel(fresnel.reflectance, cosine, eta) - np.where(differs, right, 0)) / np.where(differs, right + steepness, 1)
+
+
+def _depths(corners: Corners) -> Floats:
+    """Optical depths of the first layer."""
+    return single(corners.sigma[0] * corners.width_mm[0])
+
+
+def collision(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: ARG001 - all formulas are called alike
+    """1 - exp(-depth), relative."""
+    depth = _depths(corners)
+    return np.abs(kernel(one_minus_exp, depth) / -np.expm1(-depth) - 1)
+
+
+def free_flight(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Optical depth flown before a collision that is forced to happen within the layer, relative."""
+    chance = single(-np.expm1(-_depths(corners)) * single(rng.random(len(corners))))
+    chance = np.clip(chance, 1e-30, 1 - ROUNDING)
+    return np.abs(kernel(minus_log1m, chance) / -np.log1p(-chance) - 1)
+
+
+def transmittance(corners: Corners, rng: np.random.Generator) -> Floats:
+    """Through both layers, relative; rays deeper than ``DARK`` are ended."""
+    lengths = [single(width / rng.uniform(0.01, 1, len(corners))) for width in corners.width_mm]
+    sigma = [single(values) for values in corners.sigma]
+    depth = sigma[0] * lengths[0] + sigma[1] * lengths[1]
+    ours = kernel(lambda a, b, c, d: dr.exp(-dr.fma(c, d, a * b)), sigma[0], lengths[0], sigma[1], lengths[1])
+    return np.where(depth < DARK, np.abs(ours / np.exp(-np.minimum(depth, DARK)) - 1), 0)
+
+
+def albedo_power(corners: Corners, rng: np.random.Generator) -> Floats:
+    """What absorption leaves after 1 to 1e7 scatterings, relative; no path is kept that carries less than exp(-``DARK``)."""
+    count = np.floor(10.0 ** rng.uniform(0, 7, len(corners)))
+    log_alpha = Media(corners.media()).log_alpha[0]
+    ours = np.array(dr.exp(mi.Float(count.astype(np.float32)) * log_alpha), dtype=np.float64)
+    absorbed = corners.absorbed[0]
+    exponent = single(count) * np.where(absorbed < 1, np.log1p(-np.minimum(absorbed, 0.999999999)), -np.inf)
+    return np.where(exponent > -DARK, np.abs(ours / np.exp(np.maximum(exponent, -DARK)) - 1), 0)
+
+
+def dual_domain(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: ARG001 - all formulas are called alike
+    """Fit coordinates there and back, and their chain-rule factors, relative; values outside the fit's bounds are clipped to them."""
+    worst = np.zeros(len(corners))
+    values = {"sigma": corners.sigma[0], "alpha": 1 - corners.absorbed[0], "g1": corners.g1[0], "beta": corners.beta[0]}
+    for kind, natural in values.items():
+        low, high = BOUNDS[kind]
+        x = np.array([to_dual(kind, value) for value in natural.tolist()])
+        back = np.array([to_natural(kind, value) for value in x.tolist()])
+        slope = np.array([natural_derivative(kind, value) for value in x.tolist()])
+        truth, slope_truth = _dual_truth(kind, x)
+        inside = (x > low) & (x < high)
+        for ours, right in ((back, truth), (slope, slope_truth), (np.where(inside, back, natural), natural)):
+            worst = np.maximum(worst, np.abs(ours - right) / np.maximum(np.abs(right), 1e-300))
+    return worst
+
+
+def _dual_truth(kind: str, x: Floats) -> tuple[Floats, Floats]:
+    """Natural values and their derivatives to x, written without the hyperbolic and logistic functions."""
+    small = np.exp(-(2 if kind == "g1" else 1) * np.abs(x))
+    if kind == "sigma":
+        return np.exp(x), np.exp(x)
+    if kind == "alpha":
+        absorbed = np.exp2(-x * np.log2(10.0))
+        return 1 - absorbed, np.log(10.0) * absorbed
+    if kind == "g1":
+        return np.copysign(-np.expm1(-2 * np.abs(x)) / (1 + small), x), 4 * small / (1 + small) ** 2
+    return np.where(x < 0, small, 1.0) / (1 + small), small / (1 + small) ** 2
+
+
+FORMULAS = (
+    Formula("phase density", phase_density, 20 * ROUNDING, "a dozen roundings, one of them to the power 3/2"),
+    Formula("phase score", phase_score, 20 * ROUNDING, "a dozen roundings"),
+    Formula("phase sampling", phase_sampling, 20 * ROUNDING, "a dozen roundings"),
+    Formula("Fresnel", fresnel_reflectance, 20 * ROUNDING, "a dozen roundings"),
+    Formula("1 - exp(-x)", collision, 40 * ROUNDING, "2 roundings of exp, magnified 20-fold at x = 0.05 where the series ends"),
+    Formula("-log(1 - p)", free_flight, 100 * ROUNDING, "1 rounding of 1 - p and 1 of log, magnified 50-fold at p = 0.02 where the series ends"),
+    Formula("transmittance", transmittance, 3 * DARK * ROUNDING, "3 roundings of a depth of up to 40"),
+    Formula("albedo power", albedo_power, 3 * DARK * ROUNDING, "3 roundings of an exponent of up to 40"),
+    Formula("dual domain", dual_domain, 20 * 2.0**-53 * np.log(1e16), "float64: a dozen roundings of numbers and of exponents up to 16 ln 10"),
+)
+
+
+def worst_by_region(corners: Corners, seed: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Worst relative errors of the finite values, and how many values are not finite, both (formulas, regions)."""
+    rng = np.random.default_rng(seed)
+    worst, broken = np.zeros((len(FORMULAS), len(REGIONS))), np.zeros((len(FORMULAS), len(REGIONS)), dtype=np.int64)
+    for row, formula in enumerate(FORMULAS):
+        error = formula.relative_error(corners, rng)
+        finite = np.isfinite(error)
+        for column in range(len(REGIONS)):
+            here = corners.region == column
+            worst[row, column] = np.max(error[here & finite], initial=0)
+            broken[row, column] = np.count_nonzero(here & ~finite)
+    return worst, broken

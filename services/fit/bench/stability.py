@@ -1,0 +1,158 @@
+"""Numerical stress: parameter sets from the corners as lanes of one kernel, formulas against float64, and difficult scenes.
+
+Every set is a slab of two layers with its own media, thicknesses, faces and source, traced with all derivatives on. Paths end
+after so many flights; what they still carried is reported.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.bench import Row
+from services.fit.bench.corners import REGIONS, SMOOTH, Corners, draw
+from services.fit.bench.formula_errors import FORMULAS, worst_by_region
+from services.fit.optics import fresnel
+from services.fit.optics.parameters import MEDIUM_FIELDS
+from services.fit.slab.simulate import specular_share
+from services.fit.transport.geometry import SlabGeometry
+from services.fit.transport.media import Media, Score
+from services.fit.transport.platform import prepare_device
+from services.fit.transport.starts import PathStart, SlabStart, stream
+from services.fit.transport.walk import Plan, Walk
+
+PATHS = 64
+WHITE = "alpha = 1"
+"""The sets without any absorption, whose light must all come back; they are among those of other regions too."""
+
+
+class StabilityRow(Row):
+    """One region of parameter space. ``error`` is the worst relative error of a formula, or the standard error of a region's R + T."""
+
+    region: str
+    quantity: str
+    sets: int
+    non_finite: int
+    """Numbers that came out NaN or infinite."""
+    bound: float | None = None
+    """What ``error`` may be."""
+    cut: float | None = None
+    """Share of the light that enters which was still under way when paths were cut short."""
+    gain: float | None = None
+    """R + T + cut less what entered, per incident flux; never above zero but for its error, and zero in white sets."""
+
+
+class LaneStart(SlabStart):
+    """Walks into slabs that differ from lane to lane in source and faces."""
+
+    def __init__(self, corners: Corners, seed: int) -> None:
+        self.lanes, self.seed = len(corners), dr.opaque(mi.UInt32, seed)
+        self.ior = mi.Float(corners.ior.astype(np.float32))
+        self.normal = mi.Bool(~corners.diffuse)
+        self.bends = mi.Bool(corners.boundary == SMOOTH)
+
+    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
+        """As ``SlabStart``."""
+        rng = stream(self.seed, lane, sample)
+        cosine = dr.select(self.normal, 1, dr.sqrt(1 - rng.next_float32()))
+        inside = dr.select(self.bends, dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)), cosine)
+        omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)
+        return PathStart(rng, mi.Point3f(0), omega, mi.UInt32(1), 1 - fresnel.reflectance(cosine, self.ior))
+
+
+@dataclass(frozen=True)
+class LaneTotals:
+    """Per incident flux: (N, 3) reflected, transmitted and cut short; (F, N, 2) derivatives of the first two."""
+
+    totals: NDArray[np.float64]
+    derivatives: NDArray[np.float64]
+
+    def non_finite(self) -> NDArray[np.int64]:
+        """Numbers of each set that are NaN or infinite, (N,)."""
+        return np.asarray(np.count_nonzero(~np.isfinite(self.totals), axis=1) + np.count_nonzero(~np.isfinite(self.derivatives), axis=(0, 2)))
+
+
+def stress_plan(most_steps: int) -> Plan:
+    """Everything a slab kernel can have: all scores of both layers, the moving border, faces."""
+    return Plan(scores=tuple(Score(k, field) for k in (1, 2) for field in MEDIUM_FIELDS), shape=True, faces=True, most_steps=most_steps)
+
+
+def trace(corners: Corners, *, paths: int, most_steps: int, seed: int) -> LaneTotals:
+    """All sets at once, one lane each."""
+    geometry = SlabGeometry(tuple(corners.width_mm), moving_border=True)
+    walk = Walk(geometry, Media(corners.media()), None, LaneStart(corners, seed), stress_plan(most_steps), 1.0)
+    # A smooth face seen from within is a face of index 1 / n: so one kernel serves all three kinds.
+    ior = mi.Float(corners.ior.astype(np.float32))
+    walk.ior = dr.select(mi.Bool(corners.boundary == SMOOTH), dr.rcp(ior), ior)
+    totals, derivatives = walk.run(paths).arrays()
+    return LaneTotals(totals / paths, np.stack(derivatives)[:, :, :2] / paths)
+
+
+def run(*, quick: bool) -> list[dict[str, Any]]:
+    """Rows of formulas by region, of the walk by region, and of difficult scenes; the tables go to standard error."""
+    prepare_device()
+    corners = draw(2200 if quick else 12_100, seed=1)
+    rows = formula_rows(corners) + walk_rows(corners, most_steps=256 if quick else 16_384)
+    print(as_table(rows), file=sys.stderr)
+    return [row.model_dump() for row in rows]
+
+
+def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:
+    """Worst relative error of every formula in every region."""
+    begun = time.perf_counter()
+    worst, broken = worst_by_region(corners, seed)
+    seconds = (time.perf_counter() - begun) / worst.size
+    return [
+        StabilityRow(
+            benchmark="stability-formula", peer="dentine", seconds=seconds, error=worst[row, column], bound=formula.bound,
+            region=region, quantity=formula.name, sets=int(np.count_nonzero(corners.region == column)), non_finite=int(broken[row, column]),
+        )
+        for row, formula in enumerate(FORMULAS) for column, region in enumerate(REGIONS)
+    ]  # fmt: skip
+
+
+def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[StabilityRow]:
+    """Energy, cut energy and broken numbers of the walk in every region, white sets also by themselves."""
+    begun = time.perf_counter()
+    lanes = trace(corners, paths=PATHS, most_steps=most_steps, seed=seed)
+    seconds = time.perf_counter() - begun
+    entering = 1 - np.where(corners.diffuse, specular_share(corners.ior, "diffuse"), specular_share(corners.ior, "normal"))
+    bad = lanes.non_finite()
+    rows = []
+    for region, here in _parts(corners):
+        totals = lanes.totals[here & (bad == 0)]
+        gain = totals.sum(axis=1) - entering[here & (bad == 0)]
+        rows.append(
+            StabilityRow(
+                benchmark="stability-walk", peer="dentine", seconds=seconds * here.mean(), error=float(gain.std() / np.sqrt(len(gain)) / entering[here].mean()),
+                region=region, quantity="R + T", sets=int(here.sum()), non_finite=int(bad[here].sum()),
+                cut=float(totals[:, 2].mean() / entering[here].mean()), gain=float(gain.mean()),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _parts(corners: Corners) -> list[tuple[str, NDArray[np.bool_]]]:
+    white = (corners.absorbed == 0).all(axis=0)
+    return [(name, np.asarray(corners.region == k)) for k, name in enumerate(REGIONS)] + [(WHITE, np.asarray(white))]
+
+
+def as_table(rows: list[StabilityRow]) -> str:
+    """Two tables: worst relative error by region and formula, and what the walk did in each region."""
+    formulas = [row for row in rows if row.benchmark == "stability-formula"]
+    names = list(dict.fromkeys(row.quantity for row in formulas))
+    lines = ["| region | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines += [
+        f"| {region} | " + " | ".join(f"{row.error:.1e}" for row in formulas if row.region == region) + " |"
+        for region in dict.fromkeys(row.region for row in formulas)
+    ]
+    lines += ["", "| region | sets | not finite | cut short | R + T + cut - entering |", "|---|---|---|---|---|"]
+    lines += [f"| {row.region} | {row.sets} | {row.non_finite} | {row.cut:.1e} | {row.gain:+.1e} |" for row in rows if row.benchmark == "stability-walk"]
+    return "\n".join(lines)
