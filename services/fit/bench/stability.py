@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from services.fit.bench import Row
 from services.fit.bench.corners import REGIONS, SMOOTH, Corners, draw
+from services.fit.bench.difficult_scenes import look, scenes
 from services.fit.bench.formula_errors import FORMULAS, worst_by_region
 from services.fit.optics import fresnel
 from services.fit.optics.parameters import MEDIUM_FIELDS
@@ -34,7 +35,7 @@ WHITE = "alpha = 1"
 
 
 class StabilityRow(Row):
-    """One region of parameter space. ``error`` is the worst relative error of a formula, or the standard error of a region's R + T."""
+    """One region of parameter space, or one scene. ``error`` is a formula's worst relative error, else the relative standard error of the result."""
 
     region: str
     quantity: str
@@ -47,6 +48,12 @@ class StabilityRow(Row):
     """Share of the light that enters which was still under way when paths were cut short."""
     gain: float | None = None
     """R + T + cut less what entered, per incident flux; never above zero but for its error, and zero in white sets."""
+    gain_error: float | None = None
+    """Standard error of ``gain``."""
+    negative: int | None = None
+    """Radiances below zero."""
+    z: float | None = None
+    """Difference of a scene from one that must look alike, in standard errors."""
 
 
 class LaneStart(SlabStart):
@@ -99,7 +106,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
     """Rows of formulas by region, of the walk by region, and of difficult scenes; the tables go to standard error."""
     prepare_device()
     corners = draw(2200 if quick else 12_100, seed=1)
-    rows = formula_rows(corners) + walk_rows(corners, most_steps=256 if quick else 16_384)
+    rows = formula_rows(corners) + walk_rows(corners, most_steps=256 if quick else 16_384) + scene_rows(samples=64 if quick else 4096)
     print(as_table(rows), file=sys.stderr)
     return [row.model_dump() for row in rows]
 
@@ -129,11 +136,27 @@ def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[Stabi
     for region, here in _parts(corners):
         totals = lanes.totals[here & (bad == 0)]
         gain = totals.sum(axis=1) - entering[here & (bad == 0)]
+        gain_error = float(gain.std(ddof=1) / np.sqrt(len(gain)))
         rows.append(
             StabilityRow(
-                benchmark="stability-walk", peer="dentine", seconds=seconds * here.mean(), error=float(gain.std() / np.sqrt(len(gain)) / entering[here].mean()),
+                benchmark="stability-walk", peer="dentine", seconds=seconds * here.mean(), error=gain_error / float(entering[here].mean()),
                 region=region, quantity="R + T", sets=int(here.sum()), non_finite=int(bad[here].sum()),
-                cut=float(totals[:, 2].mean() / entering[here].mean()), gain=float(gain.mean()),
+                cut=float(totals[:, 2].mean() / entering[here].mean()), gain=float(gain.mean()), gain_error=gain_error,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def scene_rows(*, samples: int, seed: int = 4) -> list[StabilityRow]:
+    """Images and derivatives of difficult scenes; a value that is not finite ends the benchmark with the engine's own sentence."""
+    rows = []
+    for scene in scenes():
+        begun = time.perf_counter()
+        seen = look(scene, samples=samples, seed=seed)
+        rows.append(
+            StabilityRow(
+                benchmark="stability-scene", peer="dentine", seconds=time.perf_counter() - begun, error=seen.error,
+                region=scene.name, quantity="images and derivatives", sets=seen.numbers, non_finite=0, negative=seen.negative, z=seen.z,
             )
         )  # fmt: skip
     return rows
@@ -145,14 +168,24 @@ def _parts(corners: Corners) -> list[tuple[str, NDArray[np.bool_]]]:
 
 
 def as_table(rows: list[StabilityRow]) -> str:
-    """Two tables: worst relative error by region and formula, and what the walk did in each region."""
-    formulas = [row for row in rows if row.benchmark == "stability-formula"]
+    """Three tables: worst relative error by region and formula, what the walk did in each region, and the scenes."""
+    formulas, walks, views = ([row for row in rows if row.benchmark == f"stability-{part}"] for part in ("formula", "walk", "scene"))
     names = list(dict.fromkeys(row.quantity for row in formulas))
-    lines = ["| region | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
-    lines += [
-        f"| {region} | " + " | ".join(f"{row.error:.1e}" for row in formulas if row.region == region) + " |"
-        for region in dict.fromkeys(row.region for row in formulas)
-    ]
-    lines += ["", "| region | sets | not finite | cut short | R + T + cut - entering |", "|---|---|---|---|---|"]
-    lines += [f"| {row.region} | {row.sets} | {row.non_finite} | {row.cut:.1e} | {row.gain:+.1e} |" for row in rows if row.benchmark == "stability-walk"]
-    return "\n".join(lines)
+    errors = {(row.region, row.quantity): row.error for row in formulas}
+    return "\n\n".join(
+        (
+            _table(("region", *names), [(region, *(f"{errors[region, name]:.1e}" for name in names)) for region in REGIONS]),
+            _table(
+                ("region", "sets", "not finite", "cut short", "R + T + cut - entering"),
+                [(r.region, r.sets, r.non_finite, f"{r.cut:.1e}", f"{r.gain:+.1e} ± {r.gain_error:.0e}") for r in walks],
+            ),
+            _table(
+                ("scene", "numbers", "not finite", "negative", "z"),
+                [(r.region, r.sets, r.non_finite, r.negative, "" if r.z is None else f"{r.z:.1f}") for r in views],
+            ),
+        )
+    )
+
+
+def _table(head: tuple[str, ...], body: list[tuple[Any, ...]]) -> str:
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, ("---",) * len(head), *body))

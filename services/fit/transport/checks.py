@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError, NonFiniteError
 from services.fit.transport.recipe import View
+
+FARTHEST_MM = 1e12
+"""A million kilometres; farther away, squares of distances leave what single precision holds."""
+INTENSITIES = (1e-30, 1e30)
+"""Likewise."""
 
 
 def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], reach_mm: float) -> None:
@@ -22,8 +25,14 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
     for number, (position, intensity) in enumerate(zip(positions_mm, intensities, strict=True)):
         if not np.isfinite(position).all():
             raise InputError(f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's calibration.")
-        if not math.isfinite(intensity) or intensity <= 0:
-            raise InputError(f"Light {number} has intensity = {intensity:g}, which must be positive and finite; correct the rig's calibration.")
+        if not INTENSITIES[0] <= intensity <= INTENSITIES[1]:
+            low, high = INTENSITIES
+            raise InputError(f"Light {number} has intensity = {intensity:g}, which must lie in {low:g} to {high:g}; correct the rig's calibration.")
+        if np.linalg.norm(position) > FARTHEST_MM:
+            raise InputError(
+                f"Light {number} is {np.linalg.norm(position):.3g} mm away, farther than single precision can follow; "
+                f"put it within {FARTHEST_MM:g} mm and lower its intensity with the distance squared."
+            )
         if np.linalg.norm(position) <= reach_mm:
             raise InputError(
                 f"Light {number} at position_mm = {position.tolist()} is within {reach_mm:.0f} mm of the origin, where the tooth is; "
