@@ -58,7 +58,7 @@ class Case:
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
     """Per feature a row of this engine with the feature off, a row of the peer without it, and the peer's summary row."""
-    samples = 16 if quick else 128
+    samples = 32 if quick else 128
     return [row.model_dump() for case in cases() for row in _compare(case, samples)]
 
 
