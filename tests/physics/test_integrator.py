@@ -267,3 +267,61 @@ def test_a_variant_without_arrays_is_refused(tooth: Path) -> None:
 
     with variant("scalar_rgb"), pytest.raises(PlatformError, match="not scalar_rgb"):
         register_integrator()
+
+
+def test_derivatives_are_refused(tooth: Path) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    scene = load_scene(scene_dict(tooth))
+    values = mi.traverse(scene)
+    dr.enable_grad(values["light.intensity.value"])
+    image = mi.render(scene, params=values, integrator=mi.load_dict(properties()), spp=1)
+    with pytest.raises(InputError, match="gives images only"):
+        dr.backward(dr.sum(image))
+
+
+def test_an_instance_beside_the_tooth_is_no_tooth(tooth: Path) -> None:
+    # What lies in a shape group is not among the scene's shapes, and is numbered after them.
+    ball = {"type": "sphere", "radius": 1.0, "center": [2.5, 3.0, 3.5], "bsdf": {"type": "diffuse"}}
+    group = {"type": "shapegroup", "ball": ball}
+    scenes = ({"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}}}, {"ball": ball})
+    instance, shape = (render(load_scene(scene_dict(tooth, **shapes)), properties(), 64, 10)[0] for shapes in scenes)
+    np.testing.assert_allclose(instance, shape, rtol=1e-4)
+
+
+def png_pixels(path: Path) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> None:
+    from services.fit.gallery import main
+
+    with variant("llvm_ad_rgb"):
+        status = main(["--out", str(tmp_path), "--views", "front", "backlit", "--size", "20", "25", "--samples", "32"])
+    assert status == 0
+    front, backlit = (png_pixels(tmp_path / f"{view}.png").astype(float) for view in ("front", "backlit"))
+    assert front.shape == (25, 20, 3)
+    tooth_region, corner = (slice(8, 17), slice(8, 12)), (slice(0, 4), slice(0, 4))
+    assert front[tooth_region].mean() > 1.5 * front[corner].mean()
+    # Against the light, dentin is darker and yellower than the enamel of the edge above it.
+    edge, core = backlit[6:8, 9:12].mean(axis=(0, 1)), backlit[14:18, 9:12].mean(axis=(0, 1))
+    assert edge.mean() > 1.3 * core.mean()
+    assert core[0] / core[2] > 1.1 * edge[0] / edge[2]
+
+
+def test_the_gallery_renders_a_scene_of_ones_own(tooth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from services.fit.export.scene_xml import write_scene
+    from services.fit.gallery import main
+
+    scene = tmp_path / "scene.xml"
+    write_scene(scene, scene_dict(tooth))
+    arguments = ["--out", str(tmp_path), "--scene", str(scene), "--samples", "1", "--enamel"]
+    with variant("llvm_ad_rgb"):
+        assert main([*arguments, "outer_11", "--core", "dentin_11"]) == 0
+        assert main([*arguments, "molar"]) == InputError.exit_status
+    assert png_pixels(tmp_path / "camera_c0.png").std() > 0
+    assert capsys.readouterr().err.startswith("gallery: The scene has no shape 'molar' but ")

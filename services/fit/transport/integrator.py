@@ -42,6 +42,7 @@ MEDIUM_DEFAULTS = {"beta": 1.0, "g1": 0.0, "g2": 0.0}
 STOCK_PROPERTIES = {"samples_per_pass", "block_size", "timeout"}
 """What Mitsuba's own base class reads."""
 ROUGHNESS = (1e-3, 1.0)
+NO_DERIVATIVES = f"Integrator {PLUGIN} gives images only; take derivatives from services.fit.transport.engine.Engine."
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,12 @@ def register_integrator() -> None:
             paths = ScenePaths(scene, self._teeth, self.properties.optics, self.properties.max_depth)
             radiance, valid = paths.radiance(sampler, ray, mi.Bool(active))
             return radiance, valid, []
+
+        def render_forward(self, *_: Any, **__: Any) -> Any:
+            raise InputError(NO_DERIVATIVES)
+
+        def render_backward(self, *_: Any, **__: Any) -> Any:
+            raise InputError(NO_DERIVATIVES)
 
         def to_string(self) -> str:
             return f"Dentine[{self.properties}]"

@@ -48,7 +48,8 @@ class SceneTeeth:
         # A shape is known by its number among all objects of the renderer.
         part = dict.fromkeys(shapes.enamel, ENAMEL) | dict.fromkeys(shapes.dentin, DENTIN)
         numbers = _numbers(scene)
-        table = np.zeros(int(numbers.max()) + 1, dtype=np.uint32)
+        self._numbers = int(numbers.max()) + 1
+        table = np.zeros(self._numbers, dtype=np.uint32)
         table[numbers] = [part.get(shape.id(), 0) for shape in scene.shapes()]
         self._parts = mi.UInt32(table)
         dr.eval(self._parts)
@@ -61,7 +62,9 @@ class SceneTeeth:
 
     def part(self, found: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
         """Of the surface that was hit: ENAMEL, DENTIN, or 0 where it belongs to no tooth."""
-        return dr.gather(mi.UInt32, self._parts, dr.reinterpret_array(mi.UInt32, found.shape), active)
+        number = dr.reinterpret_array(mi.UInt32, found.shape)
+        # Shapes inside instances are not among the scene's own.
+        return dr.gather(mi.UInt32, self._parts, number, active & (number < self._numbers))
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Dentin over enamel over whatever is outside (0)."""
