@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from services.fit.blocks import Block, read_block, write_block
-from services.fit.transport.recipe import View
+from services.fit.blocks import Block, StoredFile, read_block, write_block
+from services.fit.evaluate import evaluate_task
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.passes import BlockTask, compare_task, image_task, jacobian_task, orders_task
+from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
 from tests.support.small_tooth import camera_at
 
 
@@ -29,3 +33,56 @@ def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: li
     assert block.fitted_view.lights == lights
     np.testing.assert_array_equal(block.fitted_view.pixels, block.view.pixels)
     assert block.view.lights is None
+
+
+class Recorder:
+    """A host that renders zeros and remembers which lights it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, ...] | None] = []
+
+    def call(self, method: str, recipe: StoredFile, tissue: Tissue, view: View, *names: Any, **options: Any) -> Any:  # noqa: ARG002 - signature of the host
+        self.asked.append(view.lights)
+        shape = (3, len(view))
+        if method == "images":
+            return StackEstimate(np.zeros(shape), np.zeros(shape))
+        if method == "order_images":
+            return np.zeros((len(options["bin_edges"]) - 1, *shape))
+        return JacobianEstimate(names[0], np.zeros(shape), np.zeros(shape), np.zeros((1, *shape)), np.zeros((1, *shape)))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> BlockTask:
+    stored = write_block(tmp_path, block_with([[0, 0], [2, 0], [0, 2]]))
+    tissue = Tissue(Medium(1, 0.9), Medium(1, 0.9))
+    return BlockTask(stored, 0, stored, "step", tissue, 16)
+
+
+def test_every_task_of_the_fit_asks_for_fitted_lights_alone(task: BlockTask) -> None:
+    host = Recorder()
+    image_task(host, task, 1)
+    jacobian_task(host, task, ("enamel.sigma",), np.ones((1, 1)), (1, 2))
+    compare_task(host, task, task.tissue, (1, 2))
+    orders_task(host, task, np.array([0, 2, 9]), 1)
+    assert host.asked == [(1, 2)] * 8
+
+
+def test_the_evaluation_adds_what_is_held_out(task: BlockTask) -> None:
+    # Light 0 is held out in one pixel, so all three count.
+    host = Recorder()
+    evaluate_task(host, task, (1, 2), ())
+    assert host.asked == [None] * 2
+
+
+def test_the_evaluation_renders_the_pictures_it_shows(tmp_path: Path) -> None:
+    block = block_with([[0, 0], [2, 0], [0, 0]])
+    block.held_out[:] = False
+    stored = write_block(tmp_path, block)
+    task = BlockTask(stored, 0, stored, "step", Tissue(Medium(1, 0.9), Medium(1, 0.9)), 16)
+    for shown, lights in (((), (1,)), ((("c0", 2),), (1, 2)), ((("another camera", 2),), (1,))):
+        host = Recorder()
+        evaluate_task(host, task, (1, 2), shown)
+        assert host.asked == [lights] * 2
