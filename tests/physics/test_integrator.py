@@ -100,9 +100,11 @@ def render(scene: Any, integrator: SceneDict, samples: int, seed: int) -> tuple[
     return stack.mean(axis=0).squeeze(), (stack.var(axis=0, ddof=1) / BATCHES).squeeze()
 
 
-def engine_images(boundary: Boundary, tissue: Tissue, light: int, intensity: float, seed: int) -> tuple[Array, Array]:
+def engine_images(
+    tissue: Tissue, light: int, seed: int, boundary: Boundary = "matched", intensity: float = INTENSITY, *, layered: bool = True
+) -> tuple[Array, Array]:
     """What the project's own engine sees, mean and its variance."""
-    dentin = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3)))
+    dentin = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3))) if layered else None
     engine = Engine(SceneRecipe(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
     image = engine.images(tissue, whole_view(CAMERA), samples=512, seed=seed, batches=BATCHES)
     return image.mean[0].reshape(SIZE, SIZE), image.variance[0].reshape(SIZE, SIZE)
@@ -112,18 +114,29 @@ def compare(ours: tuple[Array, Array], truth: tuple[Array, Array], least: int = 
     require_same_pictures(pixel_scores([ours[0], truth[0]], [ours[1], truth[1]], BLOCK), least)
 
 
-def test_a_tooth_among_other_things_looks_as_in_mitsuba(tooth: Path) -> None:
-    # Connections through the tooth, lights that paths find by chance, light that the table returns.
-    scene = load_scene(scene_dict(tooth, table=table(-4.05, 0.5), lamp=LAMP, sky=SKY))
-    compare(render(scene, properties(), 256, 1), render(scene, STOCK, 256, 2), least=200)
+def test_teeth_among_other_things_look_as_in_mitsuba(tooth: Path) -> None:
+    # Connections through two teeth, lights that paths find by chance, light that the table returns.
+    surroundings: SceneDict = {"table": table(-4.05, 0.5), "lamp": LAMP, "sky": SKY}
+    scene = scene_dict(tooth, **surroundings)
+    for surface in ("outer", "dentin"):
+        beside = np.eye(4)
+        beside[0, 3] = -6.5
+        scene[f"{surface}_12"] = scene[f"{surface}_11"] | {"to_world": beside}
+    loaded = load_scene(scene)
+    ours = render(loaded, properties(enamel="outer_11, outer_12", dentin="dentin_11, dentin_12"), 256, 1)
+    compare(ours, render(loaded, STOCK, 256, 2), least=200)
 
 
-@pytest.mark.parametrize("boundary", ["matched", "thin"])
-def test_point_lights_give_the_engines_images(tooth: Path, boundary: Boundary) -> None:
+@pytest.mark.parametrize(("boundary", "layered"), [("thin", True), ("matched", False)])
+def test_point_lights_give_the_engines_images(tooth: Path, boundary: Boundary, layered: bool) -> None:
     scene = scene_dict(tooth, second={"type": "point", "position": LIGHTS_MM[3].tolist(), "intensity": INTENSITY})
+    ours = properties(boundary=boundary)
+    if not layered:
+        ours = {name: value for name, value in ours.items() if not name.startswith("dentin")}
+        del scene["dentin_11"]
     # One run per light, so that the variances add.
-    runs = [engine_images(boundary, TISSUE, light, INTENSITY, seed=30 + light) for light in (0, 3)]
-    compare(render(load_scene(scene), properties(boundary=boundary), 512, 4), (runs[0][0] + runs[1][0], runs[0][1] + runs[1][1]))
+    runs = [engine_images(TISSUE, light, 30 + light, boundary, layered=layered) for light in (0, 3)]
+    compare(render(load_scene(scene), ours, 512, 4), (runs[0][0] + runs[1][0], runs[0][1] + runs[1][1]))
 
 
 def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
@@ -155,7 +168,7 @@ def test_each_colour_has_its_own_media(tooth: Path) -> None:
         register_integrator()
         mean, variance = render(load_scene(scene), properties(*tissues), 768, 7)
     for channel, tissue in enumerate(tissues):
-        truth = engine_images("matched", tissue, light=0, intensity=(channel + 1) * INTENSITY, seed=40 + channel)
+        truth = engine_images(tissue, light=0, seed=40 + channel, intensity=(channel + 1) * INTENSITY)
         compare((mean[..., channel], variance[..., channel]), truth)
 
 

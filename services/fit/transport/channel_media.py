@@ -1,7 +1,7 @@
 """Media that differ per colour channel, for paths that carry all channels at once.
 
 A path takes its flights and turns as one channel, the *leader*, picked by chance, and is worth f_k / mean_c(pdf_c) to channel k:
-the balance heuristic over all channels that could have led the whole path (Wilkie et al. 2014, Eq. 5). Only ratios of the
+the balance heuristic over all channels that could have led the whole path (Wilkie et al. 2014). Only ratios of the
 pdf_c enter, so they are carried relative to the largest. With one channel all of this is absent from the kernel.
 """
 

@@ -9,7 +9,7 @@ from services.fit.optics import fresnel
 
 
 class Gloss:
-    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 24, 33, 34); what is not reflected goes on unbent."""
+    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 33, 34); what is not reflected goes on unbent."""
 
     def __init__(self, roughness: float, ior: mi.Float) -> None:
         self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, roughness)
