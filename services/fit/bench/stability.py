@@ -86,20 +86,21 @@ class LaneTotals:
         return np.asarray(np.count_nonzero(~np.isfinite(self.totals), axis=1) + np.count_nonzero(~np.isfinite(self.derivatives), axis=(0, 2)))
 
 
-def stress_plan(most_steps: int) -> Plan:
+def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
     """Everything a slab kernel can have: all scores of both layers, the moving border, faces."""
-    return Plan(scores=tuple(Score(k, field) for k in (1, 2) for field in MEDIUM_FIELDS), shape=True, faces=True, most_steps=most_steps)
+    scores = tuple(Score(k, field) for k in (1, 2) for field in MEDIUM_FIELDS) if gradient else ()
+    return Plan(scores=scores, shape=gradient, faces=True, most_steps=most_steps)
 
 
-def trace(corners: Corners, *, paths: int, most_steps: int, seed: int) -> LaneTotals:
+def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient: bool = True) -> LaneTotals:
     """All sets at once, one lane each."""
     geometry = SlabGeometry(tuple(corners.width_mm), moving_border=True)
-    walk = Walk(geometry, Media(corners.media()), None, LaneStart(corners, seed), stress_plan(most_steps), 1.0)
+    walk = Walk(geometry, Media(corners.media()), None, LaneStart(corners, seed), stress_plan(most_steps, gradient=gradient), 1.0)
     # A smooth face seen from within is a face of index 1 / n: so one kernel serves all three kinds.
     ior = mi.Float(corners.ior.astype(np.float32))
     walk.ior = dr.select(mi.Bool(corners.boundary == SMOOTH), dr.rcp(ior), ior)
     totals, derivatives = walk.run(paths).arrays()
-    return LaneTotals(totals / paths, np.stack(derivatives)[:, :, :2] / paths)
+    return LaneTotals(totals / paths, np.array(derivatives).reshape(-1, *totals.shape)[:, :, :2] / paths)
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
