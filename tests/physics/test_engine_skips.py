@@ -58,8 +58,8 @@ def test_what_is_off_is_not_in_the_kernel(features: dict[str, Case], feature: st
     case = features[feature]
     off, without, on = (kernel_operations(call, 16) for call in (case.off, case.without, case.on))
     assert off == without
-    # No kernel knows how many pixels there are.
-    assert on == off if feature == "masked pixels" else on > off
+    # Lights and pixels are numbers to a kernel, not code; more of them may not show in it.
+    assert on >= off if feature in FEATURES[-2:] else on > off
 
 
 @pytest.mark.parametrize("feature", FEATURES[:-2])

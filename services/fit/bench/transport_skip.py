@@ -7,6 +7,7 @@ Of every case three calls are compared: ``off``, where the feature is there and 
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -112,6 +113,8 @@ def kernel_operations(call: Call, samples: int) -> int:
     """Operations of the largest kernel that a call launches."""
     import drjit as dr
 
+    # Equal expressions are traced once while the first is alive; what a finished trace left behind must not stand in for operations of this one.
+    gc.collect()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         call(samples, 0)
