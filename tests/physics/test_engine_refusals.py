@@ -93,6 +93,13 @@ def test_a_pixel_outside_the_image_is_refused(engine: Engine, no_kernel: None, p
     require_sentence(caught.value, "c0", str(pixel), "8 x 8")
 
 
+def test_a_camera_in_metres_is_refused(engine: Engine, no_kernel: None) -> None:
+    view = whole_view(camera_at((0, 1, 0), distance_mm=0.6))
+    with pytest.raises(InputError) as caught:
+        engine.images(TISSUE, view, samples=1, seed=1)
+    require_sentence(caught.value, "c0", "(0, 0.6, 0) mm", "in millimetres")
+
+
 @pytest.mark.parametrize("lights", [(), (5,), (-1,), (2, 2)])
 def test_lights_that_do_not_exist_are_refused(engine: Engine, no_kernel: None, lights: tuple[int, ...]) -> None:
     view = replace(whole_view(camera_at((0, 1, 0))), lights=lights)
@@ -183,11 +190,15 @@ def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], pa
     assert caught.value.exit_status == 4
 
 
-def test_a_missing_libllvm_ends_with_a_sentence(tmp_path: Path) -> None:
-    # The whole way, in a process that cannot find the library: an empty file where it is looked for.
+@pytest.mark.parametrize(
+    ("before", "sentence"),
+    [("pass", "No libLLVM was found"), ("import drjit; drjit.detail.llvm_version = lambda: (15, 0, 7)", "libLLVM 15.0 would crash the renderer")],
+)
+def test_an_unusable_libllvm_ends_with_a_sentence(tmp_path: Path, before: str, sentence: str) -> None:
+    # The whole way, in a process that cannot load the library, an empty file where it is looked for, and in one that is told it is old.
     library = tmp_path / "libLLVM.so"
     library.touch()
-    script = "from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe; Engine(recipe())"
+    script = f"{before}; from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe; Engine(recipe())"
     root = Path(__file__).resolve().parents[2]
     ended = subprocess.run(
         [sys.executable, "-c", script],
@@ -200,7 +211,7 @@ def test_a_missing_libllvm_ends_with_a_sentence(tmp_path: Path) -> None:
     )
     assert ended.returncode == 1
     last = ended.stderr.strip().splitlines()[-1]
-    assert "PlatformError: No libLLVM was found" in last
+    assert f"PlatformError: {sentence}" in last
     assert last.endswith("DRJIT_LIBLLVM_PATH to such a libLLVM.so.")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError, NonFiniteError
-from services.fit.transport.recipe import View
+from services.fit.transport.recipe import SceneRecipe, View
 
 FARTHEST_MM = 1e12
 """A million kilometres; farther away, squares of distances leave what single precision holds."""
@@ -40,13 +40,18 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
             )
 
 
-def require_view(view: View, lights: int) -> None:
-    """Refuse a view without pixels, or with pixels or lights that do not exist.
+def require_view(view: View, recipe: SceneRecipe) -> None:
+    """Refuse a view without pixels, with pixels or lights that do not exist, or from where the tooth is.
 
     Raises:
         InputError: names the camera.
     """
-    name = view.camera.name
+    name, lights = view.camera.name, len(recipe.light_positions_mm)
+    pose = np.asarray(view.camera.camera_from_world)
+    eye_mm = -pose[:3, :3].T @ pose[:3, 3]
+    if (eye_mm >= recipe.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= recipe.outer.vertices_mm.max(axis=0)).all():
+        where = ", ".join(f"{c:.4g}" for c in eye_mm)
+        raise InputError(f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as the meshes are.")
     if len(view) == 0:
         raise InputError(f"Camera {name} lists no pixel; its valid mask is empty.")
     outside = ((view.pixels < 0) | (view.pixels >= view.camera.size)).any(axis=1)

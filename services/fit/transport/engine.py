@@ -118,8 +118,7 @@ class Engine:
         from services.fit.transport.media import Media, require_medium
         from services.fit.transport.starts import CameraStart
 
-        count = len(self.recipe.light_positions_mm)
-        require_view(view, count)
+        require_view(view, self.recipe)
         if samples < 1 or batches < 1:
             raise InputError(f"samples = {samples} and batches = {batches} must be at least 1; ask for one path per pixel or more.")
         media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
