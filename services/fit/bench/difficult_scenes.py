@@ -21,6 +21,7 @@ PIXELS = 8
 DIRECTIONS = np.array([[0.16, 0.98, 0.08], [0.84, 0.5, 0.17], [-0.87, 0.35, -0.35], [0, -0.99, 0.16], [0.08, 0.16, 0.98]])
 """Towards the lights."""
 TISSUE = Tissue(Medium(3, 0.99, 0.9, 0.8, -0.2), Medium(8, 0.98, g1=0.7))
+LARGEST_Z = 4.5
 SPLIT = 1e-9
 """Where slivers part an edge, as a fraction of its length."""
 
@@ -43,7 +44,7 @@ class Seen:
     numbers: int
     """Pixels x lights, as many for every derivative."""
     negative: int
-    """Radiances below zero."""
+    """Lights whose image, summed, is below zero by more than ``LARGEST_Z`` standard errors; one pixel's estimate may be negative."""
     error: float
     """Relative standard error of the image of all pixels and lights."""
     z: float | None
@@ -86,8 +87,9 @@ def look(scene: Scene, *, samples: int, seed: int) -> Seen:
         # Pixels are independent; the lights of one pixel share its paths.
         spread = np.sqrt(image.variance.sum(axis=1) + other.variance.sum(axis=1))
         z = float(np.max(np.abs(image.mean.sum(axis=1) - other.mean.sum(axis=1)) / spread))
+    negative = int(np.count_nonzero(image.mean.sum(axis=1) < -LARGEST_Z * np.sqrt(image.variance.sum(axis=1))))
     error = float(np.sqrt(image.variance.sum()) / np.linalg.norm(image.mean))
-    return Seen(image.mean.size + jacobian.jacobian.size, int(np.count_nonzero(image.mean < 0)), error, z)
+    return Seen(image.mean.size + jacobian.jacobian.size, negative, error, z)
 
 
 def ellipsoid(semi_axes_mm: NDArray[np.float64]) -> Mesh:

@@ -51,7 +51,7 @@ class StabilityRow(Row):
     gain_error: float | None = None
     """Standard error of ``gain``."""
     negative: int | None = None
-    """Radiances below zero."""
+    """Lights whose image is below zero beyond its error."""
     z: float | None = None
     """Difference of a scene from one that must look alike, in standard errors."""
 
