@@ -1,11 +1,14 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo test test-all lint bench dashboard setup
+.PHONY: demo gallery test test-all lint bench dashboard setup
 
 BIN := .venv/bin
 
 demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and report, below demo/
 	@test -e demo/mouth/capture.json || $(BIN)/dentine phantom --out demo/mouth --pixel-mm 0.5 --cameras 3 --lights 8 --samples 8192
 	@$(BIN)/dentine run deploy/examples/demo.toml --out demo
+
+gallery: setup ## pictures of a tooth in an ordinary scene, in gallery/, some minutes
+	@$(BIN)/python -m services.fit.gallery --out gallery
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
 	@deploy/setup.sh dashboard browser
