@@ -12,9 +12,10 @@ import mitsuba as mi
 from services.fit.transport.engine import Engine
 from services.fit.transport.lights import PointLights
 from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.scores import Plan
 from services.fit.transport.starts import CameraStart
 from services.fit.transport.tally import Tally
-from services.fit.transport.walk import ROULETTE_WEIGHT, Flight, Plan, Walk, Walker, minus_log1m
+from services.fit.transport.walk import ROULETTE_WEIGHT, Flight, Walk, Walker, minus_log1m
 
 
 class PlainEngine(Engine):

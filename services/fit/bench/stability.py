@@ -26,8 +26,9 @@ from services.fit.slab.simulate import specular_share
 from services.fit.transport.geometry import SlabGeometry
 from services.fit.transport.media import Media, Score
 from services.fit.transport.platform import prepare_device
+from services.fit.transport.scores import Plan
 from services.fit.transport.starts import PathStart, SlabStart, stream
-from services.fit.transport.walk import Plan, Walk
+from services.fit.transport.walk import Walk
 
 PATHS = 64
 WHITE = "alpha = 1"

@@ -170,8 +170,9 @@ def accumulate(
     prepare_device()
     from services.fit.transport.geometry import SlabGeometry
     from services.fit.transport.media import Media, Score
+    from services.fit.transport.scores import Plan
     from services.fit.transport.starts import SlabStart
-    from services.fit.transport.walk import Plan, Walk
+    from services.fit.transport.walk import Walk
 
     names, scores = _derivatives(layers) if gradient else ((), ())
     border = gradient and len(layers) == 2

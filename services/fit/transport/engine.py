@@ -17,8 +17,9 @@ from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEs
 if TYPE_CHECKING:
     from services.fit.transport.lights import PointLights
     from services.fit.transport.media import Media
+    from services.fit.transport.scores import Plan
     from services.fit.transport.starts import CameraStart
-    from services.fit.transport.walk import Plan, Walk
+    from services.fit.transport.walk import Walk
 
 LANE_BUDGET = 24_000_000
 """Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
@@ -43,14 +44,17 @@ class Engine:
             raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
         prepare_device(threads)
         from services.fit.transport.geometry import MeshGeometry
+        from services.fit.transport.light_maps import LightMaps
         from services.fit.transport.lights import PointLights
 
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
-        self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities)
+        maps = LightMaps(recipe.light_positions_mm, recipe.light_intensities, recipe.outer.vertices_mm)
+        self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
         self._radius_mm = reach_mm
         self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
+        self._lights.maps.trace(self._geometry, self._ior)
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
         """Radiance of ``view``'s pixels under each light.
@@ -63,7 +67,7 @@ class Engine:
         Raises:
             InputError: a parameter is outside its physical range, or the view lists no pixel. NonFiniteError: a result is NaN or infinite.
         """
-        from services.fit.transport.walk import Plan
+        from services.fit.transport.scores import Plan
 
         sums, _ = self._trace(tissue, view, Plan(), samples, seed, batches)
         return StackEstimate(*self._among_all(view, *_mean_and_variance(sums)))
@@ -77,7 +81,7 @@ class Engine:
             As ``images``; InputError also for a name the scene does not have.
         """
         from services.fit.transport.media import Score
-        from services.fit.transport.walk import Plan
+        from services.fit.transport.scores import Plan
 
         modes = self._geometry.modes
         known = {f"{part}.{field}" for part in self._parts() for field in ("sigma", "alpha", "beta", "g1", "g2")} | {f"shape.{k}" for k in range(modes)}
@@ -101,7 +105,7 @@ class Engine:
         """
         from dataclasses import replace
 
-        from services.fit.transport.walk import Plan
+        from services.fit.transport.scores import Plan
 
         white = Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
         sums, _ = self._trace(white, view, Plan(order_edges=tuple(int(edge) for edge in bin_edges)), samples, seed, batches)
@@ -127,7 +131,9 @@ class Engine:
         # A solver's step that ends on a bound may be off by a rounding.
         if len(tissue.shape) != self._geometry.modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
             raise InputError(f"shape = {tissue.shape} must be {self._geometry.modes} blend weights between 0 and 1, one per dentin mode; correct it.")
-        self._geometry.reshape(tissue.shape)
+        if self._geometry.reshape(tissue.shape):
+            self._lights.maps.trace(self._geometry, self._ior)
+            self._some_lights.clear()
 
         lights, kernel_media = self._lights_of(view), Media(media)
         batches = min(batches, samples)
@@ -168,7 +174,9 @@ class Engine:
             return self._lights
         if view.lights not in self._some_lights:
             chosen = list(view.lights)
-            self._some_lights[view.lights] = PointLights(self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen])
+            self._some_lights[view.lights] = PointLights(
+                self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen], self._lights.maps.of(chosen)
+            )
         return self._some_lights[view.lights]
 
 

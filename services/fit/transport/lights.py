@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,12 +14,16 @@ from numpy.typing import NDArray
 from services.fit.optics import fresnel
 from services.fit.transport.border import inverse_cosine
 from services.fit.transport.geometry import Geometry
+from services.fit.transport.light_maps import LightMaps
 from services.fit.transport.media import Media
 
 CANDIDATES = 8
 """Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
+STEPS_PER_ROOT = 0.8
+"""Steps of the walk per connection, over the root of the number of lights: all lights are looked up in one turn, so a turn costs more the
+more there are. Measured best at 8 and at 54 lights."""
 ROULETTE_GAIN = 3.0
-ROULETTE_FLOOR = 0.02
+DARKEST_CHANCE = 0.02
 """A shadow ray is cast with probability clip(gain x expected contribution, floor, 1)."""
 DARK_DEPTH = 40.0
 """Optical depth past which a shadow ray stops: exp(-40) is below float32 resolution of any sum it could join."""
@@ -27,8 +32,10 @@ DARK_DEPTH = 40.0
 class PointLights:
     """All lights of a rig for one channel."""
 
-    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64]) -> None:
+    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], maps: LightMaps) -> None:
         self.count = len(positions_mm)
+        self.turns = max(1, round(STEPS_PER_ROOT * math.sqrt(self.count)))
+        self.maps = maps
         self.positions = mi.Float(np.ascontiguousarray(positions_mm.reshape(-1), dtype=np.float32))
         self.intensities = mi.Float(np.ascontiguousarray(intensities, dtype=np.float32))
         dr.eval(self.positions, self.intensities)

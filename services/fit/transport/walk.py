@@ -7,38 +7,22 @@ slab that count what leaves either face. What a scene lacks is absent from its k
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics import fresnel
 from services.fit.transport.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
+from services.fit.transport.connections import Connections, Vertex
 from services.fit.transport.geometry import Geometry, Hit
-from services.fit.transport.lights import ROULETTE_FLOOR, ROULETTE_GAIN, ChosenLight, PointLights, shadow
-from services.fit.transport.media import Media, PhaseFunction, Score
+from services.fit.transport.lights import PointLights, shadow
+from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.scores import Plan, Scores
 from services.fit.transport.starts import CameraStart, SlabStart
 from services.fit.transport.tally import Tally
 
 ROULETTE_WEIGHT = 0.1
 """Paths below this fraction of their first weight survive in proportion to it."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What this kernel has to do; everything here is decided before compilation."""
-
-    scores: tuple[Score, ...] = ()
-    shape: bool = False
-    """Whether derivatives to the border's shape modes are wanted; they follow those of ``scores`` in the tally."""
-    faces: bool = False
-    """Count what leaves the slab's faces instead of connecting to lights."""
-    bend: bool = False
-    """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
-    order_edges: tuple[int, ...] = ()
-    """Split images by scattering order at these edges."""
-    most_steps: int | None = None
-    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
 
 
 def one_minus_exp(x: mi.Float) -> mi.Float:
@@ -49,51 +33,6 @@ def one_minus_exp(x: mi.Float) -> mi.Float:
 def minus_log1m(p: mi.Float) -> mi.Float:
     """-log(1 - p), without cancellation for small p."""
     return dr.select(p < 0.02, p * (1 + p * (1 / 2 + p * (1 / 3 + p / 4))), -dr.log(1 - p))
-
-
-class Scores:
-    """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
-
-    def __init__(self, plan: Plan, media: Media) -> None:
-        self.plan, self.media = plan, media
-        self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
-        self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
-
-    def zero(self) -> list[mi.Float]:
-        """No score yet."""
-        return [mi.Float(0) for _ in self.plan.scores]
-
-    def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
-        """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
-        return [
-            dr.select(medium == s.medium, total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length, total)
-            if s.field == "sigma"
-            else total
-            for s, total in zip(self.plan.scores, sums, strict=True)
-        ]
-
-    def turn(self, sums: list[mi.Float], medium: mi.UInt32, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
-        """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
-        return [
-            dr.select(active & (medium == s.medium), total + terms[s.field], total) if s.field in terms else total
-            for s, total in zip(self.plan.scores, sums, strict=True)
-        ]
-
-    def complete(
-        self, sums: list[mi.Float], counts: list[mi.UInt32], medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
-    ) -> list[mi.Float]:
-        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
-        whole = []
-        for s, total in zip(self.plan.scores, sums, strict=True):
-            value = total
-            if s.field == "alpha":
-                value = mi.Float(counts[s.medium - 1]) * self.media.inverse_alpha[s.medium - 1]
-            elif s.field == "sigma":
-                value = total - lengths.get(s.medium, mi.Float(0))
-            elif s.field in terms:
-                value = total + dr.select(medium == s.medium, terms[s.field], 0)
-            whole.append(value)
-        return whole
 
 
 @dataclass
@@ -115,6 +54,10 @@ class Walker:
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     kept: Crossing
+    vertex: Vertex | None
+    """Waits for its connection to the lights."""
+    turn: mi.UInt32
+    """Steps since the last connection."""
     secondary: mi.Bool
     """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""
     shape_factor: list[mi.Float]
@@ -153,6 +96,7 @@ class Walk:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         self.book = Scores(plan, media)
+        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.book, self.ior)
         self.modes = geometry.modes if plan.shape else 0
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
@@ -179,13 +123,17 @@ class Walk:
             sums=self.book.zero(),
             border_sums=zeros(self.modes),
             kept=no_crossing(self.modes),
+            vertex=None if self.connections is None else self.connections.no_vertex(),
+            turn=mi.UInt32(0),
             secondary=mi.Bool(False),
             shape_factor=zeros(self.modes),
             lane=lane,
             sample=mi.UInt32(0),
             active=lane < self.start.lanes,
         )
-        dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
+        (walker,) = dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
+        if self.connections is not None:
+            self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
         tally.evaluate()
         return tally
 
@@ -289,45 +237,19 @@ class Walk:
         walker.counts = [dr.select(flight.scatters & (flight.medium == k + 1), count + 1, count) for k, count in enumerate(walker.counts)]
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
-        assert self.lights is not None
-        carried = self._carried(walker)
-        phase = PhaseFunction(self.media, flight.medium)
-        chosen = self.lights.choose(walker.origin, partial(phase.density, walker.omega), walker.rng, flight.scatters)
-
-        # Cast the shadow ray with a probability in proportion to what it could bring.
-        chance = dr.clip(ROULETTE_GAIN * carried * chosen.strength * self.lights.inverse_irradiance, ROULETTE_FLOOR, 1)
-        casts = flight.scatters & (walker.rng.next_float32() < chance)
-
-        def cast(walker: Walker, medium: mi.UInt32, chosen: ChosenLight, weight: mi.Float, casts: mi.Bool) -> mi.Float:
-            ray = shadow(
-                self.geometry, self.media, walker.origin, chosen.direction, walker.place, casts,
-                measured=self.book.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
-            )  # fmt: skip
-            value = weight * ray.transmittance()
-            slot = self._slot(walker, chosen)
-            primary = casts & ~walker.secondary
-            tally.add(walker.lane, slot, value, primary)
-            terms = PhaseFunction(self.media, medium).scores(self.book.phase_fields, walker.omega, chosen.direction)
-            lengths = dict(zip(self.book.sigma_media, ray.lengths, strict=True))
-            for which, score in enumerate(self.book.complete(walker.sums, walker.counts, medium, terms, lengths)):
-                tally.add_derivative(which, walker.lane, slot, value * score, primary)
-            for mode in range(self.modes):
-                factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode] + ray.border[mode])
-                tally.add_derivative(len(self.plan.scores) + mode, walker.lane, slot, value * factor, casts)
-            return value
-
-        dr.if_stmt(
-            (walker, flight.medium, chosen, carried * chosen.total / chance, casts), casts, cast, lambda *_: mi.Float(0), label="connection",
+        assert self.connections is not None
+        assert walker.vertex is not None
+        clear = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
+        found = Vertex(
+            walker.origin, walker.omega, walker.place, self._carried(walker), clear, walker.counts, walker.sums, walker.border_sums, walker.secondary,
+            walker.shape_factor, mi.Float(0),
         )  # fmt: skip
-
-    def _slot(self, walker: Walker, chosen: ChosenLight) -> mi.UInt32:
-        edges = self.plan.order_edges
-        if not edges:
-            return chosen.index
-        order, bin_index = walker.scatters_so_far(), mi.UInt32(0)
-        for edge in edges[1:-1]:
-            bin_index += dr.select(order >= edge, mi.UInt32(1), mi.UInt32(0))
-        return chosen.index * (len(edges) - 1) + bin_index
+        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), flight.scatters)
+        walker.turn += 1
+        due = walker.active & (walker.turn == self.connections.turns) & (walker.vertex.total > 0)
+        walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
+        walker.vertex.total = dr.select(due, 0, walker.vertex.total)
+        walker.turn = dr.select(walker.turn == self.connections.turns, 0, walker.turn)
 
     def _turn(self, walker: Walker, flight: Flight) -> None:
         phase, rng = PhaseFunction(self.media, flight.medium), walker.rng

@@ -1,0 +1,211 @@
+"""Depth maps seen from every light: what lies between a scattering vertex and the light, looked up instead of ray traced.
+
+One map per light holds, on a grid of directions, where the light's ray enters the outer surface and where it enters and leaves
+the dentin. Between grid points depths are interpolated, so that the optical depth from any vertex to any light costs one look-up.
+It is an estimate; the walk corrects it by exact shadow rays, few where the map is smooth and more where it cannot know:
+at silhouettes, and where a ray meets a surface more often than once in and once out (translucent shadow maps, Dachsbacher and
+Stamminger 2003, here as a control variate).
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.optics import fresnel
+from services.fit.transport.geometry import DENTIN, ENAMEL, MeshGeometry
+from services.fit.transport.media import Media
+
+TEXEL_MM = 0.15
+"""Spacing of the grid at the tooth."""
+MARGIN_MM = 1.0
+
+
+@dataclass
+class LightView:
+    """What a vertex sees in the direction of one light."""
+
+    direction: mi.Vector3f
+    falloff: mi.Float
+    """Intensity over squared distance."""
+    enamel_mm: mi.Float
+    dentin_mm: mi.Float
+    surface: mi.Float
+    """Transmittance of the outer face."""
+    certain: mi.Bool
+    """Whether the map knows; elsewhere lengths are meaningless."""
+
+    def lengths(self, media: tuple[int, ...]) -> list[mi.Float]:
+        """Path length in mm inside each of some media."""
+        return [self.enamel_mm if medium == ENAMEL else self.dentin_mm for medium in media]
+
+    def transmittance(self, media: Media) -> mi.Float:
+        """Expected transmittance, 0 where the map does not know."""
+        depth = media.sigma[ENAMEL - 1] * self.enamel_mm
+        if media.count >= DENTIN:
+            depth = dr.fma(media.sigma[DENTIN - 1], self.dentin_mm, depth)
+        return dr.select(self.certain, self.surface * dr.exp(-depth), 0)
+
+
+class LightMaps:
+    """One depth map per light, over a square of directions that holds the whole tooth."""
+
+    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]) -> None:
+        centre = 0.5 * (outer_mm.min(axis=0) + outer_mm.max(axis=0))
+        radius = float(np.linalg.norm(outer_mm - centre, axis=1).max())
+        relative = positions_mm - centre
+        distance = np.linalg.norm(relative, axis=1)
+        helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        right = np.cross(relative, helper)
+        right *= (distance / np.linalg.norm(right, axis=1) / TEXEL_MM)[:, None]
+
+        # A sphere of this radius seen from so far away fills this half-angle.
+        half = (radius * distance / np.sqrt(distance**2 - radius**2)).max() / TEXEL_MM
+        self.count, self.size = len(positions_mm), 2 * int(np.ceil(half)) + 3
+        self._near = float(radius + MARGIN_MM)
+        self._centre = dr.opaque(mi.Vector3f, centre.tolist())
+        columns = [relative, intensities[:, None], right, distance[:, None]]
+        self._frames = aligned(mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1)))
+        self._table = mi.UInt32(0)
+        self._offsets = (-self._near, -self._near, -self._near, 0.0)
+        self._steps = (2 * self._near / 65535,) * 3 + (1 / 65535,)
+        dr.eval(self._frames)
+
+    def of(self, chosen: list[int]) -> LightMaps:
+        """The maps of some of the lights."""
+        maps = copy(self)
+        maps.keep(chosen)
+        return maps
+
+    def keep(self, chosen: list[int]) -> None:
+        """Forget all other lights."""
+        self._frames = aligned(mi.Float(np.array(self._frames).reshape(self.count, -1)[chosen].reshape(-1)))
+        self._table = mi.UInt32(np.array(self._table).reshape(self.count, -1)[chosen].reshape(-1))
+        self.count = len(chosen)
+        dr.eval(self._table)
+
+    def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
+        """Fill the maps for surfaces as they now are."""
+        lanes = self.count * self.size**2
+        index = dr.arange(mi.UInt32, lanes)
+        frame = self._frame(index // self.size**2)
+        x = mi.Float(index % self.size) - self.size // 2
+        y = mi.Float(index // self.size % self.size) - self.size // 2
+        per_texel = TEXEL_MM / frame.distance
+        direction = dr.normalize(frame.forward + (frame.right * x + frame.up * y) * dr.square(per_texel))
+        start = frame.distance - self._near
+
+        @dataclass
+        class Ray:
+            point: mi.Point3f
+            direction: mi.Vector3f
+            travelled: mi.Float
+            place: mi.UInt32
+            entry: mi.Float
+            dentin_entry: mi.Float
+            dentin_exit: mi.Float
+            surface: mi.Float
+            meetings: mi.UInt32
+            """Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order."""
+            alive: mi.Bool
+
+        def step(ray: Ray) -> tuple[Ray]:
+            hit = geometry.intersect(ray.point, ray.direction, ray.place, ray.alive)
+            cosine = dr.dot(ray.direction, hit.normal)
+            entering, met = cosine < 0, hit.valid
+            travelled = ray.travelled + dr.select(met, hit.distance, 0)
+            event = dr.select(hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4)))
+            # Each event once, and inside the dentin only inside the tooth.
+            repeated = (ray.meetings & event) != 0
+            unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
+            ray.meetings |= dr.select(met, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
+            ray.entry = dr.select(met & (event == 1), travelled, ray.entry)
+            ray.dentin_entry = dr.select(met & (event == 2), travelled, ray.dentin_entry)
+            ray.dentin_exit = dr.select(met & (event == 4), travelled, ray.dentin_exit)
+            if ior is not None:
+                ray.surface = dr.select(met & (event == 1), 1 - fresnel.reflectance(dr.abs(cosine), ior), ray.surface)
+            ray.point = dr.select(met, geometry.advance(ray.point, ray.direction, hit, met), ray.point)
+            ray.place = dr.select(met, geometry.beyond(ray.place, ray.direction, hit), ray.place)
+            ray.travelled = travelled
+            ray.alive &= met & ((ray.meetings & 16) == 0)
+            return (ray,)
+
+        ray = Ray(
+            dr.fma(direction, start, frame.position), direction, start - frame.distance, dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes),
+            dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Bool, True, lanes),
+        )  # fmt: skip
+        (ray,) = dr.while_loop((ray,), lambda ray: ray.alive, step, label="light map")
+        dr.eval(ray)
+        dr.sync_thread()
+        self._store([np.array(v) for v in (ray.entry, ray.dentin_entry, ray.dentin_exit, ray.surface)], np.array(ray.meetings))
+
+    def _store(self, columns: list[NDArray[np.float32]], meetings: NDArray[np.uint32]) -> None:
+        # A cell is certain where all its corners were met in the same order, once each.
+        shape = (self.count, self.size, self.size)
+        kind = meetings.reshape(shape)
+        certain = np.zeros(shape, dtype=np.uint32)
+        corners = [kind[:, :-1, :-1], kind[:, 1:, :-1], kind[:, :-1, 1:], kind[:, 1:, 1:]]
+        certain[:, :-1, :-1] = np.logical_and.reduce([corner == corners[0] for corner in corners]) & np.isin(corners[0], (1 | 8, 1 | 2 | 4 | 8))
+
+        # Eight bytes a texel, so that all maps stay in the cache: four numbers of 16 bits, the last one's lowest bit says that the cell is certain.
+        codes = [
+            np.clip(np.rint((column.reshape(shape).astype(np.float64) - offset) / step), 0, 65535).astype(np.uint32)
+            for column, offset, step in zip(columns, self._offsets, self._steps, strict=True)
+        ]
+        self._table = mi.UInt32(np.stack([codes[0] | codes[1] << 16, codes[2] | (codes[3] & ~np.uint32(1) | certain) << 16], axis=-1).reshape(-1))
+        dr.eval(self._table)
+
+    @dataclass
+    class _Frame:
+        """A light looking at the tooth; ``right`` and ``up`` are as long as there are texels in the distance."""
+
+        position: mi.Point3f
+        intensity: mi.Float
+        right: mi.Vector3f
+        up: mi.Vector3f
+        forward: mi.Vector3f
+        distance: mi.Float
+
+    def _frame(self, light: mi.UInt32) -> LightMaps._Frame:
+        first, second = (dr.gather(mi.Vector4f, self._frames, light * 2 + k) for k in (0, 1))
+        position, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
+        forward = position * -dr.rcp(second.w)
+        return LightMaps._Frame(mi.Point3f(position + self._centre), first.w, right, dr.cross(forward, right), forward, second.w)
+
+    def look(self, light: mi.UInt32, point: mi.Point3f, active: mi.Bool) -> LightView:
+        """What lies between ``point``, inside the tooth, and a light."""
+        frame = self._frame(light)
+        from_light = mi.Vector3f(point - frame.position)
+        squared = dr.squared_norm(from_light)
+        inverse = dr.rsqrt(squared)
+        depth = squared * inverse - frame.distance
+
+        # Bilinear interpolation between the four rays around the vertex.
+        per_forward = dr.rcp(dr.dot(from_light, frame.forward))
+        x = dr.fma(dr.dot(from_light, frame.right), per_forward, self.size // 2)
+        y = dr.fma(dr.dot(from_light, frame.up), per_forward, self.size // 2)
+        column, row = dr.floor(x), dr.floor(y)
+        u, v = x - column, y - row
+        cell = dr.minimum((light * self.size + mi.UInt32(row)) * self.size + mi.UInt32(column), self.count * self.size**2 - self.size - 2)
+        corners = [[dr.gather(mi.UInt32, self._table, 2 * (cell + k) + half) for half in (0, 1)] for k in (0, 1, self.size, self.size + 1)]
+        numbers = [[mi.Float(value) for half in corner for value in (half & 0xFFFF, half >> 16)] for corner in corners]
+        entry, dentin_entry, dentin_exit, surface = (
+            dr.fma(dr.lerp(dr.lerp(*values[:2], u), dr.lerp(*values[2:], u), v), step, offset)
+            for values, step, offset in zip(zip(*numbers, strict=True), self._steps, self._offsets, strict=True)
+        )
+        certain = active & ((corners[0][1] & 0x10000) != 0)
+        dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
+        enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
+        return LightView(-from_light * inverse, frame.intensity * dr.square(inverse), enamel_mm, dentin_mm, surface, certain)
+
+
+def aligned(values: mi.Float) -> mi.Float:
+    """A copy in Dr.Jit's own memory: what NumPy lends may lack the alignment that a gather of four at once needs."""
+    copy = values + dr.opaque(mi.Float, 0)
+    dr.eval(copy)
+    return copy

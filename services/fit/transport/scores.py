@@ -1,0 +1,72 @@
+"""What a kernel has to compute, and the scores that turn its paths into derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from services.fit.transport.media import Media, Score
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What this kernel has to do; everything here is decided before compilation."""
+
+    scores: tuple[Score, ...] = ()
+    shape: bool = False
+    """Whether derivatives to the border's shape modes are wanted; they follow those of ``scores`` in the tally."""
+    faces: bool = False
+    """Count what leaves the slab's faces instead of connecting to lights."""
+    bend: bool = False
+    """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
+    order_edges: tuple[int, ...] = ()
+    """Split images by scattering order at these edges."""
+    most_steps: int | None = None
+    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
+
+
+class Scores:
+    """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
+
+    def __init__(self, plan: Plan, media: Media) -> None:
+        self.plan, self.media = plan, media
+        self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
+        self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
+
+    def zero(self) -> list[mi.Float]:
+        """No score yet."""
+        return [mi.Float(0) for _ in self.plan.scores]
+
+    def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
+        """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
+        return [
+            dr.select(medium == s.medium, total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length, total)
+            if s.field == "sigma"
+            else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
+    def turn(self, sums: list[mi.Float], medium: mi.UInt32, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
+        """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
+        return [
+            dr.select(active & (medium == s.medium), total + terms[s.field], total) if s.field in terms else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
+    def complete(
+        self, sums: list[mi.Float], counts: list[mi.UInt32], medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
+    ) -> list[mi.Float]:
+        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
+        whole = []
+        for s, total in zip(self.plan.scores, sums, strict=True):
+            value = total
+            if s.field == "alpha":
+                value = mi.Float(counts[s.medium - 1]) * self.media.inverse_alpha[s.medium - 1]
+            elif s.field == "sigma":
+                value = total - lengths.get(s.medium, mi.Float(0))
+            elif s.field in terms:
+                value = total + dr.select(medium == s.medium, terms[s.field], 0)
+            whole.append(value)
+        return whole
