@@ -183,17 +183,19 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(tooth: Path) -> None:
 
 
 def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
-    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, under 1 %; without, the image is missing.
+    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, here far under 0.5 %; without, it is darker.
+    # In sparse media much light is turned back inside and leaves without another scattering.
+    sparse = Tissue(Medium(0.2, 1.0, g1=0.3), Medium(0.4, 1.0))
     scene = load_scene(scene_dict(tooth, light={"type": "constant"}))
     brightness = []
-    for roughness in ({"roughness": 0.05}, {}):
-        mean, variance = render(scene, properties(white(TISSUE), boundary="thin", **roughness), 512, 9)
+    for roughness in ({"roughness": 0.02}, {}):
+        mean, variance = render(scene, properties(sparse, boundary="thin", **roughness), 512, 9)
         seen = variance > 0
-        assert np.sqrt(variance[seen].sum()) / seen.sum() < 0.01 / 3
+        assert np.sqrt(variance[seen].sum()) / seen.sum() < 0.005 / 3
         brightness.append(mean[seen].mean())
-    assert abs(brightness[0] - 1) < 0.01
+    assert abs(brightness[0] - 1) < 0.005
     # Towards the viewer the face reflects at least what it does at normal incidence.
-    assert brightness[1] < 1 - ((1.631 - 1) / (1.631 + 1)) ** 2 + 0.01
+    assert brightness[1] < 1 - ((1.631 - 1) / (1.631 + 1)) ** 2 + 0.005
 
 
 def test_a_moved_tooth_is_seen_where_it_is(tooth: Path) -> None:
@@ -295,7 +297,7 @@ def test_derivatives_are_refused(tooth: Path) -> None:
 
 
 def test_an_instance_beside_the_tooth_is_no_tooth(tooth: Path) -> None:
-    # What lies in a shape group is not among the scene's shapes, and is numbered after them.
+    # What lies in a shape group is not among the scene's shapes.
     ball = {"type": "sphere", "radius": 1.0, "center": [2.5, 3.0, 3.5], "bsdf": {"type": "diffuse"}}
     group = {"type": "shapegroup", "ball": ball}
     scenes = ({"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}}}, {"ball": ball})

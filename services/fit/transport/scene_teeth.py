@@ -48,8 +48,7 @@ class SceneTeeth:
         # A shape is known by its number among all objects of the renderer.
         part = dict.fromkeys(shapes.enamel, ENAMEL) | dict.fromkeys(shapes.dentin, DENTIN)
         numbers = _numbers(scene)
-        self._numbers = int(numbers.max()) + 1
-        table = np.zeros(self._numbers, dtype=np.uint32)
+        table = np.zeros(int(numbers.max()) + 1, dtype=np.uint32)
         table[numbers] = [part.get(shape.id(), 0) for shape in scene.shapes()]
         self._parts = mi.UInt32(table)
         dr.eval(self._parts)
@@ -62,9 +61,8 @@ class SceneTeeth:
 
     def part(self, found: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
         """Of the surface that was hit: ENAMEL, DENTIN, or 0 where it belongs to no tooth."""
-        number = dr.reinterpret_array(mi.UInt32, found.shape)
-        # Shapes inside instances are not among the scene's own.
-        return dr.gather(mi.UInt32, self._parts, number, active & (number < self._numbers))
+        # In an instance no shape is given; that is number 0, no tooth's.
+        return dr.gather(mi.UInt32, self._parts, dr.reinterpret_array(mi.UInt32, found.shape), active)
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Dentin over enamel over whatever is outside (0)."""
