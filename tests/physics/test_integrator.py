@@ -198,6 +198,17 @@ def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
     assert brightness[1] < 1 - ((1.631 - 1) / (1.631 + 1)) ** 2 + 0.005
 
 
+def test_a_mirror_image_is_that_of_rough_plastic(tooth: Path) -> None:
+    # A tooth so dense and dark that only its outer face shows, against stock plastic without a base.
+    scene = scene_dict(tooth, table=table(-4.05, 0.5), lamp=LAMP, sky=SKY)
+    dark = properties(Tissue(Medium(50.0, 0.0), Medium(50.0, 0.0)), boundary="thin", roughness=0.3)
+    ours = render(load_scene(scene), dark, 256, 11)
+    plastic = {"type": "roughplastic", "distribution": "ggx", "alpha": 0.3, "int_ior": 1.631, "ext_ior": 1.0, "diffuse_reflectance": 0.0}
+    del scene["dentin_11"]
+    scene["outer_11"] = {"type": "ply", "filename": str(tooth / "outer.ply"), "face_normals": True, "bsdf": plastic}
+    compare(ours, render(load_scene(scene), {"type": "path", "max_depth": -1}, 256, 12), least=200)
+
+
 def test_a_moved_tooth_is_seen_where_it_is(tooth: Path) -> None:
     import mitsuba as mi
 
