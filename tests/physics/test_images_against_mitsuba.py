@@ -1,9 +1,6 @@
 """Images against stock Mitsuba's ``prbvolpath`` on the same nested scene, pixel by pixel.
 
-z-scores come from 16 batches a side, mapped through Student's t with Welch's degrees of freedom. The count beyond 3 stays
-below its 99.9 % binomial quantile, |mean z| below 4 standard errors, and the rms within 0.9 to 1.1 (of fewer than 500 values:
-within what chi-square leaves with probability 1e-3). An honest engine fails one run in 500; seeds are fixed. The lights of a
-pixel share its walks, so the standard error of the mean is that of the pixels' own means.
+The rule is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -14,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy import stats
 
 from services.core.meshfiles import read_teeth, write_mesh
 from services.core.records import Boundary, FolderCapture
@@ -25,40 +20,11 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, SceneRecipe
+from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
-from tests.support.z_scores import rms_bounds, student_to_normal
 
-BATCHES = 16
 TISSUE = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5))
-
-
-def pixel_scores(means: list[NDArray[np.float64]], variances: list[NDArray[np.float64]], block: int = 1) -> NDArray[np.float64]:
-    """z of two sides' images (lights, H, W), summed over blocks of pixels, NaN where unlit; variances are of means over BATCHES."""
-    means = [sum_blocks(mean, block) for mean in means]
-    squares = [sum_blocks(variance**2, block) for variance in variances]
-    total = sum_blocks(variances[0] + variances[1], block)
-    lit = total > 0
-    freedom = (BATCHES - 1) * total[lit] ** 2 / (squares[0] + squares[1])[lit]
-    z = np.full(total.shape, np.nan)
-    z[lit] = student_to_normal((means[0] - means[1])[lit] / np.sqrt(total[lit]), freedom)
-    return z
-
-
-def sum_blocks(images: NDArray[np.float64], block: int) -> NDArray[np.float64]:
-    *others, height, width = images.shape
-    cut = images[..., : height // block * block, : width // block * block]
-    return cut.reshape(*others, height // block, block, width // block, block).sum(axis=(-3, -1))
-
-
-def require_same_pictures(scores: NDArray[np.float64], least: int) -> None:
-    z = scores[np.isfinite(scores)]
-    of_pixels = np.array([row[np.isfinite(row)].mean() for row in scores.reshape(len(scores), -1).T if np.isfinite(row).any()])
-    assert len(z) >= least
-    assert abs(of_pixels.mean()) < 4 * of_pixels.std(ddof=1) / np.sqrt(len(of_pixels))
-    assert np.count_nonzero(np.abs(z) > 3) <= stats.binom.ppf(0.999, len(z), 2 * stats.norm.sf(3))
-    low, high = rms_bounds(len(z), rule=(0.9, 1.1))
-    assert low <= np.sqrt(np.mean(z**2)) <= high
 
 
 @pytest.mark.parametrize("boundary", ["matched", "thin"])

@@ -25,7 +25,7 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, SceneRecipe
-from tests.physics.test_images_against_mitsuba import BATCHES, pixel_scores, require_same_pictures
+from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
 Array = NDArray[np.float64]

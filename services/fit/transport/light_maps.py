@@ -24,6 +24,8 @@ from services.fit.transport.media import Media
 TEXEL_MM = 0.15
 """Spacing of the grid at the tooth."""
 MARGIN_MM = 1.0
+WIDEST = 3.0
+"""Half-width of the map over the tooth's radius, at most."""
 
 
 @dataclass
@@ -64,12 +66,12 @@ class LightMaps:
         right = np.cross(relative, helper)
         right *= (distance / np.linalg.norm(right, axis=1) / TEXEL_MM)[:, None]
 
-        # A sphere of this radius seen from so far away fills this half-angle.
-        half = (radius * distance / np.sqrt(distance**2 - radius**2)).max() / TEXEL_MM
+        # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the map is not certain.
+        half = (radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max() / TEXEL_MM
         self.count, self.size = len(positions_mm), 2 * int(np.ceil(half)) + 3
         self._near = float(radius + MARGIN_MM)
         self._centre = dr.opaque(mi.Vector3f, centre.tolist())
-        columns = [relative, intensities[:, None], right, distance[:, None]]
+        columns = [-relative / distance[:, None], intensities[:, None], right, distance[:, None]]
         self._frames = aligned(mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1)))
         self._table = mi.UInt32(0)
         self._offsets = (-self._near, -self._near, -self._near, 0.0)
@@ -96,9 +98,12 @@ class LightMaps:
         frame = self._frame(index // self.size**2)
         x = mi.Float(index % self.size) - self.size // 2
         y = mi.Float(index // self.size % self.size) - self.size // 2
-        per_texel = TEXEL_MM / frame.distance
-        direction = dr.normalize(frame.forward + (frame.right * x + frame.up * y) * dr.square(per_texel))
-        start = frame.distance - self._near
+        # Through a point of the plane across the tooth's centre; written without the difference of two long distances.
+        across = (frame.right * x + frame.up * y) * dr.square(TEXEL_MM / frame.distance)
+        ray_length = dr.norm(frame.forward + across) * frame.distance
+        direction = (frame.forward + across) * (frame.distance / ray_length)
+        offset = across * frame.distance
+        before = self._near + dr.squared_norm(offset) / (ray_length + frame.distance)
 
         @dataclass
         class Ray:
@@ -135,8 +140,9 @@ class LightMaps:
             ray.alive &= met & ((ray.meetings & 16) == 0)
             return (ray,)
 
+        start = mi.Point3f(self._centre + offset - direction * before)
         ray = Ray(
-            dr.fma(direction, start, frame.position), direction, start - frame.distance, dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes),
+            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes),
             dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Bool, True, lanes),
         )  # fmt: skip
         (ray,) = dr.while_loop((ray,), lambda ray: ray.alive, step, label="light map")
@@ -164,7 +170,6 @@ class LightMaps:
     class _Frame:
         """A light looking at the tooth; ``right`` and ``up`` are as long as there are texels in the distance."""
 
-        position: mi.Point3f
         intensity: mi.Float
         right: mi.Vector3f
         up: mi.Vector3f
@@ -173,32 +178,35 @@ class LightMaps:
 
     def _frame(self, light: mi.UInt32) -> LightMaps._Frame:
         first, second = (dr.gather(mi.Vector4f, self._frames, light * 2 + k) for k in (0, 1))
-        position, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
-        forward = position * -dr.rcp(second.w)
-        return LightMaps._Frame(mi.Point3f(position + self._centre), first.w, right, dr.cross(forward, right), forward, second.w)
+        forward, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
+        return LightMaps._Frame(first.w, right, dr.cross(forward, right), forward, second.w)
 
     def look(self, light: mi.UInt32, point: mi.Point3f, active: mi.Bool) -> LightView:
         """What lies between ``point``, inside the tooth, and a light."""
-        frame = self._frame(light)
-        from_light = mi.Vector3f(point - frame.position)
+        frame, from_centre = self._frame(light), mi.Vector3f(point - self._centre)
+        from_light = frame.forward * frame.distance + from_centre
+        ahead = dr.dot(from_centre, frame.forward)
         squared = dr.squared_norm(from_light)
         inverse = dr.rsqrt(squared)
-        depth = squared * inverse - frame.distance
+        # How much farther than the tooth's centre, without the difference of two long distances.
+        depth = dr.fma(2 * frame.distance, ahead, dr.squared_norm(from_centre)) / dr.fma(squared, inverse, frame.distance)
 
         # Bilinear interpolation between the four rays around the vertex.
-        per_forward = dr.rcp(dr.dot(from_light, frame.forward))
-        x = dr.fma(dr.dot(from_light, frame.right), per_forward, self.size // 2)
-        y = dr.fma(dr.dot(from_light, frame.up), per_forward, self.size // 2)
+        per_forward = dr.rcp(frame.distance + ahead)
+        x = dr.fma(dr.dot(from_centre, frame.right), per_forward, self.size // 2)
+        y = dr.fma(dr.dot(from_centre, frame.up), per_forward, self.size // 2)
         column, row = dr.floor(x), dr.floor(y)
         u, v = x - column, y - row
-        cell = dr.minimum((light * self.size + mi.UInt32(row)) * self.size + mi.UInt32(column), self.count * self.size**2 - self.size - 2)
+        cell = (light * self.size + mi.UInt32(dr.maximum(row, 0))) * self.size + mi.UInt32(dr.maximum(column, 0))
+        cell = dr.minimum(cell, self.count * self.size**2 - self.size - 2)
         corners = [[dr.gather(mi.UInt32, self._table, 2 * (cell + k) + half) for half in (0, 1)] for k in (0, 1, self.size, self.size + 1)]
         numbers = [[mi.Float(value) for half in corner for value in (half & 0xFFFF, half >> 16)] for corner in corners]
         entry, dentin_entry, dentin_exit, surface = (
             dr.fma(dr.lerp(dr.lerp(*values[:2], u), dr.lerp(*values[2:], u), v), step, offset)
             for values, step, offset in zip(zip(*numbers, strict=True), self._steps, self._offsets, strict=True)
         )
-        certain = active & ((corners[0][1] & 0x10000) != 0)
+        inside = (per_forward > 0) & (dr.minimum(column, row) >= 0) & (dr.maximum(column, row) < self.size - 1)
+        certain = active & inside & ((corners[0][1] & 0x10000) != 0)
         dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
         return LightView(-from_light * inverse, frame.intensity * dr.square(inverse), enamel_mm, dentin_mm, surface, certain)
