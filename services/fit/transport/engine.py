@@ -13,6 +13,7 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.checks import require_finite, require_lights, require_view
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
 
 if TYPE_CHECKING:
     from services.fit.transport.lights import PointLights
@@ -56,26 +57,59 @@ class Engine:
         self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
         self._lights.maps.trace(self._geometry, self._ior)
 
-    def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
+    def images(
+        self,
+        tissue: Tissue,
+        view: View,
+        *,
+        seed: int,
+        samples: int | None = None,
+        rel_error: float | None = None,
+        max_seconds: float = 600.0,
+        max_samples: int = MOST_SAMPLES,
+        batches: int = 16,
+    ) -> StackEstimate:
         """Radiance of ``view``'s pixels under each light.
 
         Args:
-            samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many batches.
             seed: with pixel and sample number it fixes every random number.
-            batches: independent batches whose spread gives the variance.
+            samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many batches.
+            rel_error: instead of ``samples``, sqrt(sum of variances) / norm to reach over all pixels and lights of the view.
+            max_seconds: with ``rel_error``, give the result as it stands after this time, with ``complete`` false and its true error.
+            max_samples: the same after so many paths per pixel. A result that was not cut short by time repeats bit for bit.
+            batches: independent batches whose spread gives the variance; one value's error follows Student's t with ``batches - 1``.
 
         Raises:
-            InputError: a parameter is outside its physical range, or the view lists no pixel. NonFiniteError: a result is NaN or infinite.
+            InputError: a parameter is outside its physical range, the view lists no pixel, or not exactly one of ``samples`` and ``rel_error`` is given.
+            NonFiniteError: a result is NaN or infinite.
         """
         from services.fit.transport.scores import Plan
 
-        sums, _ = self._trace(tissue, view, Plan(), samples, seed, batches)
-        return StackEstimate(*self._among_all(view, *_mean_and_variance(sums)))
+        def summarise(tables: Sums) -> StackEstimate:
+            mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
+            return StackEstimate(mean, variance)
 
-    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
+        effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
+        return trace_until(lambda numbers, batches: self._trace(tissue, view, Plan(), numbers, seed, batches), summarise, effort)
+
+    def jacobian(
+        self,
+        tissue: Tissue,
+        view: View,
+        names: tuple[str, ...],
+        *,
+        seed: int,
+        samples: int | None = None,
+        rel_error: float | None = None,
+        max_seconds: float = 600.0,
+        max_samples: int = MOST_SAMPLES,
+        batches: int = 4,
+    ) -> JacobianEstimate:
         """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
 
-        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms.
+        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms. Arguments are those of
+        ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative to its own norm. A derivative that
+        is zero everywhere never gets there: give a limit.
 
         Raises:
             As ``images``; InputError also for a name the scene does not have.
@@ -91,12 +125,16 @@ class Engine:
         medium_names = [name for name in names if not name.startswith("shape.")]
         scores = tuple(Score(PART_NUMBER[name.split(".")[0]], name.split(".")[1]) for name in medium_names)
         plan = Plan(scores=scores, shape=any(name.startswith("shape.") for name in names))
-        sums, derivatives = self._trace(tissue, view, plan, samples, seed, batches)
-        mean, variance = self._among_all(view, *_mean_and_variance(sums))
-        place = {name: k for k, name in enumerate(medium_names + [f"shape.{k}" for k in range(modes)])}
-        pairs = [self._among_all(view, *_mean_and_variance(derivatives[place[name]])) for name in names]
-        empty = np.zeros((0, *mean.shape))
-        return JacobianEstimate(names, mean, variance, np.stack([p[0] for p in pairs]) if pairs else empty, np.stack([p[1] for p in pairs]) if pairs else empty)
+        place = {name: k for k, name in enumerate(medium_names + [f"shape.{k}" for k in range(modes)], 1)}
+
+        def summarise(tables: Sums) -> JacobianEstimate:
+            mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
+            pairs = [self._among_all(view, *_mean_and_variance(tables[place[name]])) for name in names]
+            slopes, slope_variances = (np.stack([pair[k] for pair in pairs]) if pairs else np.zeros((0, *mean.shape)) for k in range(2))
+            return JacobianEstimate(names, mean, variance, slopes, slope_variances)
+
+        effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
+        return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
 
     def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> NDArray[np.float64]:
         """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
@@ -108,23 +146,21 @@ class Engine:
         from services.fit.transport.scores import Plan
 
         white = Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
-        sums, _ = self._trace(white, view, Plan(order_edges=tuple(int(edge) for edge in bin_edges)), samples, seed, batches)
-        bins = len(bin_edges) - 1
-        _, count, slots = sums.shape
-        (orders,) = self._among_all(view, sums.mean(axis=0).reshape(count, slots // bins, bins).T)
+        plan, bins = Plan(order_edges=tuple(int(edge) for edge in bin_edges)), len(bin_edges) - 1
+        batches, count = Effort(samples=samples, batches=batches).shares(samples)
+        (sums,) = self._trace(white, view, plan, range(count), seed, batches)
+        (orders,) = self._among_all(view, (sums / count).mean(axis=0).reshape(len(view), -1, bins).T)
         return orders
 
     def _parts(self) -> tuple[str, ...]:
         return ("enamel",) if self.recipe.dentin is None else ("enamel", "dentin")
 
-    def _trace(self, tissue: Tissue, view: View, plan: Plan, samples: int, seed: int, batches: int) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Means per batch, (batches, N, slots), of contributions and of each derivative."""
+    def _trace(self, tissue: Tissue, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
+        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
         from services.fit.transport.media import Media, require_medium
         from services.fit.transport.starts import CameraStart
 
         require_view(view, self.recipe)
-        if samples < 1 or batches < 1:
-            raise InputError(f"samples = {samples} and batches = {batches} must be at least 1; ask for one path per pixel or more.")
         media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
         for part, medium in zip(self._parts(), media, strict=True):
             require_medium(part, medium)
@@ -136,8 +172,6 @@ class Engine:
             self._some_lights.clear()
 
         lights, kernel_media = self._lights_of(view), Media(media)
-        batches = min(batches, samples)
-        per_batch = -(-samples // batches)
         bins = max(len(plan.order_edges) - 1, 1)
         slots = lights.count * bins
         tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)
@@ -145,12 +179,12 @@ class Engine:
         pieces = []
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
-            start = CameraStart(piece, batches, seed, self._radius_mm)
-            sums, derivatives = self._walk(kernel_media, lights, start, plan).run(per_batch).arrays()
-            pieces.append([array.reshape(batches, len(piece), slots) / per_batch for array in (sums, *derivatives)])
+            start = CameraStart(piece, batches, seed, self._radius_mm, skipped=numbers.start)
+            sums, derivatives = self._walk(kernel_media, lights, start, plan).run(len(numbers)).arrays()
+            pieces.append([array.reshape(batches, len(piece), slots) for array in (sums, *derivatives)])
         whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
         require_finite(whole, view)
-        return whole[0], whole[1:]
+        return whole
 
     def _among_all(self, view: View, *arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Arrays (..., lights of the view, N) with zeros in place of the lights that were not sampled."""

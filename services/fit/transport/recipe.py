@@ -52,12 +52,29 @@ class View:
         return len(self.pixels)
 
 
+def relative_error(mean: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
+    """sqrt(sum of variances) / norm: 0 for what is dark and certain, NaN without batches to compare."""
+    spread, norm = float(np.sqrt(variance.sum())), float(np.linalg.norm(mean))
+    if norm == 0:
+        return 0.0 if spread == 0 else np.inf
+    return spread / norm
+
+
 @dataclass(frozen=True)
 class StackEstimate:
     """Images of one view under all lights: mean and variance of the mean, both (L, N)."""
 
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    samples: int = 0
+    """Paths per pixel behind them; 0 if not known."""
+    complete: bool = True
+    """Whether the error asked for was reached before a limit was."""
+
+    @property
+    def rel_error(self) -> float:
+        """sqrt(sum of variances) / norm over all pixels and lights."""
+        return relative_error(self.mean, self.variance)
 
 
 @dataclass(frozen=True)
@@ -69,3 +86,12 @@ class JacobianEstimate:
     variance: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     jacobian_variance: NDArray[np.float64]
+    samples: int = 0
+    """As ``StackEstimate``, as are the next two."""
+    complete: bool = True
+
+    @property
+    def rel_error(self) -> float:
+        """The worst of the images and of each derivative, each relative to its own norm: units of parameters do not matter."""
+        pairs = [(self.mean, self.variance), *zip(self.jacobian, self.jacobian_variance, strict=True)]
+        return float(np.max([relative_error(*pair) for pair in pairs]))

@@ -40,15 +40,15 @@ class PathStart:
 
 
 class CameraStart:
-    """Walks from a view's pixels, box filter."""
+    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples."""
 
-    def __init__(self, view: View, batches: int, seed: int, radius_mm: float) -> None:
+    def __init__(self, view: View, batches: int, seed: int, radius_mm: float, skipped: int = 0) -> None:
         camera = view.camera
         width, _ = camera.size
         x, y = view.pixels[:, 0].astype(np.uint32), view.pixels[:, 1].astype(np.uint32)
         self.lanes = batches * len(view)
         self._pixels = np.tile(y * width + x, batches)
-        self._batch = np.repeat(np.arange(batches, dtype=np.uint32), len(view))
+        self._batch = np.repeat(np.arange(batches, dtype=np.uint32) + np.uint32(skipped * batches), len(view))
         self.pixel = mi.UInt32(self._pixels.astype(np.uint32))
         self.batch = mi.UInt32(self._batch)
         self.width = width
@@ -63,7 +63,7 @@ class CameraStart:
         dr.eval(self.pixel, self.batch)
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
-        """A path through a random point of the lane's pixel; ``sample`` counts within the batch."""
+        """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is not skipped."""
         pixel = dr.gather(mi.UInt32, self.pixel, lane, active)
         batch = dr.gather(mi.UInt32, self.batch, lane, active)
         rng = stream(self.seed, pixel, sample * self.batches + batch)

@@ -1,0 +1,106 @@
+"""How long to trace: a number of paths, or rounds of growing size until the result's own error is as small as asked."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import InputError
+from services.fit.transport.recipe import JacobianEstimate, StackEstimate
+
+FIRST_ROUND = 4
+"""Paths per batch in the first round."""
+GROWTH = 4.0
+"""A round makes all paths so far at most this many times more: an early estimate of the error is not trusted further."""
+LEAST_GROWTH = 1.25
+"""And at least this: every look at the error is a chance to stop on one that is too small by luck."""
+SAFETY = 1.05
+"""More paths than the error so far asks for."""
+MOST_SAMPLES = 2**31
+"""Paths per pixel that sample numbers of 32 bits tell apart, with room to spare."""
+
+Sums = list[NDArray[np.float64]]
+"""Per table, (batches, N, slots) summed over paths."""
+Estimate = TypeVar("Estimate", StackEstimate, JacobianEstimate)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a caller asks for: either ``samples`` paths per pixel, or ``rel_error`` within the limits.
+
+    Raises:
+        InputError: both or neither is given, or a number is out of its range.
+    """
+
+    samples: int | None = None
+    rel_error: float | None = None
+    max_seconds: float = math.inf
+    max_samples: int = MOST_SAMPLES
+    batches: int = 16
+
+    def __post_init__(self) -> None:
+        if (self.samples is None) == (self.rel_error is None):
+            raise InputError(f"samples = {self.samples} and rel_error = {self.rel_error}: give exactly one, a number of paths per pixel or an error to reach.")
+        if self.samples is not None and (self.samples < 1 or self.batches < 1):
+            raise InputError(f"samples = {self.samples} and batches = {self.batches} must be at least 1; ask for one path per pixel or more.")
+        if self.rel_error is None:
+            return
+        if not 0 < self.rel_error < 1:
+            raise InputError(f"rel_error = {self.rel_error:g} must lie between 0 and 1; 0.01 is usual.")
+        if self.batches < 2:
+            raise InputError(f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between batches.")
+        if not self.max_seconds >= 0 or not self.batches <= self.max_samples <= MOST_SAMPLES:
+            raise InputError(
+                f"max_seconds = {self.max_seconds:g} must not be negative, and max_samples = {self.max_samples} must lie in "
+                f"batches = {self.batches} to {MOST_SAMPLES}; correct the limits."
+            )
+
+    def shares(self, samples: int) -> tuple[int, int]:
+        """Batches, and sample numbers in each, that make up ``samples`` paths per pixel."""
+        batches = min(self.batches, samples)
+        return batches, -(-samples // batches)
+
+
+def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums], Estimate], effort: Effort) -> Estimate:
+    """Trace rounds with sample numbers that follow on, and summarise all of them together.
+
+    Every batch has an equal share of every round, so that however many rounds were needed, errors have one degree of freedom less than
+    there are batches.
+
+    Args:
+        trace: sums over the sample numbers in a range, in every one of so many batches.
+        summarise: from means per path.
+    """
+    if effort.samples is not None:
+        batches, count = effort.shares(effort.samples)
+        return _summary(summarise, trace(range(count), batches), count, batches, complete=True)
+
+    assert effort.rel_error is not None
+    batches, most, begun_s = effort.batches, effort.max_samples // effort.batches, time.monotonic()
+    done, following = 0, min(FIRST_ROUND, most)
+    totals: Sums = []
+    while True:
+        sums = trace(range(done, done + following), batches)
+        totals = [total + new for total, new in zip(totals, sums, strict=True)] if totals else sums
+        done += following
+        estimate = _summary(summarise, totals, done, batches, complete=False)
+        missing = (estimate.rel_error / effort.rel_error) ** 2
+        if missing <= 1:
+            return replace(estimate, complete=True)
+        # As many paths as the error asks for, but no round far beyond the time that is left.
+        elapsed_s = time.monotonic() - begun_s
+        if done >= most or elapsed_s >= effort.max_seconds:
+            return estimate
+        wanted = done * (np.clip(SAFETY * missing, LEAST_GROWTH, GROWTH) - 1)
+        affordable = done * (effort.max_seconds - elapsed_s) / elapsed_s
+        following = max(1, min(math.ceil(min(wanted, affordable)), most - done))
+
+
+def _summary(summarise: Callable[[Sums], Estimate], totals: Sums, count: int, batches: int, *, complete: bool) -> Estimate:
+    return replace(summarise([total / count for total in totals]), samples=count * batches, complete=complete)
