@@ -12,6 +12,7 @@ from services.core.geometry import Camera, Light, Record, Vector3
 
 Unit = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
+Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 
 
@@ -97,6 +98,7 @@ class JobSpec(Record):
     sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
     workers: int = Field(default=2, ge=1, le=1024, description="processes of a local run")
+    device: Device = Field(default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker")
 
     @model_validator(mode="after")
     def _one_source(self) -> JobSpec:

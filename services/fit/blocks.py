@@ -111,6 +111,7 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         light_intensities=recipe.light_intensities,
         boundary=np.array(recipe.boundary),
         ior=np.array(recipe.ior),
+        device=np.array(recipe.device or ""),
         **dentin,
     )
 
@@ -129,6 +130,7 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         light_intensities=a["light_intensities"].astype(float),
         boundary="thin" if str(a["boundary"]) == "thin" else "matched",
         ior=float(np.asarray(a["ior"], dtype=float)),
+        device="cuda" if str(a["device"]) == "cuda" else "llvm" if str(a["device"]) == "llvm" else None,
     )
 
 

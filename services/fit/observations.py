@@ -177,7 +177,7 @@ def write_channel(
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
-        return write_recipe(folder, SceneRecipe(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior))
+        return write_recipe(folder, SceneRecipe(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device))
 
     def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
         files = []

@@ -1,4 +1,4 @@
-"""A block asks for the lights under which it has something to compare, and for no other."""
+"""A block asks for the lights under which it has something to compare, and for no other; scenes keep what they are stored with."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.fit.blocks import Block, StoredFile, read_block, write_block
+from services.core.records import Device
+from services.fit.blocks import Block, StoredFile, read_block, read_recipe, write_block, write_recipe
 from services.fit.evaluate import evaluate_task
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.passes import BlockTask, compare_task, image_task, jacobian_task, orders_task
-from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
-from tests.support.small_tooth import camera_at
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid
 
 
 def block_with(weights: list[list[float]]) -> Block:
@@ -33,6 +34,18 @@ def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: li
     assert block.fitted_view.lights == lights
     np.testing.assert_array_equal(block.fitted_view.pixels, block.view.pixels)
     assert block.view.lights is None
+
+
+@pytest.mark.parametrize("device", [None, "llvm", "cuda"])
+def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) -> None:
+    scene = SceneRecipe(ellipsoid(SEMI_AXES_MM), dentin_shape(), LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device)
+    stored = read_recipe(write_recipe(tmp_path, scene))
+    assert (stored.boundary, stored.ior, stored.device) == ("thin", 1.5, device)
+    assert stored.dentin is not None
+    assert scene.dentin is not None
+    np.testing.assert_array_equal(stored.dentin.modes_mm, scene.dentin.modes_mm)
+    np.testing.assert_array_equal(stored.outer.vertices_mm, scene.outer.vertices_mm)
+    np.testing.assert_array_equal(stored.light_positions_mm, scene.light_positions_mm)
 
 
 class Recorder:

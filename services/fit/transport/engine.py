@@ -43,7 +43,7 @@ class Engine:
         require_lights(recipe.light_positions_mm, recipe.light_intensities, reach_mm)
         if not math.isfinite(recipe.ior) or recipe.ior < 1:
             raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
-        prepare_device(threads)
+        prepare_device(threads, recipe.device)
         from services.fit.transport.geometry import MeshGeometry
         from services.fit.transport.light_maps import LightMaps
         from services.fit.transport.lights import PointLights

@@ -6,6 +6,7 @@ import importlib
 from typing import Literal
 
 from services.core.errors import PlatformError
+from services.core.records import Device
 
 OLDEST_LLVM = 17
 """libLLVM 13 and 14 are refused by Dr.Jit with a misleading sentence; 15 and 16 abort the process in the first kernel."""
@@ -24,12 +25,12 @@ def require_llvm(version: tuple[int, int, int]) -> None:
         raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {remedy}.")
 
 
-def prepare_device(threads: int | None = None, backend: str = "llvm", colours: Literal["mono", "rgb"] = "mono") -> None:
+def prepare_device(threads: int | None = None, backend: Device | None = None, colours: Literal["mono", "rgb"] = "mono") -> None:
     """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same back end do nothing.
 
     Args:
         threads: CPU threads of this process; None keeps Dr.Jit's default.
-        backend: ``llvm`` or ``cuda``.
+        backend: ``llvm`` or ``cuda``; None takes what this process already uses, else ``llvm``.
         colours: ``mono`` for everything that fits; ``rgb`` for pictures of other people's scenes.
 
     Raises:
@@ -37,6 +38,8 @@ def prepare_device(threads: int | None = None, backend: str = "llvm", colours: L
     """
     drjit = importlib.import_module("drjit")
     mitsuba = importlib.import_module("mitsuba")
+    if backend is None:
+        backend = "cuda" if (mitsuba.variant() or "").startswith("cuda") else "llvm"
     variant = f"{backend}_ad_{colours}"
     if mitsuba.variant() == variant:
         return
@@ -45,7 +48,7 @@ def prepare_device(threads: int | None = None, backend: str = "llvm", colours: L
     if backend == "llvm":
         require_llvm(tuple(drjit.detail.llvm_version()))
     elif not drjit.has_backend(drjit.JitBackend.CUDA):
-        raise PlatformError("No CUDA device or driver was found; set the variant to llvm.")
+        raise PlatformError("No CUDA device or driver was found; set device to llvm.")
     mitsuba.set_variant(variant)
     if threads is not None:
         drjit.set_thread_count(threads)

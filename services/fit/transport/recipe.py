@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
-from services.core.records import Boundary
+from services.core.records import Boundary, Device
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class SceneRecipe:
     """(L,) radiant intensity of this channel, mm as length unit."""
     boundary: Boundary = "matched"
     ior: float = 1.631
+    device: Device | None = None
+    """Where its paths are traced; None for where this process already renders, else the processor."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,21 @@
+"""One option for all tests: the device on which paths are traced."""
+
+from __future__ import annotations
+
+import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", choices=("llvm", "cuda"), help="trace paths there in this process's tests; a CUDA device must be present for cuda")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    device = session.config.getoption("--device")
+    if device is not None:
+        from services.core.errors import PlatformError
+        from services.fit.transport.platform import prepare_device
+
+        try:
+            prepare_device(backend=device)
+        except PlatformError as problem:
+            raise pytest.UsageError(str(problem)) from problem
