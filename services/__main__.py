@@ -274,6 +274,7 @@ _BENCHMARKS = MappingProxyType(
     {
         "slab": "services.fit.bench.slab:run",
         "stability": "services.fit.bench.stability:run",
+        "transport-gradient": "services.fit.bench.transport_gradient:run",
         "transport-skip": "services.fit.bench.transport_skip:run",
         "transport-stack": "services.fit.bench.transport_stack:run",
     }

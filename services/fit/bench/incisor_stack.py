@@ -1,0 +1,71 @@
+"""What the transport benchmarks share: a procedural incisor under the lights of a dome, for this engine and for stock Mitsuba."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Mesh
+from services.core.meshfiles import write_mesh
+from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+
+TISSUE = Tissue(Medium(4.5, 0.997, 0.93, 0.82, -0.1), Medium(12.0, 0.9945, 1.0, 0.75))
+PIXEL_MM = 0.5
+
+
+@dataclass(frozen=True)
+class IncisorStack:
+    """A tooth, one camera and L point lights."""
+
+    outer: Mesh
+    dentin: Mesh
+    camera: Camera
+    light_positions_mm: NDArray[np.float64]
+    """(L, 3)"""
+    light_intensities: NDArray[np.float64]
+    """(L,)"""
+
+    def recipe(self, dentin: DentinShape | None = None) -> SceneRecipe:
+        """The scene for this engine, with the tooth's own dentin unless told otherwise; faces do not reflect."""
+        known = DentinShape(self.dentin, np.zeros((0, len(self.dentin.vertices_mm), 3)))
+        return SceneRecipe(self.outer, dentin or known, self.light_positions_mm, self.light_intensities)
+
+    def tooth_view(self, engine: Engine, tissue: Tissue) -> View:
+        """The pixels in which some light shows the tooth."""
+        width, height = self.camera.size
+        y, x = np.mgrid[0:height, 0:width]
+        everything = View(self.camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.int32))
+        seen = engine.images(tissue, everything, samples=16, seed=99).mean.sum(axis=0) > 0
+        return View(self.camera, everything.pixels[seen])
+
+    def some_lights(self, count: int) -> NDArray[np.int64]:
+        """Indices of lights for a peer that is too dear for all of them."""
+        return np.linspace(0, len(self.light_positions_mm) - 1, count).astype(np.int64)
+
+    def stock_scene(self, folder: Path, tissue: Tissue, light: int, samples: int = 16) -> Any:
+        """The same under one light as a stock Mitsuba scene; its meshes are written into ``folder``."""
+        from services.fit.export.mitsuba_scene import load_scene, nested_scene
+
+        files = folder / "outer.ply", folder / "dentin.ply"
+        if not files[1].exists():
+            write_mesh(files[0], self.outer)
+            write_mesh(files[1], self.dentin)
+        where, intensity = self.light_positions_mm[light], float(self.light_intensities[light])
+        return load_scene(nested_scene({"tooth": files}, tissue, (self.camera,), where, intensity, boundary="matched", ior=1.0, samples=samples))
+
+
+def incisor_stack(lights: int) -> IncisorStack:
+    """The tooth under so many lights of a dome, the same each time."""
+    incisor = build_incisor()
+    (camera,) = dome_cameras(1, PIXEL_MM, (incisor.outer,))
+    rig = dome_lights(lights, ("green",), seed=1)
+    positions, intensities = np.array([light.position_mm for light in rig]), np.array([light.intensity[0] for light in rig])
+    return IncisorStack(incisor.outer, incisor.dentin, camera, positions, intensities)

@@ -1,0 +1,112 @@
+"""The derivative to the dentin's shape against central differences with the engine itself.
+
+The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would show for dentin of another shape; so
+both sides are linear estimates whose variance falls as 1 / paths. Ours is one Jacobian pass (both border terms) for all modes; the peer is two image
+passes per mode with common random numbers, the surfaces already in place.
+
+Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps and to our own
+derivative. Asked for an error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.anatomy.blend import dentin_blend_shape
+from services.fit.bench.incisor_stack import TISSUE, incisor_stack
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import View
+
+if TYPE_CHECKING:
+    from services.fit.bench.transport_gradient import Estimate, GradientRow
+
+Array = NDArray[np.float64]
+
+TISSUES = {"white": TISSUE, "dark": Tissue(Medium(2.0, 0.95, 0.93, 0.82, -0.1), Medium(4.0, 0.85, 1.0, 0.75))}
+SHAPE, OTHER_SHAPE = (0.5, 0.5, 0.5), (0.8, 0.8, 0.8)
+STEPS = (0.05, 0.1, 0.2, 0.4)
+WANTED_ERROR = 0.05
+"""Of the derivative: the common error at which the two are compared."""
+
+
+def shape_rows(*, quick: bool) -> list[GradientRow]:
+    """By tissue and mode: our row, the peer's at every step, and its summary at the best one."""
+    stack = incisor_stack(18 if quick else 54)
+    engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
+    samples, repeats = (32, 3) if quick else (128, 4)
+    rows: list[GradientRow] = []
+    for name, media in TISSUES.items():
+        tissue = replace(media, shape=SHAPE)
+        view = stack.tooth_view(engine, tissue)
+        other = engine.images(replace(media, shape=OTHER_SHAPE), view, samples=2 * samples, seed=7).mean
+        picture = engine.images(tissue, view, samples=2 * samples, seed=7).mean - other
+        for mode in range(1 if quick else 3):
+            ours = _scores(engine, tissue, view, mode, picture, samples, repeats)
+            differences = {h: _differences(engine, tissue, view, mode, h, picture, samples, repeats) for h in STEPS}
+            rows += _compare(name, mode, samples, ours, differences)
+    return rows
+
+
+def _scores(engine: Engine, tissue: Tissue, view: View, mode: int, picture: Array, samples: int, repeats: int) -> Estimate:
+    from services.fit.bench.transport_gradient import of_parts
+
+    names = tuple(f"shape.{k}" for k in range(len(tissue.shape)))
+    engine.jacobian(tissue, view, names, samples=samples, seed=0)
+    begun = time.process_time()
+    slopes = [engine.jacobian(tissue, view, names, samples=samples, seed=100 + repeat).jacobian[mode] for repeat in range(repeats)]
+    # One pass serves all modes.
+    seconds = (time.process_time() - begun) / repeats / len(names)
+    return of_parts((np.stack(slopes) * picture).sum(axis=1)[:, None], seconds)
+
+
+def _differences(engine: Engine, tissue: Tissue, view: View, mode: int, step: float, picture: Array, samples: int, repeats: int) -> Estimate:
+    from services.fit.bench.transport_gradient import of_parts
+
+    seconds, sides = 0.0, []
+    for sign in (1, -1):
+        moved = tissue.with_values({f"shape.{mode}": tissue.shape[mode] + sign * step})
+        engine.images(moved, view, samples=16, seed=0)
+        begun = time.process_time()
+        sides.append(np.stack([engine.images(moved, view, samples=samples, seed=200 + repeat).mean for repeat in range(repeats)]))
+        seconds += (time.process_time() - begun) / repeats
+    return of_parts(((sides[0] - sides[1]) * picture).sum(axis=1)[:, None] / (2 * step), seconds)
+
+
+def _compare(tissue: str, mode: int, samples: int, ours: Estimate, differences: dict[float, Estimate]) -> list[GradientRow]:
+    from services.fit.bench.transport_gradient import GradientRow
+
+    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias.
+    steps = np.array([0.0, *differences])
+    values = np.array([ours.mean[0], *(d.mean[0] for d in differences.values())])
+    spread = np.sqrt([ours.mean_variance[0], *(d.mean_variance[0] for d in differences.values())])
+    design = np.stack([np.ones_like(steps), steps**2], axis=1) / spread[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    derivative, bias = covariance @ design.T @ (values / spread)
+    # The square of a noisy k is too large by its variance; what is not resolved counts as no bias, in the peer's favour.
+    bias_squared = max(bias**2 - covariance[1, 1], 0.0)
+
+    wanted = (WANTED_ERROR * derivative) ** 2
+    costs = {h: d.seconds * d.variance[0] / max(wanted - bias_squared * h**4, 1e-300) for h, d in differences.items()}
+    best = min(costs, key=lambda h: costs[h])
+    # z against the peer alone: its own D(0), from its own steps.
+    own = np.linalg.inv(design[1:].T @ design[1:])
+    theirs = (own @ design[1:].T @ (values / spread)[1:])[0]
+    z = float((theirs - values[0]) / np.sqrt(own[0, 0] + spread[0] ** 2))
+
+    def row(peer: str, estimate: Estimate) -> GradientRow:
+        error = float(np.sqrt(estimate.variance[0]) / abs(derivative))
+        return GradientRow(
+            benchmark=f"transport-gradient {tissue}", peer=peer, seconds=estimate.seconds, error=error,
+            parameter=f"shape.{mode}", samples=samples, gradient=float(estimate.mean[0]),
+        )  # fmt: skip
+
+    rows = [row("dentine", ours), *(row(f"central differences, step {h:g}", d) for h, d in differences.items())]
+    ratio = float(costs[best] * wanted / (ours.seconds * ours.variance[0]))
+    summary = row(f"central differences, step {best:g}", differences[best])
+    return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient-summary {tissue}", "efficiency_ratio": ratio, "z": z})]

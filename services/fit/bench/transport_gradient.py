@@ -1,0 +1,156 @@
+"""Gradients of an L2 loss over the images of an incisor under all lights of a dome, against the best that is at hand without this engine.
+
+Media: 1/2 sum (C - reference)^2 to sigma, alpha, g and the lobes' weight of enamel and dentin. Ours is J'(C - reference) from a few Jacobian passes, each
+one's derivatives with the images of the others, so that the two always have independent seeds. The peer is stock ``prbvolpath``, an image and backward,
+light by light on a few of the lights, scaled to all. Shape: see ``shape_gradient``. There are no stains in the engine yet, so none are measured.
+
+Noise of the images times noise of the derivatives falls as 1 / paths squared and rules short runs on both sides; each is judged at its largest count, where
+their errors are about equal.
+
+Efficiency is 1 / (variance x time). Time is processor time of all threads, after everything is compiled: it is the same measure for either side on
+equal threads, and other jobs on the machine move it less than they move a clock. Variances come from independent repeats; pixels (ours) and lights (the
+peer's) have random numbers of their own, so a gradient's variance is the sum of theirs.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.bench import Row
+from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
+from services.fit.bench.stock_gradient import StockGradient, shared_names
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import View
+
+Array = NDArray[np.float64]
+
+OTHER_TISSUE = Tissue(Medium(3.8, 0.996, 0.9, 0.8, -0.1), Medium(13.5, 0.9925, 1.0, 0.72))
+"""Shown by the reference images: about 10 % from ``TISSUE``'s."""
+
+PASSES = 4
+
+
+class GradientRow(Row):
+    """A row of the gradient to one parameter, or of all of them: then ``error`` is the geometric mean of theirs."""
+
+    parameter: str | None = None
+    samples: int | None = None
+    """Paths per pixel and light of the peer's image and of its backward pass; of all our Jacobian passes together."""
+    gradient: float | None = None
+    """To the natural parameter; the row's ``error`` is relative to it."""
+    z: float | None = None
+    """In a peer's summary row: its gradient less ours under the same lights, in standard errors; in the one over all parameters the rms of theirs."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A gradient (F,), the variance of a single such estimate, the variance of ``mean``, and the time a single one takes."""
+
+    mean: Array
+    variance: Array
+    mean_variance: Array
+    seconds: float
+
+
+def run(*, quick: bool) -> list[dict[str, Any]]:
+    """Rows by parameter of this engine and of the peers, and the peers' summary rows."""
+    from services.fit.bench.shape_gradient import shape_rows
+
+    return [row.model_dump() for row in [*media_rows(quick=quick), *shape_rows(quick=quick)]]
+
+
+def media_rows(*, quick: bool) -> list[GradientRow]:
+    """Gradient to the media against ``prbvolpath``: either side's rows at growing sample counts, the peer's summary by parameter and over all."""
+    stack = incisor_stack(18 if quick else 54)
+    engine, names = Engine(stack.recipe()), shared_names(TISSUE)
+    view = stack.tooth_view(engine, TISSUE)
+    chosen = stack.some_lights(2 if quick else 6)
+    reference = engine.images(OTHER_TISSUE, view, samples=256 if quick else 1024, seed=7).mean
+
+    counts, peer_counts, repeats = ((32, 256), (16, 64), 3) if quick else ((64, 256, 1024), (64, 256), 4)
+    pairs = [our_gradient(engine, TISSUE, view, reference, names, chosen, samples=samples, repeats=repeats) for samples in counts]
+    ours, best = pairs[-1][0], pairs[-1]
+    rows = [row for samples, (whole, _) in zip(counts, pairs, strict=True) for row in _rows("dentine", names, samples, whole, ours.mean)]
+    scale = len(reference) / len(chosen)
+    with tempfile.TemporaryDirectory() as folder:
+        for samples in peer_counts:
+            peer = _stock_gradient(Path(folder), stack, view, reference, chosen, samples=samples, repeats=repeats)
+            scaled = Estimate(peer.mean * scale, peer.variance * scale, peer.mean_variance * scale, peer.seconds * scale)
+            rows += _rows("mitsuba-prbvolpath", names, samples, scaled, ours.mean)
+    return rows + _summary(names, best, peer, scaled)
+
+
+def our_gradient(
+    engine: Engine, tissue: Tissue, view: View, reference: Array, names: tuple[str, ...], chosen: NDArray[np.int64], *, samples: int, repeats: int
+) -> tuple[Estimate, Estimate]:
+    """The gradient over all lights, and over the chosen ones alone (its time is that of all).
+
+    Args:
+        reference: (L, N).
+        samples: paths per pixel of all passes together, a multiple of ``PASSES``.
+    """
+
+    def once(repeat: int) -> Array:
+        passes = [engine.jacobian(tissue, view, names, samples=samples // PASSES, seed=repeat * PASSES + k, batches=1) for k in range(PASSES)]
+        # The mean over all pairs of two passes: the product of the means less each pass's product with itself.
+        residuals = [one.mean - reference for one in passes]
+        alone = sum(one.jacobian * residual for one, residual in zip(passes, residuals, strict=True))
+        together = sum(one.jacobian for one in passes) * sum(residuals)
+        return np.asarray((together - alone) / (PASSES * (PASSES - 1)))
+
+    once(0)
+    begun = time.process_time()
+    terms = np.stack([once(repeat) for repeat in range(1, repeats + 1)])
+    seconds = (time.process_time() - begun) / repeats
+    return of_parts(terms.sum(axis=2), seconds), of_parts(terms[:, :, chosen].sum(axis=2), seconds)
+
+
+def of_parts(repeats: Array, seconds: float) -> Estimate:
+    """From repeats of a sum over parts with random numbers of their own, (R, F, parts)."""
+    variance = repeats.var(axis=0, ddof=1).sum(axis=-1)
+    return Estimate(repeats.mean(axis=0).sum(axis=-1), variance, variance / len(repeats), seconds)
+
+
+def _stock_gradient(folder: Path, stack: IncisorStack, view: View, reference: Array, chosen: NDArray[np.int64], *, samples: int, repeats: int) -> Estimate:
+    seconds, by_light = 0.0, []
+    for light in chosen.tolist():
+        gradient = StockGradient(stack.stock_scene(folder, TISSUE, light), TISSUE, view)
+        gradient(reference[light], samples=samples, seed=0)
+        begun = time.process_time()
+        by_light.append([gradient(reference[light], samples=samples, seed=1 + light * repeats + repeat) for repeat in range(repeats)])
+        seconds += (time.process_time() - begun) / repeats
+    return of_parts(np.array(by_light).transpose(1, 2, 0), seconds)
+
+
+def _rows(peer: str, names: tuple[str, ...], samples: int, estimate: Estimate, gradient: Array) -> list[GradientRow]:
+    errors = np.sqrt(estimate.variance) / np.abs(gradient)
+    common: dict[str, Any] = {"benchmark": "transport-gradient", "peer": peer, "seconds": estimate.seconds, "samples": samples}
+    single = [GradientRow(**common, error=e, parameter=n, gradient=g) for n, e, g in zip(names, errors.tolist(), estimate.mean.tolist(), strict=True)]
+    return [*single, GradientRow(**common, error=float(np.exp(np.mean(np.log(errors)))))]
+
+
+def _summary(names: tuple[str, ...], ours: tuple[Estimate, Estimate], peer: Estimate, scaled: Estimate) -> list[GradientRow]:
+    whole, few = ours
+    z = (peer.mean - few.mean) / np.sqrt(peer.mean_variance + few.mean_variance)
+    # The size of the gradient is common to both and drops out.
+    ratios = scaled.variance * scaled.seconds / (whole.variance * whole.seconds)
+    errors = np.sqrt(scaled.variance) / np.abs(whole.mean)
+    common: dict[str, Any] = {"benchmark": "transport-gradient-summary", "peer": "mitsuba-prbvolpath", "seconds": scaled.seconds}
+    single = [
+        GradientRow(**common, error=error, parameter=name, z=score, efficiency_ratio=ratio)
+        for name, error, score, ratio in zip(names, errors.tolist(), z.tolist(), ratios.tolist(), strict=True)
+    ]
+    means: dict[str, Any] = {
+        "error": float(np.exp(np.mean(np.log(errors)))),
+        "efficiency_ratio": float(np.exp(np.mean(np.log(ratios)))),
+        "z": float(np.sqrt(np.mean(z**2))),
+    }
+    return [*single, GradientRow(**common, **means)]
