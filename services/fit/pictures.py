@@ -38,6 +38,8 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
 
 def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> tuple[Picture, ...]:
     """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
+    # A fit of every n-th pixel is shown as the smaller picture it is, not as dots.
+    every = min((spacing(view.pixels) for stack in views.values() for view in stack), default=1)
     channels = list(evaluations)
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
@@ -47,14 +49,20 @@ def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifes
             view, number = by_camera[camera], int(seen[light])
             key = (camera, manifest.lights[number].name)
             if key not in images:
-                width, height = view.camera.size
+                width, height = (-(-size // every) for size in view.camera.size)
                 blank = np.zeros((height, width, len(channels)))
                 images[key] = Picture(*key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool))
-            x, y = view.pixels.T
+            x, y = view.pixels.T // every
             images[key].photo[y, x, index] = view.reference[number]
             images[key].valid[y, x] |= view.valid[number]
-            images[key].render[pixels[:, 1], pixels[:, 0], index] = values
+            images[key].render[pixels[:, 1] // every, pixels[:, 0] // every, index] = values
     return tuple(images[key] for key in sorted(images))
+
+
+def spacing(pixels: NDArray[np.int32]) -> int:
+    """The n of pixels (N, 2) that are every n-th of an image; 1 where they are too few to tell."""
+    steps = [np.diff(np.unique(axis)) for axis in pixels.T]
+    return max(int(np.gcd.reduce(np.concatenate(steps))), 1)
 
 
 def write_preview(root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]) -> list[dict[str, object]]:
