@@ -275,6 +275,7 @@ _BENCHMARKS = MappingProxyType(
         "slab": "services.fit.bench.slab:run",
         "stability": "services.fit.bench.stability:run",
         "transport-gradient": "services.fit.bench.transport_gradient:run",
+        "transport-lights": "services.fit.bench.transport_lights:run",
         "transport-skip": "services.fit.bench.transport_skip:run",
         "transport-stack": "services.fit.bench.transport_stack:run",
     }
@@ -284,7 +285,7 @@ _BENCHMARKS = MappingProxyType(
 
 def bench(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run, or all; without it they are listed.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file, and a picture of it beside it.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A smaller case, for a check.")] = False,
 ) -> None:
     """Measure speed with its error beside it."""
@@ -296,14 +297,28 @@ def bench(
     names = list(_BENCHMARKS) if name == "all" else [name]
     if unknown := [one for one in names if one not in _BENCHMARKS]:
         raise InputError(f"Benchmark {unknown[0]} does not exist; known are {', '.join(_BENCHMARKS)} and all.")
-    results = {}
+    modules, results = {}, {}
     for one in names:
-        module, function = _BENCHMARKS[one].split(":")
-        results[one] = getattr(importlib.import_module(module), function)(quick=quick)
+        address, function = _BENCHMARKS[one].split(":")
+        modules[one] = importlib.import_module(address)
+        results[one] = getattr(modules[one], function)(quick=quick)
     text = json.dumps(results if name == "all" else results[name], indent=1)
-    if json_file is not None:
-        json_file.write_text(text + "\n")
     print(text)
+    if json_file is None:
+        return
+    json_file.write_text(text + "\n")
+    for one in names:
+        _draw(modules[one], results[one], json_file.with_name(f"{json_file.stem}-{one}.png") if name == "all" else json_file.with_suffix(".png"))
+
+
+def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
+    """Draw a benchmark in its module's own way if it has one."""
+    try:
+        from services.fit.bench.plots import error_against_time, write_png
+    except ModuleNotFoundError as missing:
+        print(f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install 'dentine[bench]'.", file=sys.stderr)
+        return
+    write_png(getattr(module, "picture", error_against_time)(rows), png)
 
 
 if __name__ == "__main__":

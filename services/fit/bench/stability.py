@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +29,9 @@ from services.fit.transport.platform import prepare_device
 from services.fit.transport.scores import Plan
 from services.fit.transport.starts import PathStart, SlabStart, stream
 from services.fit.transport.walk import Walk
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PATHS = 64
 WHITE = "alpha = 1"
@@ -111,6 +114,13 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
     rows = formula_rows(corners) + walk_rows(corners, most_steps=256 if quick else 16_384) + scene_rows(samples=64 if quick else 4096)
     print(as_table(rows), file=sys.stderr)
     return [row.model_dump() for row in rows]
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Errors against run time, without lines: the points are regions and scenes, and no error here falls with time."""
+    from services.fit.bench.plots import error_against_time
+
+    return error_against_time(rows, lines=False)
 
 
 def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:
