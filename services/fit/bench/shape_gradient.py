@@ -12,19 +12,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.anatomy.blend import dentin_blend_shape
+from services.fit.bench.gradient_rows import Estimate, GradientRow, of_parts
 from services.fit.bench.incisor_stack import TISSUE, incisor_stack
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View
-
-if TYPE_CHECKING:
-    from services.fit.bench.transport_gradient import Estimate, GradientRow
 
 Array = NDArray[np.float64]
 
@@ -46,41 +43,37 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
         view = stack.tooth_view(engine, tissue)
         other = engine.images(replace(media, shape=OTHER_SHAPE), view, samples=2 * samples, seed=7).mean
         picture = engine.images(tissue, view, samples=2 * samples, seed=7).mean - other
-        for mode in range(1 if quick else 3):
-            ours = _scores(engine, tissue, view, mode, picture, samples, repeats)
+        ours = _scores(engine, tissue, view, picture, samples, repeats)
+        for mode in range(1 if quick else len(SHAPE)):
             differences = {h: _differences(engine, tissue, view, mode, h, picture, samples, repeats) for h in STEPS}
-            rows += _compare(name, mode, samples, ours, differences)
+            rows += _compare(name, mode, samples, ours[mode], differences)
     return rows
 
 
-def _scores(engine: Engine, tissue: Tissue, view: View, mode: int, picture: Array, samples: int, repeats: int) -> Estimate:
-    from services.fit.bench.transport_gradient import of_parts
-
+def _scores(engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int) -> list[Estimate]:
+    """The derivative to every mode; one pass serves them all, and each is charged its share of the time."""
     names = tuple(f"shape.{k}" for k in range(len(tissue.shape)))
     engine.jacobian(tissue, view, names, samples=samples, seed=0)
     begun = time.process_time()
-    slopes = [engine.jacobian(tissue, view, names, samples=samples, seed=100 + repeat).jacobian[mode] for repeat in range(repeats)]
-    # One pass serves all modes.
+    slopes = np.stack([engine.jacobian(tissue, view, names, samples=samples, seed=100 + repeat).jacobian for repeat in range(repeats)])
     seconds = (time.process_time() - begun) / repeats / len(names)
-    return of_parts((np.stack(slopes) * picture).sum(axis=1)[:, None], seconds)
+    by_pixel = (slopes * picture).sum(axis=2)
+    return [of_parts(by_pixel[:, [mode]], seconds) for mode in range(len(names))]
 
 
 def _differences(engine: Engine, tissue: Tissue, view: View, mode: int, step: float, picture: Array, samples: int, repeats: int) -> Estimate:
-    from services.fit.bench.transport_gradient import of_parts
-
-    seconds, sides = 0.0, []
+    # Random numbers are common to the two sides of a difference, and to no other step.
+    seconds, sides, first_seed = 0.0, [], 1000 + round(1000 * step)
     for sign in (1, -1):
         moved = tissue.with_values({f"shape.{mode}": tissue.shape[mode] + sign * step})
         engine.images(moved, view, samples=16, seed=0)
         begun = time.process_time()
-        sides.append(np.stack([engine.images(moved, view, samples=samples, seed=200 + repeat).mean for repeat in range(repeats)]))
+        sides.append(np.stack([engine.images(moved, view, samples=samples, seed=first_seed + repeat).mean for repeat in range(repeats)]))
         seconds += (time.process_time() - begun) / repeats
     return of_parts(((sides[0] - sides[1]) * picture).sum(axis=1)[:, None] / (2 * step), seconds)
 
 
 def _compare(tissue: str, mode: int, samples: int, ours: Estimate, differences: dict[float, Estimate]) -> list[GradientRow]:
-    from services.fit.bench.transport_gradient import GradientRow
-
     # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias.
     steps = np.array([0.0, *differences])
     values = np.array([ours.mean[0], *(d.mean[0] for d in differences.values())])

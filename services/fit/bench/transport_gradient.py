@@ -16,15 +16,15 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench import Row
+from services.fit.bench.gradient_rows import Estimate, GradientRow, of_parts
 from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
+from services.fit.bench.shape_gradient import shape_rows
 from services.fit.bench.stock_gradient import StockGradient, shared_names
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
@@ -36,34 +36,11 @@ OTHER_TISSUE = Tissue(Medium(3.8, 0.996, 0.9, 0.8, -0.1), Medium(13.5, 0.9925, 1
 """Shown by the reference images: about 10 % from ``TISSUE``'s."""
 
 PASSES = 4
-
-
-class GradientRow(Row):
-    """A row of the gradient to one parameter, or of all of them: then ``error`` is the geometric mean of theirs."""
-
-    parameter: str | None = None
-    samples: int | None = None
-    """Paths per pixel and light of the peer's image and of its backward pass; of all our Jacobian passes together."""
-    gradient: float | None = None
-    """To the natural parameter; the row's ``error`` is relative to it."""
-    z: float | None = None
-    """In a peer's summary row: its gradient less ours under the same lights, in standard errors; in the one over all parameters the rms of theirs."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A gradient (F,), the variance of a single such estimate, the variance of ``mean``, and the time a single one takes."""
-
-    mean: Array
-    variance: Array
-    mean_variance: Array
-    seconds: float
+"""Jacobian passes of one gradient of ours: of their pairs, one in four would not be independent and is left out."""
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
     """Rows by parameter of this engine and of the peers, and the peers' summary rows."""
-    from services.fit.bench.shape_gradient import shape_rows
-
     return [row.model_dump() for row in [*media_rows(quick=quick), *shape_rows(quick=quick)]]
 
 
@@ -111,12 +88,6 @@ def our_gradient(
     terms = np.stack([once(repeat) for repeat in range(1, repeats + 1)])
     seconds = (time.process_time() - begun) / repeats
     return of_parts(terms.sum(axis=2), seconds), of_parts(terms[:, :, chosen].sum(axis=2), seconds)
-
-
-def of_parts(repeats: Array, seconds: float) -> Estimate:
-    """From repeats of a sum over parts with random numbers of their own, (R, F, parts)."""
-    variance = repeats.var(axis=0, ddof=1).sum(axis=-1)
-    return Estimate(repeats.mean(axis=0).sum(axis=-1), variance, variance / len(repeats), seconds)
 
 
 def _stock_gradient(folder: Path, stack: IncisorStack, view: View, reference: Array, chosen: NDArray[np.int64], *, samples: int, repeats: int) -> Estimate:
