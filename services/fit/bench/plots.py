@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 COLUMNS = 4
 PANEL_INCHES = (4.6, 3.9)
@@ -19,19 +20,14 @@ SUMMARY = "-summary"
 Rows = list[dict[str, Any]]
 
 
-def error_against_time(rows: Rows, *, lines: bool = True) -> Figure:
-    """One panel per benchmark, or per parameter of one, log-log, this engine first.
-
-    Args:
-        rows: as ``Row.model_dump`` gives them.
-        lines: also draw for everyone what more or fewer paths give from the most efficient point, error = 1 / sqrt(efficiency x time).
-    """
+def error_against_time(rows: Rows) -> Figure:
+    """One panel per benchmark, or per parameter of one, log-log, this engine first; ``rows`` are as ``Row.model_dump`` gives them."""
     panels: dict[tuple[str, str], Rows] = {}
     for row in rows:
         panels.setdefault((row["benchmark"].removesuffix(SUMMARY), row.get("parameter") or ""), []).append(row)
     figure, axes = grid(len(panels))
     for one, (name, drawn) in zip(axes, panels.items(), strict=True):
-        draw_errors(one, drawn, lines=lines)
+        draw_errors(one, drawn)
         one.set_title(" ".join(name))
     return figure
 
@@ -45,7 +41,12 @@ def grid(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def draw_errors(axes: Axes, rows: Rows, *, by: str = "peer", lines: bool = True) -> None:
-    """Points of everyone measured; ``by`` is the field that tells them apart, and a peer's efficiency ratio stands in the legend."""
+    """Points of everyone measured; a peer's efficiency ratio stands in the legend.
+
+    Args:
+        by: field that tells them apart.
+        lines: also draw for everyone what more or fewer paths give from the most efficient point, error = 1 / sqrt(efficiency x time).
+    """
     drawn = [row for row in rows if row["error"] > 0 and row["seconds"] > 0]
     for number, one in enumerate(sorted({row[by] for row in drawn}, key=lambda one: (one != OURS, one))):
         mine = [row for row in drawn if row[by] == one]
@@ -61,10 +62,20 @@ def draw_errors(axes: Axes, rows: Rows, *, by: str = "peer", lines: bool = True)
 
 
 def finish(axes: Axes, x: str, y: str) -> None:
-    """Both axes logarithmic, with names, grid and legend."""
+    """Both axes logarithmic and at least a decade long, with names, grid and legend."""
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    axes.set(xlim=_a_decade(*axes.get_xlim()), ylim=_a_decade(*axes.get_ylim()))
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(visible=True, which="both", alpha=0.25)
     axes.legend(fontsize=8)
+
+
+def _a_decade(low: float, high: float) -> tuple[float, float]:
+    wider = max(1.0, (12 * low / high) ** 0.5)
+    return low / wider, high * wider
 
 
 def write_png(figure: Figure, path: Path) -> None:

@@ -117,10 +117,21 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors against run time, without lines: the points are regions and scenes, and no error here falls with time."""
-    from services.fit.bench.plots import error_against_time
+    """Every formula's error in every region with its bound; errors of regions and scenes against run time, without lines, as they are different things."""
+    from services.fit.bench.plots import draw_errors, grid
 
-    return error_against_time(rows, lines=False)
+    figure, (formulas, walk, scenes) = grid(3)
+    of = {part: [row for row in rows if row["benchmark"] == f"stability-{part}"] for part in ("formula", "walk", "scene")}
+    names = [row["quantity"] for row in of["formula"]]
+    formulas.plot(names, [row["error"] for row in of["formula"]], "o", color="C0", markersize=5, label="worst of each region")
+    formulas.plot(names, [row["bound"] for row in of["formula"]], "_", color="C1", markersize=24, label="bound")
+    formulas.set(yscale="log", ylabel="relative error", title="stability-formula")
+    formulas.tick_params(axis="x", rotation=90)
+    formulas.legend(fontsize=8)
+    for axes, part in ((walk, "walk"), (scenes, "scene")):
+        draw_errors(axes, of[part], lines=False)
+        axes.set_title(f"stability-{part}")
+    return figure
 
 
 def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:

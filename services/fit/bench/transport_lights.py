@@ -77,10 +77,10 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
     """Rows by number of lights, with the peer's summary rows, then by number of pixels."""
     stack = incisor_stack(LIGHTS[-1])
     engine = Engine(stack.recipe())
-    rounds, counts = (2, (32, 64)) if quick else (7, (64, 256))
+    rounds, counts = (2, (32, 64)) if quick else (5, (64, 256))
     rows = light_rows(engine, stack.tooth_view(engine, TISSUE), counts, rounds)
     finer = replace(stack, camera=dome_cameras(1, 0.25 if quick else 0.125, (stack.outer,))[0])
-    rows += pixel_rows(engine, finer.tooth_view(engine, TISSUE), 16 if quick else 64, rounds)
+    rows += pixel_rows(engine, finer.tooth_view(engine, TISSUE), 16 if quick else 32, rounds)
     return [row.model_dump() for row in rows]
 
 

@@ -108,8 +108,8 @@ class Engine:
         """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
 
         Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms. Arguments are those of
-        ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative to its own norm. A derivative that
-        is zero everywhere never gets there: give a limit.
+        ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative to its own norm. A derivative of
+        which only noise is seen never gets there: give a limit.
 
         Raises:
             As ``images``; InputError also for a name the scene does not have.
