@@ -19,27 +19,25 @@ from numpy.typing import NDArray
 from services.fit.slab.simulate import Sums
 from tests.support.slab_tables import SlabCase, derivative_cases, named, passes, simulate, total_cases
 
-TOTAL_TOLERANCE = 1e-3
 
-
-def tolerances(case: SlabCase) -> NDArray[np.float64]:
+def tolerances(case: SlabCase, of_totals: float) -> NDArray[np.float64]:
     """Of each value (rows, 2)."""
-    totals = np.full((1, 2), TOTAL_TOLERANCE)
+    totals = np.full((1, 2), of_totals)
     return np.vstack([totals, case.derivative_tolerance()]) if case.names else totals
 
 
-def rule(case: SlabCase, seconds: float) -> Callable[[Sums], float]:
+def rule(tolerance: NDArray[np.float64], seconds: float) -> Callable[[Sums], float]:
     """The shortfall from a third of every tolerance, 0 once the time is up."""
-    allowed, begun_s = tolerances(case) / 3, time.monotonic()
+    allowed, begun_s = tolerance / 3, time.monotonic()
     return lambda sums: float((sums.standard_error() / allowed).max()) if time.monotonic() < begun_s + seconds else 0.0
 
 
-def measure(case: SlabCase, shortfall: Callable[[Sums], float], seed: int) -> Iterator[dict[str, object]]:
+def measure(case: SlabCase, tolerance: NDArray[np.float64], shortfall: Callable[[Sums], float], seed: int) -> Iterator[dict[str, object]]:
     """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the rule."""
     began = time.perf_counter()
     sums = simulate(case, shortfall, seed)
     seconds = time.perf_counter() - began
-    mean, error, tolerance = sums.mean(), sums.standard_error(), tolerances(case)
+    mean, error = sums.mean(), sums.standard_error()
     for row, name in enumerate(("total", *case.names)):
         for column, side in enumerate("RT"):
             value, truth, spread = mean[row, column], case.values[row, column], error[row, column]
@@ -63,6 +61,7 @@ def main() -> None:
     parser.add_argument("table", choices=("derivatives", "totals"))
     parser.add_argument("--passes", type=int, default=2, help="of 262144 paths, each next one up to four times as long")
     parser.add_argument("--seconds", type=float, help="instead of passes: until a third of every tolerance, at most so long per case")
+    parser.add_argument("--tolerance", type=float, default=1e-3, help="of totals, absolute")
     parser.add_argument("--cases", help="only these, separated by commas; a first word, as S01")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
@@ -72,8 +71,9 @@ def main() -> None:
         cases = named(cases, *arguments.cases.split(","))
     rows: list[dict[str, object]] = []
     for number, case in enumerate(cases):
-        shortfall = rule(case, arguments.seconds) if arguments.seconds else passes(arguments.passes)
-        rows += measure(case, shortfall, arguments.seed + number)
+        tolerance = tolerances(case, arguments.tolerance)
+        shortfall = rule(tolerance, arguments.seconds) if arguments.seconds else passes(arguments.passes)
+        rows += measure(case, tolerance, shortfall, arguments.seed + number)
     arguments.out.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
     z = np.array([row["z"] for row in rows], dtype=np.float64)
     fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)
