@@ -36,7 +36,7 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
     """By tissue and mode: our row, the peer's at every step, and its summary at the best one."""
     stack = incisor_stack(18 if quick else 54)
     engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
-    samples, repeats = (32, 3) if quick else (128, 4)
+    samples, repeats = (32, 3) if quick else (64, 4)
     rows: list[GradientRow] = []
     for name, media in TISSUES.items():
         tissue = replace(media, shape=SHAPE)
