@@ -24,6 +24,8 @@ from services.fit.transport.media import Media
 TEXEL_MM = 0.15
 """Spacing of the grid at the tooth."""
 MARGIN_MM = 1.0
+DARK_DEPTH = 40.0
+"""Optical depth past which a connection is dark: exp(-40) is below float32 resolution of any sum it could join."""
 WIDEST = 3.0
 """Half-width of the map over the tooth's radius, at most."""
 
@@ -51,7 +53,7 @@ class LightView:
         depth = media.sigma[ENAMEL - 1] * self.enamel_mm
         if media.count >= DENTIN:
             depth = dr.fma(media.sigma[DENTIN - 1], self.dentin_mm, depth)
-        return dr.select(self.certain, self.surface * dr.exp(-depth), 0)
+        return dr.select(self.certain & (depth < DARK_DEPTH), self.surface * dr.exp(-depth), 0)
 
 
 class LightMaps:

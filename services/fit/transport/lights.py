@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from services.fit.optics import fresnel
 from services.fit.transport.border import inverse_cosine
 from services.fit.transport.geometry import Geometry
-from services.fit.transport.light_maps import LightMaps
+from services.fit.transport.light_maps import DARK_DEPTH, LightMaps
 from services.fit.transport.media import Media
 
 CANDIDATES = 8
@@ -25,8 +25,6 @@ more there are. Measured best at 8 and at 54 lights."""
 ROULETTE_GAIN = 3.0
 DARKEST_CHANCE = 0.02
 """A shadow ray is cast with probability clip(gain x expected contribution, floor, 1)."""
-DARK_DEPTH = 40.0
-"""Optical depth past which a shadow ray stops: exp(-40) is below float32 resolution of any sum it could join."""
 
 
 class PointLights:
