@@ -36,6 +36,7 @@ def test_the_folder_is_a_complete_capture(tmp_path: Path) -> None:
         image, variance = np.load(tmp_path / entry.file), np.load(tmp_path / entry.variance_file)
         assert image.shape == variance.shape == (height, width, 1)
         assert image.dtype == np.float32
+        assert (image >= 0).all()
         assert (variance[image > 0] > 0).all()
     pixels, depth = capture.cameras[0].project(tooth.outer.vertices_mm)
     assert (pixels > 1).all()

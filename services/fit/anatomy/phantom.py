@@ -183,7 +183,8 @@ def _render(
     estimate = Engine(recipe).images(TRUE_TISSUE[name], View(camera, pixels), samples=samples, seed=seed)
     width, height = camera.size
     images = np.zeros((2, len(lights), height, width))
-    images[:, :, pixels[:, 1], pixels[:, 0]] = estimate.mean, estimate.variance
+    # Single estimates of almost no light may come out below zero; a photograph's cannot.
+    images[:, :, pixels[:, 1], pixels[:, 0]] = np.maximum(estimate.mean, 0.0), estimate.variance
     return images[0], images[1]
 
 
