@@ -80,19 +80,29 @@ class Mesh:
         a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
+    def require_surface(self, name: str, extent_mm: tuple[float, float] = (2.0, 200.0)) -> None:
+        """Refuse a mesh that has no extent in millimetres or that nothing can hit; it need not be closed.
+
+        Raises:
+            MeshError: not finite, without faces, or of an extent that nothing in a mouth has.
+        """
+        if not np.isfinite(self.vertices_mm).all():
+            raise MeshError(f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again.")
+        if len(self.faces) == 0:
+            raise MeshError(f"Mesh {name} has no faces; export it again with its triangles.")
+        extent = float(np.ptp(self.vertices_mm, axis=0).max())
+        if not extent_mm[0] <= extent <= extent_mm[1]:
+            raise MeshError(
+                f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices must be in millimetres, so rescale it."
+            )
+
     def require_solid(self, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:
         """Refuse a mesh that cannot bound a medium.
 
         Raises:
             MeshError: open, inside out, not finite, or of an extent that no tooth or jaw in millimetres has.
         """
-        if not np.isfinite(self.vertices_mm).all():
-            raise MeshError(f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again.")
-        extent = float(np.ptp(self.vertices_mm, axis=0).max())
-        if not extent_mm[0] <= extent <= extent_mm[1]:
-            raise MeshError(
-                f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices must be in millimetres, so rescale it."
-            )
+        self.require_surface(name, extent_mm)
         open_edges = int(np.count_nonzero(self.edge_counts() != 2))
         if open_edges:
             raise MeshError(f"Mesh {name} is not watertight: {open_edges} edges do not join exactly two faces; close its holes.")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from services.core.errors import CorruptStoreError
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 
@@ -98,21 +98,30 @@ def read_block(stored: StoredFile) -> Block:
 
 def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
     """Store a recipe in ``folder``."""
-    dentin: dict[str, NDArray[Any]] = {}
-    if recipe.dentin is not None:
-        base = recipe.dentin.base
-        dentin = {"dentin_vertices": base.vertices_mm, "dentin_faces": base.faces, "dentin_modes": recipe.dentin.modes_mm}
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def add(name: str, mesh: Mesh | None) -> None:
+        if mesh is not None:
+            arrays.update({f"{name}_vertices": mesh.vertices_mm, f"{name}_faces": mesh.faces})
+
+    for k, tooth in enumerate(recipe.teeth):
+        add(f"outer{k}", tooth.outer)
+        if tooth.dentin is not None:
+            add(f"dentin{k}", tooth.dentin.base)
+            arrays[f"dentin{k}_modes"] = tooth.dentin.modes_mm
+    add("gums", recipe.gums)
+    add("cavity", recipe.cavity)
     return _write(
         folder,
         "scene",
-        outer_vertices=recipe.outer.vertices_mm,
-        outer_faces=recipe.outer.faces,
+        teeth=np.array(len(recipe.teeth)),
         light_positions=recipe.light_positions_mm,
         light_intensities=recipe.light_intensities,
         boundary=np.array(recipe.boundary),
         ior=np.array(recipe.ior),
+        gums_ior=np.array(recipe.gums_ior),
         device=np.array(recipe.device or ""),
-        **dentin,
+        **arrays,
     )
 
 
@@ -120,17 +129,24 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
     """Read a recipe."""
     a = stored.load()
 
-    def mesh(part: str) -> Mesh:
-        return Mesh(a[f"{part}_vertices"].astype(float), a[f"{part}_faces"].astype(np.int32))
+    def mesh(name: str) -> Mesh | None:
+        return Mesh(a[f"{name}_vertices"].astype(float), a[f"{name}_faces"].astype(np.int32)) if f"{name}_faces" in a else None
+
+    def tooth(k: int) -> ToothSurfaces:
+        outer, base = mesh(f"outer{k}"), mesh(f"dentin{k}")
+        assert outer is not None
+        return ToothSurfaces(outer, None if base is None else DentinShape(base, a[f"dentin{k}_modes"].astype(float)))
 
     return SceneRecipe(
-        outer=mesh("outer"),
-        dentin=DentinShape(mesh("dentin"), a["dentin_modes"].astype(float)) if "dentin_faces" in a else None,
+        teeth=tuple(tooth(k) for k in range(int(np.asarray(a["teeth"], dtype=int)))),
         light_positions_mm=a["light_positions"].astype(float),
         light_intensities=a["light_intensities"].astype(float),
         boundary="thin" if str(a["boundary"]) == "thin" else "matched",
         ior=float(np.asarray(a["ior"], dtype=float)),
         device="cuda" if str(a["device"]) == "cuda" else "llvm" if str(a["device"]) == "llvm" else None,
+        gums=mesh("gums"),
+        gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
+        cavity=mesh("cavity"),
     )
 
 

@@ -14,7 +14,7 @@ from services.core.meshfiles import read_teeth
 from services.core.records import JobSpec, PreparedManifest
 from services.core.store import open_stage, reading
 from services.fit.blocks import Block, StoredFile, pixels_per_block, write_block, write_recipe
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, View, single_tooth
 
 Array = NDArray[np.float64]
 
@@ -177,7 +177,7 @@ def write_channel(
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
-        return write_recipe(folder, SceneRecipe(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device))
+        return write_recipe(folder, single_tooth(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device))
 
     def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
         files = []

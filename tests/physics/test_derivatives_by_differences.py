@@ -7,6 +7,7 @@ it to fourth order.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.core.records import Boundary
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import SceneRecipe
 from tests.support.one_sided_border import leave_out_scattering
+from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import camera_at, recipe, whole_view
 
 SEEDS = 8
@@ -25,16 +28,18 @@ LARGEST_ERROR = 0.05
 """Standard error of score and of extrapolated difference, as a fraction of the derivative."""
 FAMILY_FALSE_ALARM = 1e-3
 """Chance that any t-test of a group fails a correct engine (Bonferroni)."""
-STEPS = {"sigma": 0.3, "alpha": 0.04, "beta": 0.2, "g1": 0.12, "g2": 0.2, "shape": 0.3}
+STEPS = {"sigma": 0.3, "alpha": 0.04, "beta": 0.2, "g1": 0.12, "g2": 0.2, "shape": 0.3, "reflectance": 0.2, "gums.sigma": 1.0, "1.enamel.sigma": 0.7}
 
 
 @dataclass(frozen=True)
 class Group:
     """Derivatives tested at one tissue, and the paths per pixel, seed and image that 5 % takes."""
 
-    tissue: Tissue
+    tissue: Tissue | Mouth
     samples: dict[str, int]
     score_samples: int
+    scene: Callable[[Boundary], SceneRecipe] = recipe
+    span_mm: float = 9.0
 
 
 MEDIA = Group(
@@ -47,16 +52,24 @@ MEDIA = Group(
 SHAPE = Group(Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4)), {"shape.0": 1024, "shape.1": 2048}, 4096)
 """Dentin clearer than enamel: of both modes, Eq. 32 alone is 2.5 times the derivative, and noise stays small."""
 
+IN_A_MOUTH = Group(
+    MOUTH,
+    {"0.dentin.alpha": 384, "1.enamel.alpha": 128, "1.enamel.sigma": 2048, "gums.alpha": 128, "gums.sigma": 2048, "cavity.reflectance": 64},
+    2048,
+    mouth_recipe,
+    14.0,
+)
+
 
 def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """By name, over seeds: scores and extrapolated central differences, both relative to the mean score."""
-    engine, view, names = Engine(recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1), tuple(group.samples)
+    engine, view, names = Engine(group.scene(boundary)), whole_view(camera_at((0.2, 1, 0.1), span_mm=group.span_mm), 1), tuple(group.samples)
     pictures = engine.jacobian(group.tissue, view, names, samples=4 * group.score_samples, seed=10_000).jacobian
     slopes = [engine.jacobian(group.tissue, view, names, samples=group.score_samples, seed=11_000 + seed).jacobian for seed in range(SEEDS)]
     compared = {}
     for name, picture, slope in zip(names, pictures, np.stack(slopes, axis=1), strict=True):
         scores = np.einsum("sln,ln->s", slope, picture)
-        middle, step = group.tissue.value(name), STEPS.get(name.split(".")[1], STEPS["shape"])
+        middle, step = group.tissue.value(name), STEPS.get(name, STEPS.get(name.split(".")[-1], STEPS["shape"]))
 
         def value(parameter: float, seed: int, name: str = name, picture: NDArray[np.float64] = picture) -> float:
             tissue = group.tissue.with_values({name: parameter})
@@ -79,6 +92,7 @@ def standard_error(values: NDArray[np.float64]) -> float:
         pytest.param(SHAPE, "matched", id="shape-matched"),
         pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
         pytest.param(SHAPE, "thin", id="shape-thin"),
+        pytest.param(IN_A_MOUTH, "thin", id="mouth-thin"),
     ],
 )
 def test_scores_are_the_images_derivatives(group: Group, boundary: Boundary) -> None:

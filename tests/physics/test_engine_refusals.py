@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from services.core.errors import DentineError, InputError, MeshError, NonFiniteError, PlatformError
 from services.core.geometry import Mesh
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import require_llvm
-from services.fit.transport.recipe import SceneRecipe, View
-from tests.support.small_tooth import LIGHTS_MM, camera_at, ellipsoid, recipe, whole_view
+from services.fit.transport.recipe import SceneRecipe, ToothSurfaces, View, single_tooth
+from tests.support.small_mouth import MOUTH, mouth_recipe, wall
+from tests.support.small_tooth import LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view
 
 TISSUE = Tissue(Medium(2, 0.9, 0.9, 0.6, -0.2), Medium(4, 0.8), (0.5, 0.4))
 
@@ -128,17 +129,20 @@ def with_light(number: int, *, intensity: float = 1.0, position: tuple[float, fl
     return replace(recipe(), light_positions_mm=positions, light_intensities=intensities)
 
 
+def with_dentin(mesh: Mesh) -> SceneRecipe:
+    """The small tooth with another surface as its dentin's base."""
+    return replace(recipe(), teeth=(ToothSurfaces(ellipsoid(SEMI_AXES_MM), replace(dentin_shape(), base=mesh)),))
+
+
 def test_dentin_that_breaks_through_the_enamel_is_refused() -> None:
-    scene = recipe()
-    assert scene.dentin is not None
-    base = scene.dentin.base
+    base = dentin_shape().base
     aside, larger = Mesh(base.vertices_mm + np.array([1.0, 0, 0]), base.faces), Mesh(base.vertices_mm * 1.2, base.faces)
     # One cusp of an otherwise nested surface.
     top = np.argmax(base.vertices_mm[:, 2])
     spike = Mesh(base.vertices_mm + 0.5 * np.eye(3)[2] * (np.arange(len(base.vertices_mm)) == top)[:, None], base.faces)
     for mesh in (aside, larger, spike):
         with pytest.raises(MeshError) as caught:
-            Engine(replace(scene, dentin=replace(scene.dentin, base=mesh)))
+            Engine(with_dentin(mesh))
         require_sentence(caught.value, "dentin surface", "outer surface", "mm")
 
 
@@ -163,7 +167,7 @@ def test_lights_that_give_no_light_are_refused() -> None:
 
 def test_surfaces_that_bound_nothing_are_refused() -> None:
     scene = recipe()
-    outer = scene.outer
+    outer = scene.teeth[0].outer
     hole = Mesh(outer.vertices_mm, outer.faces[1:])
     flipped = Mesh(outer.vertices_mm, outer.faces[:, ::-1].copy())
     in_metres = Mesh(outer.vertices_mm * 1e-3, outer.faces)
@@ -171,11 +175,10 @@ def test_surfaces_that_bound_nothing_are_refused() -> None:
     broken = Mesh(np.where(outer.vertices_mm == outer.vertices_mm[0], np.nan, outer.vertices_mm), outer.faces)
     for mesh, part in ((hole, "3 edges"), (flipped, "inside out"), (in_metres, "millimetres"), (in_micrometres, "millimetres"), (broken, "non-finite")):
         with pytest.raises(MeshError) as caught:
-            Engine(replace(scene, outer=mesh))
+            Engine(replace(scene, teeth=(ToothSurfaces(mesh, scene.teeth[0].dentin),)))
         require_sentence(caught.value, "outer surface", part)
-        assert scene.dentin is not None
         with pytest.raises(MeshError) as caught:
-            Engine(replace(scene, dentin=replace(scene.dentin, base=mesh)))
+            Engine(with_dentin(mesh))
         require_sentence(caught.value, "dentin surface", part)
 
 
@@ -276,4 +279,43 @@ def test_a_mesh_alone_knows_its_volume_and_edges() -> None:
     mesh = ellipsoid(np.array([3.0, 2.0, 4.0]))
     assert mesh.signed_volume_mm3() == pytest.approx(4 / 3 * np.pi * 24, rel=0.02)
     assert (mesh.edge_counts() == 2).all()
-    assert isinstance(SceneRecipe(mesh, None, LIGHTS_MM, np.ones(5)).outer, Mesh)
+    assert isinstance(single_tooth(mesh, None, LIGHTS_MM, np.ones(5)).teeth[0].outer, Mesh)
+
+
+def mouth_scene(**changes: Any) -> SceneRecipe:
+    return replace(mouth_recipe("thin"), **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"teeth": ()}, ("0 teeth", "1 to 15")),
+        ({"teeth": (ToothSurfaces(ellipsoid(SEMI_AXES_MM)),) * 16}, ("16 teeth", "1 to 15")),
+        ({"teeth": (ToothSurfaces(ellipsoid(SEMI_AXES_MM)), ToothSurfaces(wall()))}, ("outer surface of tooth 1", "not watertight")),
+        ({"gums": wall()}, ("gums", "not watertight")),
+        ({"cavity": Mesh(1e-3 * wall().vertices_mm, wall().faces)}, ("cavity", "0.016 units", "millimetres")),
+        ({"cavity": Mesh(wall().vertices_mm, wall().faces[:0])}, ("cavity", "no faces")),
+        ({"gums_ior": 0.9}, ("gums_ior = 0.9", "at least 1")),
+    ],
+)
+def test_parts_that_no_mouth_has_are_refused(no_kernel: None, changes: dict[str, Any], facts: tuple[str, ...]) -> None:
+    with pytest.raises(DentineError) as caught:
+        Engine(mouth_scene(**changes))
+    require_sentence(caught.value, *facts)
+
+
+@pytest.mark.parametrize(
+    ("mouth", "facts"),
+    [
+        (replace(MOUTH, teeth=MOUTH.teeth[:1]), ("1 teeth", "scene of 2")),
+        (replace(MOUTH, gums=None), ("gums", "none")),
+        (replace(MOUTH, gums=Medium(1, 1.5)), ("gums.alpha = 1.5", "0 to 1")),
+        (replace(MOUTH, reflectance=None), ("cavity", "no reflectance")),
+        (replace(MOUTH, reflectance=1.2), ("cavity.reflectance = 1.2", "0 to 1")),
+        (replace(MOUTH, teeth=(MOUTH.teeth[0], Tissue(Medium(-1, 0.5), Medium(1, 0.5)))), ("1.enamel.sigma = -1", "positive")),
+    ],
+)
+def test_media_that_do_not_belong_to_the_scene_are_refused(mouth: Mouth, facts: tuple[str, ...]) -> None:
+    with pytest.raises(InputError) as caught:
+        Engine(mouth_scene()).images(mouth, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
+    require_sentence(caught.value, *facts)

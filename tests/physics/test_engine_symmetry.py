@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, single_tooth
 from tests.support.small_tooth import CAMERA_DISTANCE_MM, camera_at, recipe, sphere, whole_view
 from tests.support.z_scores import LARGEST_Z
 
@@ -30,7 +32,7 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surf
     lights = uniform_room(200)
     core = sphere(1.2)
     dentin = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
-    scene = SceneRecipe(sphere(2.0), dentin, FAR_MM * lights, np.full(len(lights), FAR_MM**2 * 4 * np.pi / len(lights)), boundary)
+    scene = single_tooth(sphere(2.0), dentin, FAR_MM * lights, np.full(len(lights), FAR_MM**2 * 4 * np.pi / len(lights)), boundary)
     tissue = Tissue(Medium(2, 1, 0.8, 0.5, -0.2), Medium(4, 1, 1, 0.3))
     view = whole_view(camera_at((0.3, 1, 0.2), size=4, span_mm=0.8))
     estimate = Engine(scene).images(tissue, view, samples=24576, seed=4)
@@ -49,8 +51,7 @@ def test_camera_and_light_may_change_places(boundary: Boundary) -> None:
     values, variances = [], []
     for seed, (towards_camera, towards_light) in enumerate((directions, directions[::-1])):
         unit = np.array(towards_light) / np.linalg.norm(towards_light)
-        tooth = recipe(boundary)
-        scene = SceneRecipe(tooth.outer, tooth.dentin, 50 * CAMERA_DISTANCE_MM * unit[None], np.array([1e8]), boundary)
+        scene = replace(recipe(boundary), light_positions_mm=50 * CAMERA_DISTANCE_MM * unit[None], light_intensities=np.array([1e8]))
         camera = camera_at(towards_camera, size=8, span_mm=9.0, distance_mm=50 * CAMERA_DISTANCE_MM)
         estimate = Engine(scene).images(tissue, whole_view(camera), samples=16384, seed=seed)
         values.append(estimate.mean.sum())

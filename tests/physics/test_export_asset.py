@@ -21,7 +21,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_d
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, View, single_tooth
 
 TISSUE = Tissue(Medium(2.5, 0.97, 0.9, 0.6, -0.1), Medium(6.0, 0.93, 1.0, 0.5, 0.0))
 """Paths of some tens of scatters: the comparison costs seconds."""
@@ -53,7 +53,7 @@ class Rig:
         dentin = self.tooth.dentin
         assert dentin is not None
         shape = DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
-        recipe = SceneRecipe(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
+        recipe = single_tooth(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
         width, height = camera.size
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.int32)
         estimate = Engine(recipe).images(TISSUE, View(camera, pixels), samples=samples, seed=11)

@@ -17,7 +17,7 @@ from services.fit.bench.transport_gradient import our_gradient
 from services.fit.export.mitsuba_scene import load_scene, nested_scene
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
 TISSUE = Tissue(Medium(1.5, 0.9, 0.7, 0.6, -0.3), Medium(0.7, 0.7, g1=0.5))
@@ -36,7 +36,7 @@ def test_gradients_agree_with_prbvolpath(tmp_path: Path) -> None:
     write_mesh(files[0], outer)
     write_mesh(files[1], dentin.base)
     camera, lights = camera_at((0.2, 1, 0.1)), LIGHTS_MM[[0, 2]]
-    engine, view = Engine(SceneRecipe(outer, dentin, lights, np.full(2, INTENSITY))), whole_view(camera)
+    engine, view = Engine(single_tooth(outer, dentin, lights, np.full(2, INTENSITY))), whole_view(camera)
     reference = engine.images(OTHER, view, samples=1024, seed=5).mean
 
     theirs = []

@@ -19,7 +19,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_b
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
@@ -39,7 +39,7 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
     write_mesh(tmp_path / "outer.ply", outer)
     write_mesh(tmp_path / "dentin.ply", dentin.base)
     lights = LIGHTS_MM[[1, 3]]
-    scene = SceneRecipe(outer, dentin, lights, np.full(2, INTENSITY), boundary)
+    scene = single_tooth(outer, dentin, lights, np.full(2, INTENSITY), boundary)
     ours = Engine(scene).images(TISSUE, whole_view(camera), samples=2048, seed=21, batches=BATCHES)
     scores = []
     for number, light in enumerate(lights):
@@ -65,7 +65,7 @@ def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least
     assert tooth.dentin is not None
     dentin = DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
     lights = np.array([light.position_mm for light in capture.lights])
-    engine = Engine(SceneRecipe(tooth.outer, dentin, lights, np.array([light.intensity[0] for light in capture.lights])))
+    engine = Engine(single_tooth(tooth.outer, dentin, lights, np.array([light.intensity[0] for light in capture.lights])))
     camera = capture.cameras[0]
     ours = engine.images(tissue, whole_view(camera), samples=samples, seed=41, batches=BATCHES)
     stems = [root / f"{camera.name}_{light.name}" for light in capture.lights]

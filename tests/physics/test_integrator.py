@@ -24,7 +24,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_d
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
@@ -105,7 +105,7 @@ def engine_images(
 ) -> tuple[Array, Array]:
     """What the project's own engine sees, mean and its variance."""
     dentin = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3))) if layered else None
-    engine = Engine(SceneRecipe(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
+    engine = Engine(single_tooth(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
     image = engine.images(tissue, whole_view(CAMERA), samples=512, seed=seed, batches=BATCHES)
     return image.mean[0].reshape(SIZE, SIZE), image.variance[0].reshape(SIZE, SIZE)
 

@@ -19,7 +19,7 @@ from services.fit.slab.simulate import Layer, simulate_slab, specular_share
 from services.fit.transport.engine import Engine
 from services.fit.transport.nesting import winding_number
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, SceneRecipe, single_tooth
 from tests.support.slab_tables import total_cases
 from tests.support.small_tooth import LIGHTS_MM, camera_at, whole_view
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
@@ -180,7 +180,7 @@ def test_dentin_has_room_inside_enamel() -> None:
     outer = ellipsoid(axes)
 
     def scene(dentin: Mesh) -> SceneRecipe:
-        return SceneRecipe(outer, DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3))), LIGHTS_MM, np.ones(5))
+        return single_tooth(outer, DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3))), LIGHTS_MM, np.ones(5))
 
     centred = ellipsoid(axes - 0.3)
     shifted = Mesh(centred.vertices_mm + np.array([0.0, 0.5, 0.0]), centred.faces)
@@ -197,13 +197,13 @@ def test_dentin_has_room_inside_enamel() -> None:
 
 def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100 times too bright.
-    monkeypatch.setattr("services.fit.transport.geometry.require_nested", lambda *_: None)
+    monkeypatch.setattr("services.fit.transport.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     known = DentinShape(outer, np.zeros((0, len(outer.vertices_mm), 3)))
     enamel, dentin, view = Medium(3, 0.99, g1=0.8), Medium(8, 0.98, g1=0.7), whole_view(camera_at((0, 1, 0)))
     intensities = np.full(5, 1e5)
-    coincident = Engine(SceneRecipe(outer, known, LIGHTS_MM, intensities)).images(Tissue(enamel, dentin), view, samples=64, seed=1).mean.sum()
-    alone = Engine(SceneRecipe(outer, None, LIGHTS_MM, intensities))
+    coincident = Engine(single_tooth(outer, known, LIGHTS_MM, intensities)).images(Tissue(enamel, dentin), view, samples=64, seed=1).mean.sum()
+    alone = Engine(single_tooth(outer, None, LIGHTS_MM, intensities))
     either = [alone.images(Tissue(medium, medium), view, samples=64, seed=2).mean.sum() for medium in (enamel, dentin)]
     assert 0.5 * min(either) < coincident < 1.5 * max(either)
 
@@ -212,4 +212,4 @@ def test_lights_beyond_single_precision_are_refused() -> None:
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     for positions, intensity, part in ((LIGHTS_MM * 1e18, 1.0, "mm away"), (LIGHTS_MM, 1e-40, "intensity = 1e-40"), (LIGHTS_MM, 1e35, "intensity = 1e\\+35")):
         with pytest.raises(InputError, match=part):
-            Engine(SceneRecipe(outer, None, positions, np.full(5, intensity)))
+            Engine(single_tooth(outer, None, positions, np.full(5, intensity)))

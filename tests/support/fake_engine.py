@@ -65,7 +65,7 @@ class FakeEngine:
     def _formula(self, tissue: Tissue, view: View) -> Array:
         x, y = view.pixels.T.astype(float)
         thickness = 0.3 + 0.9 * y / 34.0
-        if self.recipe.dentin is None:
+        if self.recipe.teeth[0].dentin is None:
             thickness = thickness + 50.0
         for m, c in enumerate(tissue.shape):
             thickness = thickness * (1 + 0.3 * c * np.cos((m + 1) * x / 9.0))

@@ -12,7 +12,7 @@ from services.core.meshfiles import write_mesh
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 
 FAKE = "tests.support.fake_engine:FakeEngine"
@@ -66,7 +66,7 @@ def write_prepared(
     valid = create_array(store, "valid", shape, (1, 1, height, width), "uint16", axes)
     y, x = (index.reshape(-1) for index in np.mgrid[:height, :width])
     dentin = DentinShape(sphere(3.0), np.zeros((len(truth.shape), 1, 3)))
-    recipe = SceneRecipe(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
+    recipe = single_tooth(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
     for c, one in enumerate(cameras):
         image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from services.fit.blocks import Block, StoredFile, read_block, read_recipe, writ
 from services.fit.evaluate import evaluate_task
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.passes import BlockTask, compare_task, image_task, jacobian_task, orders_task
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
-from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
+from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 
 
 def block_with(weights: list[list[float]]) -> Block:
@@ -38,14 +39,19 @@ def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: li
 
 @pytest.mark.parametrize("device", [None, "llvm", "cuda"])
 def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) -> None:
-    scene = SceneRecipe(ellipsoid(SEMI_AXES_MM), dentin_shape(), LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device)
+    teeth = (ToothSurfaces(ellipsoid(SEMI_AXES_MM), dentin_shape()), ToothSurfaces(sphere(2.0)))
+    scene = SceneRecipe(teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0))
     stored = read_recipe(write_recipe(tmp_path, scene))
-    assert (stored.boundary, stored.ior, stored.device) == ("thin", 1.5, device)
-    assert stored.dentin is not None
-    assert scene.dentin is not None
-    np.testing.assert_array_equal(stored.dentin.modes_mm, scene.dentin.modes_mm)
-    np.testing.assert_array_equal(stored.outer.vertices_mm, scene.outer.vertices_mm)
-    np.testing.assert_array_equal(stored.light_positions_mm, scene.light_positions_mm)
+    assert (stored.boundary, stored.ior, stored.device, stored.gums_ior) == ("thin", 1.5, device, 1.4)
+    np.testing.assert_equal(asdict(stored), asdict(scene))
+
+
+@pytest.mark.parametrize("missing", ["gums", "cavity", "dentin"])
+def test_what_a_scene_lacks_stays_absent(tmp_path: Path, missing: str) -> None:
+    whole = SceneRecipe((ToothSurfaces(sphere(2.0), dentin_shape()),), LIGHTS_MM, np.ones(len(LIGHTS_MM)), gums=sphere(5.0), cavity=sphere(9.0))
+    scene = replace(whole, teeth=(ToothSurfaces(sphere(2.0)),)) if missing == "dentin" else replace(whole, **{missing: None})
+    stored = read_recipe(write_recipe(tmp_path, scene))
+    assert (stored.gums is None, stored.cavity is None, stored.teeth[0].dentin is None) == tuple(missing == part for part in ("gums", "cavity", "dentin"))
 
 
 class Recorder:

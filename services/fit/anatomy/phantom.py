@@ -20,7 +20,7 @@ from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, View, single_tooth
 
 FDI = 11
 IOR = 1.631
@@ -171,7 +171,7 @@ def _render(
         return _render_mitsuba(out, tooth, camera, lights, channel, TRUE_TISSUE[name], samples, seed)
     from services.fit.transport.engine import Engine
 
-    recipe = SceneRecipe(
+    recipe = single_tooth(
         outer=tooth.outer,
         dentin=None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3))),
         light_positions_mm=np.array([light.position_mm for light in lights]),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Mesh
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View, single_tooth
 
 SEMI_AXES_MM = np.array([3.0, 2.0, 4.0])
 BOX_MM = 4.0
@@ -56,7 +56,7 @@ def scenes() -> Iterator[Scene]:
     outer, dentin = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.3)
     plain = _recipe(outer, dentin)
     yield Scene("slivers", _recipe(with_slivers(outer), with_slivers(dentin)), TISSUE, plain, TISSUE)
-    yield Scene("slivers, thin faces", replace(plain, outer=with_slivers(outer), boundary="thin"), TISSUE, replace(plain, boundary="thin"), TISSUE)
+    yield Scene("slivers, thin faces", replace(_recipe(with_slivers(outer), dentin), boundary="thin"), TISSUE, replace(plain, boundary="thin"), TISSUE)
     thinnest, all_dentin = ellipsoid(SEMI_AXES_MM - 1e-3), Tissue(TISSUE.dentin, TISSUE.dentin)
     yield Scene("enamel of 1 um", _recipe(outer, thinnest), TISSUE, _recipe(outer, None), all_dentin)
     yield Scene("almost no absorption", plain, Tissue(Medium(10, 1 - 1e-7, g1=0.9), Medium(30, 1 - 1e-7, g1=0.99)))
@@ -76,7 +76,7 @@ def look(scene: Scene, *, samples: int, seed: int) -> Seen:
     Raises:
         NonFiniteError: a value came out NaN or infinite.
     """
-    parts = ("enamel",) if scene.recipe.dentin is None else ("enamel", "dentin")
+    parts = ("enamel",) if scene.recipe.teeth[0].dentin is None else ("enamel", "dentin")
     names = tuple(f"{part}.{field}" for part in parts for field in MEDIUM_FIELDS)
     engine, view = Engine(scene.recipe), _edge_on()
     image = engine.images(scene.tissue, view, samples=samples, seed=seed)
@@ -125,7 +125,7 @@ def _box() -> Mesh:
 
 def _recipe(outer: Mesh, dentin: Mesh | None) -> SceneRecipe:
     known = None if dentin is None else DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
-    return SceneRecipe(outer, known, _towards_lights(DISTANCE_MM), np.full(len(DIRECTIONS), DISTANCE_MM**2))
+    return single_tooth(outer, known, _towards_lights(DISTANCE_MM), np.full(len(DIRECTIONS), DISTANCE_MM**2))
 
 
 def _towards_lights(distance_mm: float) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, SceneRecipe, View, single_tooth
 
 TISSUE = Tissue(Medium(4.5, 0.997, 0.93, 0.82, -0.1), Medium(12.0, 0.9945, 1.0, 0.75))
 PIXEL_MM = 0.5
@@ -36,7 +36,7 @@ class IncisorStack:
     def recipe(self, dentin: DentinShape | None = None) -> SceneRecipe:
         """The scene for this engine, with the tooth's own dentin unless told otherwise; faces do not reflect."""
         known = DentinShape(self.dentin, np.zeros((0, len(self.dentin.vertices_mm), 3)))
-        return SceneRecipe(self.outer, dentin or known, self.light_positions_mm, self.light_intensities)
+        return single_tooth(self.outer, dentin or known, self.light_positions_mm, self.light_intensities)
 
     def tooth_view(self, engine: Engine, tissue: Tissue) -> View:
         """The pixels in which some light shows the tooth."""

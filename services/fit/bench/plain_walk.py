@@ -45,15 +45,16 @@ class PlainWalk(Walk):
         beyond = geometry.advance(walker.origin, walker.omega, hit, crosses)
         walker.origin = dr.select(scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin))
         walker.place = dr.select(crosses, geometry.beyond(walker.place, walker.omega, hit), walker.place)
-        walker.counts = [dr.select(scatters & (medium == 1), walker.counts[0] + 1, walker.counts[0])]
+        (count,) = walker.so_far.counts
+        walker.so_far.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
         # Connect to the lights, then turn.
-        self._connect(walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False)), tally)
+        self._connect(walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False)), tally)
         onward = PhaseFunction(self.media, medium).sample(walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32())
         walker.omega = dr.select(scatters, onward, walker.omega)
 
         # Faint paths survive in proportion to what they carry.
-        share = walker.weight * dr.exp(mi.Float(walker.counts[0]) * self.media.log_alpha[0]) / (ROULETTE_WEIGHT * walker.reference)
+        share = walker.weight * dr.exp(mi.Float(walker.so_far.counts[0]) * self.media.log_alpha[0]) / (ROULETTE_WEIGHT * walker.reference)
         faded = (share < 1) & (walker.rng.next_float32() >= share)
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
         ended = walker.active & ((~scatters & ~crosses) | faded)
@@ -62,7 +63,7 @@ class PlainWalk(Walk):
             walker.sample = walker.sample + 1
             fresh = self.start.begin(walker.lane, walker.sample, ended)
             walker.rng, walker.origin, walker.omega, walker.place = fresh.rng, fresh.origin, fresh.omega, fresh.place
-            walker.weight, walker.reference, walker.counts = fresh.weight, mi.Float(fresh.weight), [mi.UInt32(0)]
+            walker.weight, walker.reference, walker.so_far.counts = fresh.weight, mi.Float(fresh.weight), [mi.UInt32(0)]
             walker.active = walker.sample < limit
             return walker
 

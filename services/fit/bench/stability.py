@@ -93,7 +93,7 @@ class LaneTotals:
 def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
     """Everything a slab kernel can have: all scores of both layers, the moving border, faces."""
     scores = tuple(Score(k, field) for k in (1, 2) for field in MEDIUM_FIELDS) if gradient else ()
-    return Plan(scores=scores, shape=gradient, faces=True, most_steps=most_steps)
+    return Plan(scores=scores, shape=0 if gradient else None, faces=True, most_steps=most_steps)
 
 
 def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient: bool = True) -> LaneTotals:

@@ -23,7 +23,7 @@ from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.bench import Row
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View
+from services.fit.transport.recipe import DentinShape, View, single_tooth
 
 PAIRS = 30
 LIGHTS, FEW_LIGHTS = 18, (2, 7, 11)
@@ -70,13 +70,13 @@ def cases() -> list[Case]:
     incisor = build_incisor()
     rig = dome_lights(LIGHTS, ("green",), seed=1)
     positions, intensities = np.array([light.position_mm for light in rig]), np.array([light.intensity[0] for light in rig])
-    homogeneous = SceneRecipe(incisor.outer, None, positions, intensities)
+    homogeneous = single_tooth(incisor.outer, None, positions, intensities)
     few = replace(homogeneous, light_positions_mm=positions[list(FEW_LIGHTS)], light_intensities=intensities[list(FEW_LIGHTS)])
     dentin = dentin_blend_shape(incisor.outer)
     modelled = Mesh(dentin.vertices_mm(TISSUE.shape), dentin.base.faces)
     plain, unable = Engine(homogeneous), PlainEngine(homogeneous)
-    blend = Engine(replace(homogeneous, dentin=dentin))
-    known = Engine(replace(homogeneous, dentin=DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape)))))
+    blend = Engine(single_tooth(incisor.outer, dentin, positions, intensities))
+    known = Engine(single_tooth(incisor.outer, DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape))), positions, intensities))
     camera = dome_cameras(1, PIXEL_MM, (incisor.outer,))[0]
     every_pixel, (crop, cropped_camera) = _view(camera), _crop(camera)
     one, unused, ready, two, layered = (

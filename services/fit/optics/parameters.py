@@ -66,3 +66,40 @@ class Tissue:
             else:
                 dentin = replace(dentin, **{leaf: value})
         return Tissue(enamel, dentin, tuple(shape))
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """Everything a fit may change in a scene of several parts, for one colour channel.
+
+    Names: ``0.enamel.sigma`` ... ``13.shape.2`` by tooth, ``gums.sigma`` ..., ``cavity.reflectance``.
+    """
+
+    teeth: tuple[Tissue, ...]
+    gums: Medium | None = None
+    reflectance: float | None = None
+    """Of the cavity's wall, diffuse, 0 to 1."""
+
+    def value(self, name: str) -> float:
+        """The parameter called ``name``."""
+        part, leaf = name.split(".", 1)
+        if part == "gums":
+            return float(getattr(self.gums, leaf))
+        if part == "cavity":
+            assert self.reflectance is not None
+            return self.reflectance
+        return self.teeth[int(part)].value(leaf)
+
+    def with_values(self, values: dict[str, float]) -> Mouth:
+        """A copy with some parameters replaced."""
+        teeth, gums, reflectance = list(self.teeth), self.gums, self.reflectance
+        for name, value in values.items():
+            part, leaf = name.split(".", 1)
+            if part == "gums":
+                assert gums is not None
+                gums = replace(gums, **{leaf: value})
+            elif part == "cavity":
+                reflectance = value
+            else:
+                teeth[int(part)] = teeth[int(part)].with_values({leaf: value})
+        return Mouth(tuple(teeth), gums, reflectance)

@@ -178,7 +178,7 @@ def accumulate(
     border = gradient and len(layers) == 2
     geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
     media = Media([_medium(layer) for layer in layers])
-    plan = Plan(scores=tuple(Score(*score) for score in scores), shape=border, faces=True, bend=boundary == "smooth")
+    plan = Plan(scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True, bend=boundary == "smooth")
     sums = Sums(1 + len(scores) + border, float(specular_share(ior, source)))
     spread = np.array([_spread_of_border(layers, score) for score in scores])
     from_scores: bool | None = False if border_terms_only or not border else None

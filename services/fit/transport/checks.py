@@ -12,6 +12,8 @@ FARTHEST_MM = 1e12
 """A million kilometres; farther away, squares of distances leave what single precision holds."""
 INTENSITIES = (1e-30, 1e30)
 """Likewise."""
+MOST_TEETH = 15
+"""A place in the scene is 32 bits: two for each tooth, one for gums."""
 
 
 def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], reach_mm: float) -> None:
@@ -40,6 +42,25 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
             )
 
 
+def require_surfaces(recipe: SceneRecipe) -> None:
+    """Refuse surfaces that cannot bound media, and more teeth than a scene can hold.
+
+    Raises:
+        MeshError: names the surface. InputError: no tooth, or too many.
+    """
+    if not 0 < len(recipe.teeth) <= MOST_TEETH:
+        raise InputError(f"The scene has {len(recipe.teeth)} teeth; give 1 to {MOST_TEETH}.")
+    for number, tooth in enumerate(recipe.teeth):
+        which = "" if len(recipe.teeth) == 1 else f" of tooth {number}"
+        tooth.outer.require_solid(f"outer surface{which}")
+        if tooth.dentin is not None:
+            tooth.dentin.base.require_solid(f"dentin surface{which}")
+    if recipe.gums is not None:
+        recipe.gums.require_solid("gums")
+    if recipe.cavity is not None:
+        recipe.cavity.require_surface("cavity")
+
+
 def require_view(view: View, recipe: SceneRecipe) -> None:
     """Refuse a view without pixels, with pixels or lights that do not exist, or from where the tooth is.
 
@@ -49,7 +70,7 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     name, lights = view.camera.name, len(recipe.light_positions_mm)
     pose = np.asarray(view.camera.camera_from_world)
     eye_mm = -pose[:3, :3].T @ pose[:3, 3]
-    if (eye_mm >= recipe.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= recipe.outer.vertices_mm.max(axis=0)).all():
+    if any((eye_mm >= tooth.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= tooth.outer.vertices_mm.max(axis=0)).all() for tooth in recipe.teeth):
         where = ", ".join(f"{c:.4g}" for c in eye_mm)
         raise InputError(f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as the meshes are.")
     if len(view) == 0:

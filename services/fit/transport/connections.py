@@ -15,7 +15,7 @@ import mitsuba as mi
 from services.fit.transport.geometry import Geometry
 from services.fit.transport.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction
-from services.fit.transport.scores import Plan, Scores
+from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.tally import Tally
 
 MAP_DOUBT = 0.03
@@ -34,11 +34,13 @@ class Vertex:
     carried: mi.Float
     clear: mi.Float
     """Transmittance over the distance in which no surface lies: no light can be brighter."""
-    counts: list[mi.UInt32]
+    so_far: Scatterings
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     secondary: mi.Bool
     shape_factor: list[mi.Float]
+    wall: list[mi.Bool]
+    """Whether it lies on an opaque surface, whose normal ``omega`` then is; empty in scenes that have none."""
     total: mi.Float
     """Sum of ``carried * clear`` over the vertices offered; 0 when there was none."""
 
@@ -65,7 +67,7 @@ class Connections:
 
     def __init__(self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, book: Scores, ior: mi.Float | None) -> None:
         self.geometry, self.media, self.lights, self.plan, self.book, self.ior = geometry, media, lights, plan, book, ior
-        self.modes = geometry.modes if plan.shape else 0
+        self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.turns = lights.turns
         """Steps of the walk per connection."""
 
@@ -76,8 +78,8 @@ class Connections:
             return [mi.Float(0) for _ in range(count)]
 
         return Vertex(
-            mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), [mi.UInt32(0) for _ in range(self.media.count)],
-            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes), mi.Float(0),
+            mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.book.unscattered(),
+            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque, mi.Float(0),
         )  # fmt: skip
 
     def offer(self, kept: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
@@ -115,16 +117,15 @@ class Connections:
     def _look_everywhere(self, vertex: Vertex, lane: mi.UInt32, u: mi.Float, active: mi.Bool, tally: Tally) -> Doubt:
         """Count what the light maps expect from every light, and keep one light in proportion to the doubt about it."""
         maps, count = self.lights.maps, self.lights.count
-        doubt = 1.0 if self.plan.shape else MAP_DOUBT
+        doubt = MAP_DOUBT if self.plan.shape is None else 1.0
         # A vertex stands for all that were offered with it.
         strength = vertex.total / dr.maximum(vertex.clear, 1e-30)
 
         def step(
             light: mi.UInt32, u: mi.Float, kept: Doubt, vertex: Vertex, lane: mi.UInt32, strength: mi.Float, active: mi.Bool
         ) -> tuple[mi.UInt32, mi.Float, Doubt, Vertex, mi.UInt32, mi.Float, mi.Bool]:
-            seen = maps.look(light, vertex.point, active)
-            phase = PhaseFunction(self.media, self.geometry.medium(vertex.place))
-            weight = strength * phase.density(vertex.omega, seen.direction) * seen.falloff
+            seen = maps.look(light, vertex.point, vertex.place, active)
+            weight = strength * self._density(vertex, seen.direction) * seen.falloff
             expected, lengths = seen.transmittance(self.media), seen.lengths(self.book.sigma_media)
             self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
 
@@ -163,23 +164,32 @@ class Connections:
         """Add a connection's value to its image and, times the score of the whole path, to the derivatives."""
         slot, primary = self._slot(vertex, light), active & ~vertex.secondary
         tally.add(lane, slot, value, primary)
-        medium = self.geometry.medium(vertex.place)
+        medium = self._medium(vertex)
         terms = PhaseFunction(self.media, medium).scores(self.book.phase_fields, vertex.omega, direction)
         lengths_of = dict(zip(self.book.sigma_media, lengths, strict=True))
-        for which, score in enumerate(self.book.complete(vertex.sums, vertex.counts, medium, terms, lengths_of)):
+        for which, score in enumerate(self.book.complete(vertex.sums, vertex.so_far, medium, terms, lengths_of)):
             tally.add_derivative(which, lane, slot, value * score, primary)
         for mode in range(self.modes):
             on_the_way = vertex.border_sums[mode] if border is None else vertex.border_sums[mode] + border[mode]
             factor = dr.select(vertex.secondary, vertex.shape_factor[mode], on_the_way)
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
+    def _medium(self, vertex: Vertex) -> mi.UInt32:
+        medium = self.geometry.medium(vertex.place)
+        return dr.select(vertex.wall[0], mi.UInt32(self.media.count), medium) if vertex.wall else medium
+
+    def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
+        """Phase function, or diffuse reflection of white, towards a direction, 1/sr."""
+        density = PhaseFunction(self.media, self.geometry.medium(vertex.place)).density(vertex.omega, direction)
+        if vertex.wall:
+            density = dr.select(vertex.wall[0], dr.maximum(dr.dot(vertex.omega, direction), 0) * dr.inv_pi, density)
+        return density
+
     def _slot(self, vertex: Vertex, light: mi.UInt32) -> mi.UInt32:
         edges = self.plan.order_edges
         if not edges:
             return light
-        order, bin_index = vertex.counts[0], mi.UInt32(0)
-        for count in vertex.counts[1:]:
-            order = order + count
+        order, bin_index = self.book.order(vertex.so_far), mi.UInt32(0)
         for edge in edges[1:-1]:
             bin_index += dr.select(order >= edge, mi.UInt32(1), mi.UInt32(0))
         return light * (len(edges) - 1) + bin_index

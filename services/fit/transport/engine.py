@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.checks import require_finite, require_lights, require_view
+from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.transport.checks import require_finite, require_lights, require_surfaces, require_view
+from services.fit.transport.names import media_of, parameter_names, whitened
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
 from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 LANE_BUDGET = 24_000_000
 """Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
-PART_NUMBER = {"enamel": 1, "dentin": 2}
 
 
 class Engine:
@@ -36,30 +36,32 @@ class Engine:
         Raises:
             PlatformError: no usable libLLVM. MeshError: a surface cannot bound a medium. InputError: no usable light.
         """
-        recipe.outer.require_solid("outer surface")
-        if recipe.dentin is not None:
-            recipe.dentin.base.require_solid("dentin surface")
-        reach_mm = float(np.linalg.norm(recipe.outer.vertices_mm, axis=1).max())
+        require_surfaces(recipe)
+        reach_mm = float(np.linalg.norm(recipe.vertices_mm(), axis=1).max())
         require_lights(recipe.light_positions_mm, recipe.light_intensities, reach_mm)
-        if not math.isfinite(recipe.ior) or recipe.ior < 1:
-            raise InputError(f"ior = {recipe.ior:g} must be at least 1; give the index of refraction of enamel, 1.631.")
+        for name, ior, usual in (("ior", recipe.ior, "enamel, 1.631"), ("gums_ior", recipe.gums_ior, "gums, 1.33")):
+            if not math.isfinite(ior) or ior < 1:
+                raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
         prepare_device(threads, recipe.device)
-        from services.fit.transport.geometry import MeshGeometry
         from services.fit.transport.light_maps import LightMaps
         from services.fit.transport.lights import PointLights
+        from services.fit.transport.mesh_geometry import MeshGeometry
+        from services.fit.transport.mouth_maps import MouthMaps
 
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
-        maps = LightMaps(recipe.light_positions_mm, recipe.light_intensities, recipe.outer.vertices_mm)
+        kind = LightMaps if self._geometry.single else MouthMaps
+        maps = kind(recipe.light_positions_mm, recipe.light_intensities, recipe.vertices_mm())
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
         self._radius_mm = reach_mm
-        self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
+        refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
+        self._ior = recipe.ior if recipe.boundary == "thin" and refracts else None
         self._lights.maps.trace(self._geometry, self._ior)
 
     def images(
         self,
-        tissue: Tissue,
+        tissue: Tissue | Mouth,
         view: View,
         *,
         seed: int,
@@ -94,7 +96,7 @@ class Engine:
 
     def jacobian(
         self,
-        tissue: Tissue,
+        tissue: Tissue | Mouth,
         view: View,
         names: tuple[str, ...],
         *,
@@ -117,15 +119,18 @@ class Engine:
         from services.fit.transport.media import Score
         from services.fit.transport.scores import Plan
 
-        modes = self._geometry.modes
-        known = {f"{part}.{field}" for part in self._parts() for field in ("sigma", "alpha", "beta", "g1", "g2")} | {f"shape.{k}" for k in range(modes)}
+        known = parameter_names(self.recipe)
         unknown = [name for name in names if name not in known]
         if unknown:
-            raise InputError(f"Parameter {unknown[0]} does not exist in this scene; it has {', '.join(sorted(known))}.")
-        medium_names = [name for name in names if not name.startswith("shape.")]
-        scores = tuple(Score(PART_NUMBER[name.split(".")[0]], name.split(".")[1]) for name in medium_names)
-        plan = Plan(scores=scores, shape=any(name.startswith("shape.") for name in names))
-        place = {name: k for k, name in enumerate(medium_names + [f"shape.{k}" for k in range(modes)], 1)}
+            raise InputError(f"Parameter {unknown[0]} does not exist in this scene; it has {', '.join(known)}.")
+        media = [name for name in names if known[name].shape is None]
+        moved = {tooth for name in names if (tooth := known[name].shape) is not None}
+        if len(moved) > 1:
+            raise InputError(f"Shapes of teeth {sorted(moved)} were asked for at once; ask for one tooth's at a time.")
+        shape = next(iter(moved), None)
+        plan = Plan(scores=tuple(Score(known[name].medium, known[name].field) for name in media), shape=shape)
+        shapes = [name for name, parameter in known.items() if parameter.shape is not None and parameter.shape == shape]
+        place = {name: k for k, name in enumerate(media + shapes, 1)}
 
         def summarise(tables: Sums) -> JacobianEstimate:
             mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
@@ -136,45 +141,38 @@ class Engine:
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
         return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
 
-    def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> NDArray[np.float64]:
+    def order_images(
+        self, tissue: Tissue | Mouth, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1
+    ) -> NDArray[np.float64]:
         """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
 
         An image is a polynomial in a common albedo with these as coefficients; paths end at the last edge.
         """
-        from dataclasses import replace
-
         from services.fit.transport.scores import Plan
 
-        white = Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
+        white = whitened(tissue)
         plan, bins = Plan(order_edges=tuple(int(edge) for edge in bin_edges)), len(bin_edges) - 1
         batches, count = Effort(samples=samples, batches=batches).shares(samples)
         (sums,) = self._trace(white, view, plan, range(count), seed, batches)
         (orders,) = self._among_all(view, (sums / count).mean(axis=0).reshape(len(view), -1, bins).T)
         return orders
 
-    def _parts(self) -> tuple[str, ...]:
-        return ("enamel",) if self.recipe.dentin is None else ("enamel", "dentin")
-
-    def _trace(self, tissue: Tissue, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
+    def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
         """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
-        from services.fit.transport.media import Media, require_medium
+        from services.fit.transport.media import Media
         from services.fit.transport.starts import CameraStart
 
         require_view(view, self.recipe)
-        media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
-        for part, medium in zip(self._parts(), media, strict=True):
-            require_medium(part, medium)
-        # A solver's step that ends on a bound may be off by a rounding.
-        if len(tissue.shape) != self._geometry.modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
-            raise InputError(f"shape = {tissue.shape} must be {self._geometry.modes} blend weights between 0 and 1, one per dentin mode; correct it.")
-        if self._geometry.reshape(tissue.shape):
+        mouth = tissue if isinstance(tissue, Mouth) else Mouth((tissue,))
+        media = media_of(mouth, self.recipe)
+        if self._geometry.reshape(tuple(tuple(tooth.shape) for tooth in mouth.teeth)):
             self._lights.maps.trace(self._geometry, self._ior)
             self._some_lights.clear()
 
         lights, kernel_media = self._lights_of(view), Media(media)
         bins = max(len(plan.order_edges) - 1, 1)
         slots = lights.count * bins
-        tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)
+        tables = 1 + len(plan.scores) + (0 if plan.shape is None else self._geometry.modes_of[plan.shape])
         slice_size = max(1, LANE_BUDGET // (batches * slots * tables))
         pieces = []
         for first in range(0, len(view), slice_size):

@@ -9,8 +9,10 @@ Stamminger 2003, here as a control variate).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -18,8 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
-from services.fit.transport.geometry import DENTIN, ENAMEL, MeshGeometry
+from services.fit.transport.geometry import DENTIN, ENAMEL, Hit
 from services.fit.transport.media import Media
+
+if TYPE_CHECKING:
+    from services.fit.transport.mesh_geometry import MeshGeometry
 
 TEXEL_MM = 0.15
 """Spacing of the grid at the tooth."""
@@ -37,8 +42,10 @@ class LightView:
     direction: mi.Vector3f
     falloff: mi.Float
     """Intensity over squared distance."""
-    enamel_mm: mi.Float
-    dentin_mm: mi.Float
+    media: tuple[int | mi.UInt32, ...]
+    """Numbers of the media on the way ..."""
+    lengths_mm: tuple[mi.Float, ...]
+    """... and how far it leads through each."""
     surface: mi.Float
     """Transmittance of the outer face."""
     certain: mi.Bool
@@ -46,38 +53,72 @@ class LightView:
 
     def lengths(self, media: tuple[int, ...]) -> list[mi.Float]:
         """Path length in mm inside each of some media."""
-        return [self.enamel_mm if medium == ENAMEL else self.dentin_mm for medium in media]
+        found = []
+        for medium in media:
+            of_this = [dr.select(number == medium, length, 0) for number, length in zip(self.media, self.lengths_mm, strict=True)]
+            found.append(sum(of_this, start=mi.Float(0)))
+        return found
 
     def transmittance(self, media: Media) -> mi.Float:
         """Expected transmittance, 0 where the map does not know."""
-        depth = media.sigma[ENAMEL - 1] * self.enamel_mm
-        if media.count >= DENTIN:
-            depth = dr.fma(media.sigma[DENTIN - 1], self.dentin_mm, depth)
+        depth = mi.Float(0)
+        for number, length in zip(self.media, self.lengths_mm, strict=True):
+            if not isinstance(number, int):
+                depth = dr.fma(media.pick(media.sigma, number), length, depth)
+            elif number <= media.count:
+                depth = dr.fma(media.sigma[number - 1], length, depth)
         return dr.select(self.certain & (depth < DARK_DEPTH), self.surface * dr.exp(-depth), 0)
 
 
+@dataclass
+class MapRay:
+    """A light's ray on its way through the scene, and what it met."""
+
+    point: mi.Point3f
+    direction: mi.Vector3f
+    travelled: mi.Float
+    """From the plane across the scene's centre, negative before it."""
+    place: mi.UInt32
+    entry: mi.Float
+    dentin_entry: mi.Float
+    dentin_exit: mi.Float
+    surface: mi.Float
+    meetings: mi.UInt32
+    """What it met, in bits."""
+    limit: mi.Float
+    """Where following it ended."""
+    alive: mi.Bool
+
+
 class LightMaps:
-    """One depth map per light, over a square of directions that holds the whole tooth."""
+    """One depth map per light of a single tooth, over a square of directions that holds all of it."""
+
+    WORDS = 2
+    """Of 32 bits per grid point."""
+    MOST_BYTES = 2**29
+    """Of all maps; larger scenes under more lights have a coarser grid."""
 
     def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]) -> None:
         centre = 0.5 * (outer_mm.min(axis=0) + outer_mm.max(axis=0))
         radius = float(np.linalg.norm(outer_mm - centre, axis=1).max())
         relative = positions_mm - centre
         distance = np.linalg.norm(relative, axis=1)
-        helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-        right = np.cross(relative, helper)
-        right *= (distance / np.linalg.norm(right, axis=1) / TEXEL_MM)[:, None]
 
         # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the map is not certain.
-        half = (radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max() / TEXEL_MM
-        self.count, self.size = len(positions_mm), 2 * int(np.ceil(half)) + 3
+        half_mm = float((radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max())
+        self.count = len(positions_mm)
+        self.texel_mm = max(TEXEL_MM, 2 * half_mm / np.sqrt(self.MOST_BYTES / (4 * self.WORDS * self.count)))
+        self.size = 2 * int(np.ceil(half_mm / self.texel_mm)) + 3
+
+        helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        right = np.cross(relative, helper)
+        right *= (distance / np.linalg.norm(right, axis=1) / self.texel_mm)[:, None]
         self._near = float(radius + MARGIN_MM)
         self._centre = dr.opaque(mi.Vector3f, centre.tolist())
         columns = [-relative / distance[:, None], intensities[:, None], right, distance[:, None]]
         self._frames = aligned(mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1)))
         self._table = mi.UInt32(0)
-        self._offsets = (-self._near, -self._near, -self._near, 0.0)
-        self._steps = (2 * self._near / 65535,) * 3 + (1 / 65535,)
+        self._depth_step = 2 * self._near / 65535
         dr.eval(self._frames)
 
     def of(self, chosen: list[int]) -> LightMaps:
@@ -100,77 +141,75 @@ class LightMaps:
         frame = self._frame(index // self.size**2)
         x = mi.Float(index % self.size) - self.size // 2
         y = mi.Float(index // self.size % self.size) - self.size // 2
-        # Through a point of the plane across the tooth's centre; written without the difference of two long distances.
-        across = (frame.right * x + frame.up * y) * dr.square(TEXEL_MM / frame.distance)
+        # Through a point of the plane across the scene's centre; written without the difference of two long distances.
+        across = (frame.right * x + frame.up * y) * dr.square(self.texel_mm / frame.distance)
         ray_length = dr.norm(frame.forward + across) * frame.distance
         direction = (frame.forward + across) * (frame.distance / ray_length)
         offset = across * frame.distance
         before = self._near + dr.squared_norm(offset) / (ray_length + frame.distance)
+        start = mi.Point3f(self._centre + offset - direction * before)
 
-        @dataclass
-        class Ray:
-            point: mi.Point3f
-            direction: mi.Vector3f
-            travelled: mi.Float
-            place: mi.UInt32
-            entry: mi.Float
-            dentin_entry: mi.Float
-            dentin_exit: mi.Float
-            surface: mi.Float
-            meetings: mi.UInt32
-            """Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order."""
-            alive: mi.Bool
-
-        def step(ray: Ray) -> tuple[Ray]:
+        def step(ray: MapRay) -> tuple[MapRay]:
             hit = geometry.intersect(ray.point, ray.direction, ray.place, ray.alive)
-            cosine = dr.dot(ray.direction, hit.normal)
-            entering, met = cosine < 0, hit.valid
-            travelled = ray.travelled + dr.select(met, hit.distance, 0)
-            event = dr.select(hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4)))
-            # Each event once, and inside the dentin only inside the tooth.
-            repeated = (ray.meetings & event) != 0
-            unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
-            ray.meetings |= dr.select(met, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
-            ray.entry = dr.select(met & (event == 1), travelled, ray.entry)
-            ray.dentin_entry = dr.select(met & (event == 2), travelled, ray.dentin_entry)
-            ray.dentin_exit = dr.select(met & (event == 4), travelled, ray.dentin_exit)
+            behind = geometry.beyond(ray.place, ray.direction, hit)
+            ray.travelled += dr.select(hit.valid, hit.distance, 0)
+            through = mi.Float(1)
             if ior is not None:
-                ray.surface = dr.select(met & (event == 1), 1 - fresnel.reflectance(dr.abs(cosine), ior), ray.surface)
-            ray.point = dr.select(met, geometry.advance(ray.point, ray.direction, hit, met), ray.point)
-            ray.place = dr.select(met, geometry.beyond(ray.place, ray.direction, hit), ray.place)
-            ray.travelled = travelled
-            ray.alive &= met & ((ray.meetings & 16) == 0)
+                through = 1 - fresnel.reflectance(dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.place, behind))
+            self._meet(ray, geometry, hit, through)
+            ray.point = dr.select(hit.valid, geometry.advance(ray.point, ray.direction, hit, hit.valid), ray.point)
+            ray.place = dr.select(hit.valid, behind, ray.place)
             return (ray,)
 
-        start = mi.Point3f(self._centre + offset - direction * before)
-        ray = Ray(
-            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes),
-            dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Bool, True, lanes),
+        ray = MapRay(
+            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes),
+            dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, -self._near, lanes),
+            dr.full(mi.Bool, True, lanes),
         )  # fmt: skip
         (ray,) = dr.while_loop((ray,), lambda ray: ray.alive, step, label="light map")
         dr.eval(ray)
         dr.sync_thread()
-        self._store([np.array(v) for v in (ray.entry, ray.dentin_entry, ray.dentin_exit, ray.surface)], np.array(ray.meetings))
+        self._store(ray)
 
-    def _store(self, columns: list[NDArray[np.float32]], meetings: NDArray[np.uint32]) -> None:
-        # A cell is certain where all its corners were met in the same order, once each.
+    def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
+        """Note a surface. Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order."""
+        entering, met = dr.dot(ray.direction, hit.normal) < 0, hit.valid
+        event = dr.select(hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4)))
+        # Each event once, and inside the dentin only inside the tooth.
+        repeated = (ray.meetings & event) != 0
+        unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
+        ray.meetings |= dr.select(met, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
+        ray.entry = dr.select(met & (event == 1), ray.travelled, ray.entry)
+        ray.dentin_entry = dr.select(met & (event == 2), ray.travelled, ray.dentin_entry)
+        ray.dentin_exit = dr.select(met & (event == 4), ray.travelled, ray.dentin_exit)
+        ray.surface = dr.select(met & (event == 1), through, ray.surface)
+        ray.alive &= met & ((ray.meetings & 16) == 0)
+
+    def _store(self, ray: MapRay) -> None:
+        self._pack([ray.entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, (1 | 8, 1 | 2 | 4 | 8))
+
+    def _pack(self, depths: list[mi.Float], surface: mi.Float, kind: mi.UInt32, certain_kinds: tuple[int, ...], more: tuple[mi.UInt32, ...] = ()) -> None:
+        """Four numbers of 16 bits, so that all maps stay in the cache: three depths, and the surface with the cell's certainty in the lowest bit.
+
+        A cell is certain where all its corners met the same, of a kind that the map can tell.
+        """
         shape = (self.count, self.size, self.size)
-        kind = meetings.reshape(shape)
+        kinds = np.array(kind).reshape(shape)
         certain = np.zeros(shape, dtype=np.uint32)
-        corners = [kind[:, :-1, :-1], kind[:, 1:, :-1], kind[:, :-1, 1:], kind[:, 1:, 1:]]
-        certain[:, :-1, :-1] = np.logical_and.reduce([corner == corners[0] for corner in corners]) & np.isin(corners[0], (1 | 8, 1 | 2 | 4 | 8))
-
-        # Eight bytes a texel, so that all maps stay in the cache: four numbers of 16 bits, the last one's lowest bit says that the cell is certain.
-        codes = [
-            np.clip(np.rint((column.reshape(shape).astype(np.float64) - offset) / step), 0, 65535).astype(np.uint32)
-            for column, offset, step in zip(columns, self._offsets, self._steps, strict=True)
-        ]
-        self._table = mi.UInt32(np.stack([codes[0] | codes[1] << 16, codes[2] | (codes[3] & ~np.uint32(1) | certain) << 16], axis=-1).reshape(-1))
+        corners = [kinds[:, :-1, :-1], kinds[:, 1:, :-1], kinds[:, :-1, 1:], kinds[:, 1:, 1:]]
+        certain[:, :-1, :-1] = np.logical_and.reduce([corner == corners[0] for corner in corners]) & np.isin(corners[0], certain_kinds)
+        codes = [self._depth_code(depth).reshape(shape) for depth in depths]
+        codes.append(np.rint(np.clip(np.array(surface, dtype=np.float64), 0, 1) * 65535).astype(np.uint32).reshape(shape) & ~np.uint32(1) | certain)
+        words = [codes[0] | codes[1] << 16, codes[2] | codes[3] << 16, *(np.array(word).reshape(shape) for word in more)]
+        self._table = mi.UInt32(np.stack(words, axis=-1).reshape(-1))
         dr.eval(self._table)
+
+    def _depth_code(self, depth: mi.Float) -> NDArray[np.uint32]:
+        return np.clip(np.rint((np.array(depth, dtype=np.float64) + self._near) / self._depth_step), 0, 65535).astype(np.uint32)
 
     @dataclass
     class _Frame:
-        """A light looking at the tooth; ``right`` and ``up`` are as long as there are texels in the distance."""
+        """A light looking at the scene; ``right`` and ``up`` are as long as there are texels in the distance."""
 
         intensity: mi.Float
         right: mi.Vector3f
@@ -183,14 +222,14 @@ class LightMaps:
         forward, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
         return LightMaps._Frame(first.w, right, dr.cross(forward, right), forward, second.w)
 
-    def look(self, light: mi.UInt32, point: mi.Point3f, active: mi.Bool) -> LightView:
-        """What lies between ``point``, inside the tooth, and a light."""
+    def look(self, light: mi.UInt32, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> LightView:
+        """What lies between ``point`` and a light."""
         frame, from_centre = self._frame(light), mi.Vector3f(point - self._centre)
         from_light = frame.forward * frame.distance + from_centre
         ahead = dr.dot(from_centre, frame.forward)
         squared = dr.squared_norm(from_light)
         inverse = dr.rsqrt(squared)
-        # How much farther than the tooth's centre, without the difference of two long distances.
+        # How much farther than the scene's centre, without the difference of two long distances.
         depth = dr.fma(2 * frame.distance, ahead, dr.squared_norm(from_centre)) / dr.fma(squared, inverse, frame.distance)
 
         # Bilinear interpolation between the four rays around the vertex.
@@ -198,20 +237,34 @@ class LightMaps:
         x = dr.fma(dr.dot(from_centre, frame.right), per_forward, self.size // 2)
         y = dr.fma(dr.dot(from_centre, frame.up), per_forward, self.size // 2)
         column, row = dr.floor(x), dr.floor(y)
-        u, v = x - column, y - row
         cell = (light * self.size + mi.UInt32(dr.maximum(row, 0))) * self.size + mi.UInt32(dr.maximum(column, 0))
         cell = dr.minimum(cell, self.count * self.size**2 - self.size - 2)
-        corners = [[dr.gather(mi.UInt32, self._table, 2 * (cell + k) + half) for half in (0, 1)] for k in (0, 1, self.size, self.size + 1)]
-        numbers = [[mi.Float(value) for half in corner for value in (half & 0xFFFF, half >> 16)] for corner in corners]
-        entry, dentin_entry, dentin_exit, surface = (
-            dr.fma(dr.lerp(dr.lerp(*values[:2], u), dr.lerp(*values[2:], u), v), step, offset)
-            for values, step, offset in zip(zip(*numbers, strict=True), self._steps, self._offsets, strict=True)
-        )
         inside = (per_forward > 0) & (dr.minimum(column, row) >= 0) & (dr.maximum(column, row) < self.size - 1)
-        certain = active & inside & ((corners[0][1] & 0x10000) != 0)
+        corners = [[dr.gather(mi.UInt32, self._table, self.WORDS * (cell + k) + word) for word in range(self.WORDS)] for k in (0, 1, self.size, self.size + 1)]
+        u, v = x - column, y - row
+
+        def between(word: int, shift: int) -> mi.Float:
+            values = [mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift) for corner in corners]
+            return dr.lerp(dr.lerp(*values[:2], u), dr.lerp(*values[2:], u), v)
+
+        return self._view(-from_light * inverse, frame.intensity * dr.square(inverse), depth, corners, between, place, active & inside)
+
+    def _view(
+        self,
+        direction: mi.Vector3f,
+        falloff: mi.Float,
+        depth: mi.Float,
+        corners: list[list[mi.UInt32]],
+        between: Callable[[int, int], mi.Float],
+        place: mi.UInt32,  # noqa: ARG002 - scenes of several surfaces need it
+        inside: mi.Bool,
+    ) -> LightView:
+        """Read a cell; ``between`` interpolates the half of a word from a bit on."""
+        entry, dentin_entry, dentin_exit = (dr.fma(between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0)))
         dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
-        return LightView(-from_light * inverse, frame.intensity * dr.square(inverse), enamel_mm, dentin_mm, surface, certain)
+        certain = inside & ((corners[0][1] & 0x10000) != 0)
+        return LightView(direction, falloff, (ENAMEL, DENTIN), (enamel_mm, dentin_mm), between(1, 16) * (1 / 65535), certain)
 
 
 def aligned(values: mi.Float) -> mi.Float:

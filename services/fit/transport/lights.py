@@ -102,14 +102,14 @@ def shadow(
     active: mi.Bool,
     *,
     measured: tuple[int, ...] = (),
-    shape: bool = False,
+    shape: int | None = None,
     thin_ior: mi.Float | None = None,
 ) -> ShadowRay:
     """Follow straight lines to distant lights through all media.
 
     Args:
         measured: media whose path lengths are wanted.
-        shape: whether derivatives to the border's shape are wanted.
+        shape: tooth to whose border's shape derivatives are wanted.
         thin_ior: index of refraction of ``thin`` outer faces; None where they are index-matched.
     """
 
@@ -122,17 +122,20 @@ def shadow(
         ray.lengths = [total + dr.select(medium == k, length, 0) for k, total in zip(measured, ray.lengths, strict=True)]
         behind = geometry.beyond(ray.place, direction, hit)
         cosine = dr.dot(direction, hit.normal)
-        if shape:
+        if shape is not None:
             jump = (media.extinction(geometry.medium(behind)) - sigma) * inverse_cosine(cosine)
-            ray.border = [dr.fma(speed, jump, total) for total, speed in zip(ray.border, geometry.velocity(hit, ray.alive), strict=True)]
+            ray.border = [dr.fma(speed, jump, total) for total, speed in zip(ray.border, geometry.velocity(hit, shape, ray.alive), strict=True)]
         if thin_ior is not None:
-            ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), thin_ior), 1)
+            contrast = geometry.contrast(thin_ior, ray.place, behind)
+            ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
+        if geometry.opaque:
+            ray.surface = dr.select(hit.opaque, 0, ray.surface)
         ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)
         ray.place = dr.select(hit.valid, behind, ray.place)
-        ray.alive &= hit.valid & (ray.depth < DARK_DEPTH)
+        ray.alive &= hit.valid & ~hit.opaque & (ray.depth < DARK_DEPTH)
         return ray, direction
 
-    modes = geometry.modes if shape else 0
+    modes = 0 if shape is None else geometry.modes_of[shape]
     ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)], mi.Bool(active))
     ray, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
     return ray

@@ -14,6 +14,9 @@ from services.core.errors import InputError
 from services.fit.optics import phase
 from services.fit.optics.parameters import Medium
 
+MOST_SELECTED = 3
+"""Values of more media than this are gathered from a table."""
+
 
 def require_medium(name: str, medium: Medium) -> None:
     """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, where they must lie inside it too.
@@ -65,9 +68,16 @@ class Media:
         self.beta = opaque(lambda m: m.beta)
         self.g1 = opaque(lambda m: m.g1)
         self.g2 = opaque(lambda m: m.g2)
+        self._tables: dict[int, mi.Float] = {}
+        if self.count > MOST_SELECTED:
+            columns = (self.sigma, self.sigma_s, self.log_alpha, self.beta, self.g1, self.g2)
+            self._tables = {id(column): dr.concat(column) for column in columns}
+            dr.eval(self._tables)
 
     def pick(self, values: list[mi.Float], index: mi.UInt32) -> mi.Float:
-        """Value of the medium an index names; the last one where it names empty space."""
+        """Value of the medium an index names; any where it names empty space."""
+        if self._tables:
+            return dr.gather(mi.Float, self._tables[id(values)], dr.maximum(index, 1) - 1)
         result = values[-1]
         for k in range(self.count - 2, -1, -1):
             result = dr.select(index == k + 1, values[k], result)

@@ -25,11 +25,21 @@ class DentinShape:
 
 
 @dataclass(frozen=True)
-class SceneRecipe:
-    """One tooth, its lights and its boundary model, for one colour channel."""
+class ToothSurfaces:
+    """One tooth: the surface around its enamel, and the dentin's inside, if there is any."""
 
     outer: Mesh
-    dentin: DentinShape | None
+    dentin: DentinShape | None = None
+
+
+@dataclass(frozen=True)
+class SceneRecipe:
+    """Teeth with what surrounds them, their lights and their boundary model, for one colour channel.
+
+    Where solids overlap, dentin counts over enamel over gums, and of two teeth the one listed first.
+    """
+
+    teeth: tuple[ToothSurfaces, ...]
     light_positions_mm: NDArray[np.float64]
     """(L, 3)"""
     light_intensities: NDArray[np.float64]
@@ -38,6 +48,29 @@ class SceneRecipe:
     ior: float = 1.631
     device: Device | None = None
     """Where its paths are traced; None for where this process already renders, else the processor."""
+    gums: Mesh | None = None
+    """The solid that holds the roots."""
+    gums_ior: float = 1.33
+    cavity: Mesh | None = None
+    """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
+
+    def vertices_mm(self) -> NDArray[np.float64]:
+        """Vertices of all outer surfaces, (V, 3)."""
+        meshes = [*(tooth.outer for tooth in self.teeth), *(mesh for mesh in (self.gums, self.cavity) if mesh is not None)]
+        return np.concatenate([mesh.vertices_mm for mesh in meshes])
+
+
+def single_tooth(
+    outer: Mesh,
+    dentin: DentinShape | None,
+    light_positions_mm: NDArray[np.float64],
+    light_intensities: NDArray[np.float64],
+    boundary: Boundary = "matched",
+    ior: float = 1.631,
+    device: Device | None = None,
+) -> SceneRecipe:
+    """A scene of one tooth and nothing else."""
+    return SceneRecipe((ToothSurfaces(outer, dentin),), light_positions_mm, light_intensities, boundary, ior, device)
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,17 @@ import mitsuba as mi
 
 from services.fit.transport.media import Media, Score
 
+MOST_COUNTED = 3
+"""Media of which each keeps a count of its own scatterings."""
+
 
 @dataclass(frozen=True)
 class Plan:
     """What this kernel has to do; everything here is decided before compilation."""
 
     scores: tuple[Score, ...] = ()
-    shape: bool = False
-    """Whether derivatives to the border's shape modes are wanted; they follow those of ``scores`` in the tally."""
+    shape: int | None = None
+    """Tooth to whose border's shape modes derivatives are wanted; they follow those of ``scores`` in the tally."""
     faces: bool = False
     """Count what leaves the slab's faces instead of connecting to lights."""
     bend: bool = False
@@ -27,6 +30,18 @@ class Plan:
     """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
 
 
+@dataclass
+class Scatterings:
+    """What a path has scattered so far. The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution."""
+
+    counts: list[mi.UInt32]
+    """In each medium that is counted on its own."""
+    others: list[mi.Float]
+    """Sum of ln alpha over all other scatterings; empty where every medium is counted."""
+    total: list[mi.UInt32]
+    """Likewise, the number of all scatterings."""
+
+
 class Scores:
     """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
 
@@ -34,10 +49,46 @@ class Scores:
         self.plan, self.media = plan, media
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
+        # Of few media all are counted; of many, those whose albedo is free.
+        self.counts_all = media.count <= MOST_COUNTED
+        asked = {s.medium for s in plan.scores if s.field == "alpha"}
+        self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(asked))
 
     def zero(self) -> list[mi.Float]:
         """No score yet."""
         return [mi.Float(0) for _ in self.plan.scores]
+
+    def unscattered(self) -> Scatterings:
+        """No scattering yet."""
+        rest = 0 if self.counts_all else 1
+        return Scatterings([mi.UInt32(0) for _ in self.counted], [mi.Float(0)] * rest, [mi.UInt32(0)] * rest)
+
+    def scatter(self, so_far: Scatterings, medium: mi.UInt32, active: mi.Bool) -> Scatterings:
+        """One more in each active lane."""
+        counts = [dr.select(active & (medium == k), count + 1, count) for k, count in zip(self.counted, so_far.counts, strict=True)]
+        if self.counts_all:
+            return Scatterings(counts, [], [])
+        elsewhere = active
+        for k in self.counted:
+            elsewhere &= medium != k
+        others = so_far.others[0] + dr.select(elsewhere, self.media.pick(self.media.log_alpha, medium), 0)
+        return Scatterings(counts, [others], [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)])
+
+    def albedo(self, so_far: Scatterings) -> mi.Float:
+        """Product of the albedos of all scatterings."""
+        exponent = so_far.others[0] if so_far.others else mi.Float(0)
+        for k, count in zip(self.counted, so_far.counts, strict=True):
+            exponent = dr.fma(mi.Float(count), self.media.log_alpha[k - 1], exponent)
+        return dr.exp(exponent)
+
+    def order(self, so_far: Scatterings) -> mi.UInt32:
+        """Number of scatterings."""
+        if so_far.total:
+            return so_far.total[0]
+        total = so_far.counts[0]
+        for count in so_far.counts[1:]:
+            total = total + count
+        return total
 
     def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
         """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
@@ -56,14 +107,14 @@ class Scores:
         ]
 
     def complete(
-        self, sums: list[mi.Float], counts: list[mi.UInt32], medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
+        self, sums: list[mi.Float], so_far: Scatterings, medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
     ) -> list[mi.Float]:
         """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
         whole = []
         for s, total in zip(self.plan.scores, sums, strict=True):
             value = total
             if s.field == "alpha":
-                value = mi.Float(counts[s.medium - 1]) * self.media.inverse_alpha[s.medium - 1]
+                value = mi.Float(so_far.counts[self.counted.index(s.medium)]) * self.media.inverse_alpha[s.medium - 1]
             elif s.field == "sigma":
                 value = total - lengths.get(s.medium, mi.Float(0))
             elif s.field in terms:

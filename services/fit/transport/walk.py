@@ -17,7 +17,7 @@ from services.fit.transport.connections import Connections, Vertex
 from services.fit.transport.geometry import Geometry, Hit
 from services.fit.transport.lights import PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction
-from services.fit.transport.scores import Plan, Scores
+from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.starts import CameraStart, SlabStart
 from services.fit.transport.tally import Tally
 
@@ -47,8 +47,7 @@ class Walker:
     """Throughput without the albedos, which are counted."""
     reference: mi.Float
     """Throughput against which roulette compares."""
-    counts: list[mi.UInt32]
-    """Scatters so far in each medium."""
+    so_far: Scatterings
     steps: list[mi.UInt32]
     """Flights so far; empty unless they are limited."""
     sums: list[mi.Float]
@@ -66,13 +65,6 @@ class Walker:
     sample: mi.UInt32
     active: mi.Bool
 
-    def scatters_so_far(self) -> mi.UInt32:
-        """Scattering order."""
-        total = self.counts[0]
-        for count in self.counts[1:]:
-            total = total + count
-        return total
-
 
 @dataclass
 class Flight:
@@ -86,7 +78,9 @@ class Flight:
     meets: mi.Bool
     """A surface is reached ..."""
     reflects: mi.Bool
-    """... and reflects, else it is crossed."""
+    """... and reflects like a mirror, or ..."""
+    bounces: mi.Bool
+    """... is opaque and reflects diffusely, else it is crossed."""
 
 
 class Walk:
@@ -97,7 +91,7 @@ class Walk:
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         self.book = Scores(plan, media)
         self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.book, self.ior)
-        self.modes = geometry.modes if plan.shape else 0
+        self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
 
@@ -118,7 +112,7 @@ class Walk:
             place=path.place,
             weight=path.weight,
             reference=mi.Float(path.weight),
-            counts=[mi.UInt32(0) for _ in range(self.media.count)],
+            so_far=self.book.unscattered(),
             steps=[mi.UInt32(0) for _ in range(self.limited)],
             sums=self.book.zero(),
             border_sums=zeros(self.modes),
@@ -148,17 +142,13 @@ class Walk:
         ended = self._end(walker, flight)
         if self.plan.most_steps is not None:
             ended = self._cut(walker, ended, self.plan.most_steps, tally)
-        if self.plan.shape:
+        if self.plan.shape is not None:
             ended = self._start_secondary(walker, ended, tally)
         self._renew(walker, ended, limit)
         return walker
 
     def _carried(self, walker: Walker) -> mi.Float:
-        # The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution.
-        exponent = mi.Float(0)
-        for count, log_alpha in zip(walker.counts, self.media.log_alpha, strict=True):
-            exponent = dr.fma(mi.Float(count), log_alpha, exponent)
-        return walker.weight * dr.exp(exponent)
+        return walker.weight * self.book.albedo(walker.so_far)
 
     def _fly(self, walker: Walker) -> Flight:
         medium = self.geometry.medium(walker.place)
@@ -173,12 +163,16 @@ class Walk:
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
         if self.ior is not None:
-            # A thin face lets the camera's own ray in (its reflection is a highlight, masked) and reflects later ones by chance.
-            mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), self.ior)
-            entry = (walker.scatters_so_far() == 0) & (medium == 0) & ~walker.secondary
-            walker.weight *= dr.select(meets & hit.outer & entry, 1 - mirrored, 1)
-            reflects = meets & hit.outer & ~entry & (walker.rng.next_float32() < mirrored)
-        return Flight(medium, sigma, hit, distance, scatters, meets, reflects)
+            # A thin face lets the camera's own ray in where its mirror image would be of empty space, and reflects others by chance.
+            contrast = self.geometry.contrast(self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit))
+            mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
+            reflects = meets & hit.outer & ~hit.opaque
+            if self.geometry.single:
+                entry = (self.book.order(walker.so_far) == 0) & (medium == 0) & ~walker.secondary
+                walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
+                reflects &= ~entry
+            reflects &= walker.rng.next_float32() < mirrored
+        return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
 
     def _fly_past_faces(self, walker: Walker, carried: mi.Float, tally: Tally) -> Flight:
         medium = self.geometry.medium(walker.place)
@@ -196,7 +190,7 @@ class Walk:
         lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.book.sigma_media}
         primary = walker.active & leaving & ~walker.secondary
         tally.add(walker.lane, face, value, primary)
-        for which, score in enumerate(self.book.complete(walker.sums, walker.counts, mi.UInt32(0), {}, lengths)):
+        for which, score in enumerate(self.book.complete(walker.sums, walker.so_far, mi.UInt32(0), {}, lengths)):
             tally.add_derivative(which, walker.lane, face, value * score, primary)
         for mode in range(self.modes):
             factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode])
@@ -208,22 +202,22 @@ class Walk:
         distance = minus_log1m(walker.rng.next_float32() * dr.select(leaving, collides, 1)) / sigma
         scatters = walker.active & dr.select(leaving, ~reflects, distance < hit.distance)
         distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
-        first = scatters & (walker.scatters_so_far() == 0) & ~walker.secondary
+        first = scatters & (self.book.order(walker.so_far) == 0) & ~walker.secondary
         walker.weight *= remains
         # Judged by what one scattering leaves of it, single scattering survives at any albedo.
         walker.reference = dr.select(first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference)
-        return Flight(medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects)
+        return Flight(medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False))
 
     def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
         hit, omega = flight.hit, walker.omega
         length = dr.select(flight.scatters, flight.distance, dr.select(flight.meets, hit.distance, 0))
         walker.sums = self.book.flight(walker.sums, flight.medium, length, flight.scatters)
-        crosses = flight.meets & ~flight.reflects
+        crosses = flight.meets & ~flight.reflects & ~flight.bounces
         behind = self.geometry.beyond(walker.place, omega, hit)
         cosine = dr.dot(omega, hit.normal)
-        if self.plan.shape:
+        if self.plan.shape is not None:
             # Score the border's transmittance change, and offer the crossing for the scattering change.
-            shifts = [speed * inverse_cosine(cosine) for speed in self.geometry.velocity(hit, crosses)]
+            shifts = [speed * inverse_cosine(cosine) for speed in self.geometry.velocity(hit, self.plan.shape, crosses)]
             jump = dr.select(crosses, self.media.extinction(self.geometry.medium(behind)) - flight.sigma, 0)
             walker.border_sums = [dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)]
             at_border = crosses & ~hit.outer & ~walker.secondary
@@ -234,17 +228,21 @@ class Walk:
         walker.origin = dr.select(flight.scatters, dr.fma(omega, flight.distance, walker.origin), dr.select(flight.meets, reached, walker.origin))
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
         walker.place = dr.select(crosses, behind, walker.place)
-        walker.counts = [dr.select(flight.scatters & (flight.medium == k + 1), count + 1, count) for k, count in enumerate(walker.counts)]
+        scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium) if self.geometry.opaque else flight.medium
+        walker.so_far = self.book.scatter(walker.so_far, scattered_in, flight.scatters | flight.bounces)
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
         assert self.connections is not None
         assert walker.vertex is not None
         clear = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
+        omega, wall = walker.omega, []
+        if self.geometry.opaque:
+            omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
-            walker.origin, walker.omega, walker.place, self._carried(walker), clear, walker.counts, walker.sums, walker.border_sums, walker.secondary,
-            walker.shape_factor, mi.Float(0),
+            walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums, walker.border_sums, walker.secondary,
+            walker.shape_factor, wall, mi.Float(0),
         )  # fmt: skip
-        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), flight.scatters)
+        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces)
         walker.turn += 1
         due = walker.active & (walker.turn == self.connections.turns) & (walker.vertex.total > 0)
         walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
@@ -254,9 +252,17 @@ class Walk:
     def _turn(self, walker: Walker, flight: Flight) -> None:
         phase, rng = PhaseFunction(self.media, flight.medium), walker.rng
         u_lobe = rng.next_float32() if self.media.two_lobes else None
-        onward = phase.sample(walker.omega, u_lobe, rng.next_float32(), rng.next_float32())
+        u, v = rng.next_float32(), rng.next_float32()
+        onward = phase.sample(walker.omega, u_lobe, u, v)
         walker.sums = self.book.turn(walker.sums, flight.medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters)
+        if self.geometry.opaque:
+            diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))
+            walker.omega = dr.select(flight.bounces, diffuse, walker.omega)
         walker.omega = dr.select(flight.scatters, onward, walker.omega)
+
+    def _facing(self, walker: Walker, flight: Flight) -> mi.Vector3f:
+        """The surface's normal on the side that the walker came from."""
+        return -dr.mulsign(mi.Vector3f(flight.hit.normal), dr.dot(walker.omega, flight.hit.normal))
 
     def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
         # Paths that faded survive in proportion to what they carry; those that met nothing are gone.
@@ -265,7 +271,7 @@ class Walk:
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
         ended = walker.active & ((~flight.scatters & ~flight.meets) | faded)
         if self.plan.order_edges:
-            ended |= walker.active & (walker.scatters_so_far() >= self.plan.order_edges[-1])
+            ended |= walker.active & (self.book.order(walker.so_far) >= self.plan.order_edges[-1])
         return ended
 
     def _cut(self, walker: Walker, ended: mi.Bool, most_steps: int, tally: Tally) -> mi.Bool:
@@ -304,14 +310,14 @@ class Walk:
             walker.weight = strength * (scattering.sigma_a + scattering.sigma_b) * dr.abs(balance)
             walker.reference = mi.Float(walker.weight)
             walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
-            walker.counts = [dr.zeros(mi.UInt32) for _ in walker.counts]
+            walker.so_far = self.book.unscattered()
             walker.steps = [dr.zeros(mi.UInt32) for _ in walker.steps]
             walker.secondary = mi.Bool(True)
             walker.rng = rng
             return walker
 
         walker_after = dr.if_stmt((walker, begins), begins, begin, lambda walker, _: walker, label="secondary walk")
-        for field in ("rng", "origin", "omega", "place", "weight", "reference", "counts", "steps", "secondary", "shape_factor"):
+        for field in ("rng", "origin", "omega", "place", "weight", "reference", "so_far", "steps", "secondary", "shape_factor"):
             setattr(walker, field, getattr(walker_after, field))
         return (ended & ~begins) | (begins & (walker.weight == 0))
 
@@ -323,12 +329,12 @@ class Walk:
             path = self.start.begin(walker.lane, walker.sample, ended)
             walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
             walker.weight, walker.reference = path.weight, mi.Float(path.weight)
-            walker.counts = [mi.UInt32(0) for _ in walker.counts]
+            walker.so_far = self.book.unscattered()
             walker.steps = [mi.UInt32(0) for _ in walker.steps]
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
             walker.kept.total = mi.Float(0)
-            if self.plan.shape:
+            if self.plan.shape is not None:
                 walker.secondary = mi.Bool(False)
             walker.active = walker.sample < limit
             return walker

@@ -1,0 +1,165 @@
+"""Teeth, gums and the wall of the mouth as triangles, and the media between them.
+
+All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, T + k for its dentin, 2T for gums and 2T + 1 for the wall.
+A lane's *place* holds bit n while it is inside the solid that surface n bounds, so solids may overlap. What a scene lacks is absent from its kernels.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from services.fit.transport.clearance import Clearance
+from services.fit.transport.geometry import RAY_EPSILON, Hit
+from services.fit.transport.names import media_numbers
+from services.fit.transport.nesting import require_nested
+from services.fit.transport.recipe import DentinShape, SceneRecipe
+
+Shapes = tuple[tuple[float, ...], ...]
+"""Blend weights of each tooth's dentin."""
+
+
+class MeshGeometry:
+    """The surfaces of one scene at their present places."""
+
+    def __init__(self, recipe: SceneRecipe) -> None:
+        self.recipe = recipe
+        self.teeth = len(recipe.teeth)
+        dentins = [tooth.dentin for tooth in recipe.teeth]
+        self.numbers = media_numbers(recipe)
+        self.single = self.teeth == 1 and recipe.gums is None and recipe.cavity is None
+        self.opaque = recipe.cavity is not None
+        self.modes_of = tuple(0 if dentin is None else len(dentin.modes_mm) for dentin in dentins)
+        self.epsilon = RAY_EPSILON * (1 + float(np.abs(recipe.vertices_mm()).max()))
+        for tooth in recipe.teeth:
+            if tooth.dentin is not None:
+                require_nested(tooth.outer, tooth.dentin.base, 2 * self.epsilon)
+
+        # Surfaces that never move come first.
+        fixed = {k: tooth.outer for k, tooth in enumerate(recipe.teeth)}
+        fixed |= {2 * self.teeth + k: mesh for k, mesh in enumerate((recipe.gums, recipe.cavity)) if mesh is not None}
+        self._dentins: dict[int, DentinShape] = {k: dentin for k, dentin in enumerate(dentins) if dentin is not None}
+        meshes = [*fixed.values(), *(dentin.base for dentin in self._dentins.values())]
+        first = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in meshes])
+        self._faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first, strict=False)]).astype(np.uint32)
+        self._fixed_mm = np.concatenate([mesh.vertices_mm for mesh in fixed.values()])
+        self.fixed_faces = sum(len(mesh.faces) for mesh in fixed.values())
+        numbers = [*fixed, *(self.teeth + k for k in self._dentins)]
+        self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
+
+        self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32))
+        self._shapes: Shapes | None = None
+        self.reshape(tuple((0.0,) * modes for modes in self.modes_of))
+        self._displacements = self._displacement_tables()
+
+    def reshape(self, shapes: Shapes) -> bool:
+        """Move the dentin surfaces to these blend weights; returns whether any changed."""
+        if shapes == self._shapes:
+            return False
+        moved = [dentin.vertices_mm(shapes[k]) for k, dentin in self._dentins.items()]
+        points = np.concatenate([self._fixed_mm, *moved])
+        if moved:
+            inner = self._faces[self.fixed_faces :].astype(np.int32) - len(self._fixed_mm)
+            self._clearance.move_inner(points[len(self._fixed_mm) :], inner)
+        positions = mi.Float(points.reshape(-1).astype(np.float32))
+        if self._shapes is None:
+            mesh = mi.Mesh("teeth", len(points), len(self._faces))
+            arrays = mi.traverse(mesh)
+            arrays["faces"] = mi.UInt32(self._faces.reshape(-1))
+            arrays["vertex_positions"] = positions
+            arrays.update()
+            self.scene = mi.load_dict({"type": "scene", "teeth": mesh}, optimize=False)
+            self._parameters = mi.traverse(self.scene)
+        else:
+            self._parameters["teeth.vertex_positions"] = positions
+            self._parameters.update()
+        corners = points[self._faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        self._normals = mi.Float(np.ascontiguousarray((normals / np.maximum(lengths, 1e-30)).reshape(-1), dtype=np.float32))
+        dr.eval(self._normals)
+        changed, self._shapes = self._shapes is not None, shapes
+        return changed
+
+    def _displacement_tables(self) -> list[mi.Float]:
+        """B_m - B0 at the corners of every dentin face, a table per mode; zero where a tooth has fewer modes."""
+        tables = []
+        for mode in range(max(self.modes_of, default=0)):
+            parts = [
+                (dentin.modes_mm[mode] if mode < len(dentin.modes_mm) else np.zeros_like(dentin.base.vertices_mm))[dentin.base.faces]
+                for dentin in self._dentins.values()
+            ]
+            tables.append(mi.Float(np.ascontiguousarray(np.concatenate(parts).reshape(-1), dtype=np.float32)))
+        return tables
+
+    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the place
+        """Next surface, by ray tracing."""
+        ray = mi.Ray3f(origin, direction)
+        found = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        valid = active & found.is_valid()
+        normal = dr.gather(mi.Normal3f, self._normals, found.prim_index, valid)
+        outer = found.prim_index < self.fixed_faces if self._dentins else mi.Bool(True)
+        surface = mi.UInt32(0) if self.single else dr.gather(mi.UInt32, self._surface, found.prim_index, valid)
+        opaque = valid & (surface == 2 * self.teeth + 1) if self.opaque else mi.Bool(False)
+        return Hit(dr.select(valid, found.t, dr.inf), valid, normal, outer, opaque, surface, found.prim_index, found.prim_uv)
+
+    def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """Distance within which no surface lies."""
+        return self._clearance(point, active)
+
+    def inside(self, place: mi.UInt32) -> mi.UInt32:
+        """Number of the tooth that counts at a place, the number of teeth where that is gums, and above that outside of all."""
+        within = place & (2**self.teeth - 1)
+        if self._dentins:
+            dentin = (place >> self.teeth) & (2**self.teeth - 1)
+            within = dr.select(dentin != 0, dentin, within)
+        return dr.select(within != 0, dr.tzcnt(within), dr.select((place >> (2 * self.teeth)) != 0, mi.UInt32(self.teeth), mi.UInt32(self.teeth + 1)))
+
+    def medium(self, place: mi.UInt32) -> mi.UInt32:
+        """Dentin over enamel over gums over air, whatever surfaces overlap."""
+        if self.single:
+            inside_outer = place & 1
+            return dr.select((place & 2) != 0, mi.UInt32(2), inside_outer) if self._dentins else inside_outer
+        tooth, numbers = self.inside(place), self.numbers
+        enamel = tooth * (1 + numbers.dentin) + 1
+        in_dentin = ((place >> self.teeth) & (2**self.teeth - 1)) != 0
+        of_tooth = dr.select(in_dentin, enamel + 1, enamel) if self._dentins else enamel
+        return dr.select(tooth < self.teeth, of_tooth, dr.select(tooth == self.teeth, mi.UInt32(numbers.of_gums), mi.UInt32(0)))
+
+    def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
+        """Entering sets the surface's bit and leaving clears it, so a missed hit heals at the next."""
+        bit = dr.select(hit.outer, mi.UInt32(1), mi.UInt32(2)) if self.single else mi.UInt32(1) << hit.surface
+        return dr.select(dr.dot(direction, hit.normal) < 0, place | bit, place & ~bit)
+
+    def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:
+        """Ratio, at least 1, of the indices of refraction of the media at two places."""
+        if self.single:
+            return ior
+
+        def index(place: mi.UInt32) -> mi.Float:
+            tooth = self.inside(place)
+            return dr.select(tooth < self.teeth, ior, dr.select(tooth == self.teeth, self.recipe.gums_ior, 1.0))
+
+        first, second = index(before), index(after)
+        return dr.maximum(first, second) / dr.minimum(first, second)
+
+    def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:
+        """Offset along the normal as Mitsuba does."""
+        offset = dr.mulsign(dr.select(through, self.epsilon, -self.epsilon), dr.dot(direction, hit.normal))
+        return dr.fma(direction, hit.distance, origin) + hit.normal * offset
+
+    def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:
+        """Normal speed n . (B_m - B0) at the hit, interpolated over its triangle; zero but on the dentin of one tooth."""
+        active = active & ~hit.outer & hit.valid
+        if not self.single:
+            active &= hit.surface == self.teeth + tooth
+        face = (hit.primitive - self.fixed_faces) * 3
+        weights = (1 - hit.uv.x - hit.uv.y, hit.uv.x, hit.uv.y)
+        speeds = []
+        for table in self._displacements[: self.modes_of[tooth]]:
+            displacement = mi.Vector3f(0)
+            for corner, weight in enumerate(weights):
+                displacement += weight * dr.gather(mi.Vector3f, table, face + corner, active)
+            speeds.append(dr.select(active, dr.dot(hit.normal, displacement), 0))
+        return speeds

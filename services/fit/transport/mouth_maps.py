@@ -1,0 +1,93 @@
+"""Light maps of scenes of several surfaces: each knows the first thing that a light's ray enters, and how far into it the ray may be followed.
+
+A thing is a tooth with its dentin, the gums, or the wall. Behind anything else a map says nothing, and the shadow ray is all. Where a ray has met
+nothing yet the map knows that too: what lies on a wall in front of all surfaces sees the light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from services.fit.transport.geometry import Hit
+from services.fit.transport.light_maps import LightMaps, LightView, MapRay
+from services.fit.transport.mesh_geometry import MeshGeometry
+
+FIRST = 31
+"""Bits of what a ray met: one more than the first thing's number, 0 for nothing ..."""
+DENTIN_ENTERED, DENTIN_LEFT = 32, 64
+"""... and what became of its dentin."""
+
+WALL_TEXELS = 2.0
+"""How much deeper than a cell's nearest corner a vertex on the wall may lie, in texels."""
+
+
+class MouthMaps(LightMaps):
+    """One depth map per light of several teeth, gums or a wall."""
+
+    WORDS = 3
+    MOST_BYTES = 2**26
+
+    def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
+        """Fill the maps for surfaces as they now are."""
+        self._geometry = geometry
+        super().trace(geometry, ior)
+
+    def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:
+        met, entering = hit.valid, dr.dot(ray.direction, hit.normal) < 0
+        thing = dr.select(hit.surface < geometry.teeth, hit.surface, hit.surface - geometry.teeth) + 1
+        begins = met & ((ray.meetings & FIRST) == 0)
+        dentin = met & ~begins & ~hit.outer & (thing == (ray.meetings & FIRST))
+        enters = dentin & entering & ((ray.meetings & DENTIN_ENTERED) == 0)
+        leaves = dentin & ~entering & ((ray.meetings & (DENTIN_ENTERED | DENTIN_LEFT)) == DENTIN_ENTERED)
+        ends = met & dr.select(begins, hit.opaque | ~entering, ~enters & ~leaves)
+
+        ray.meetings |= dr.select(begins, thing, 0) | dr.select(enters, mi.UInt32(DENTIN_ENTERED), 0) | dr.select(leaves, mi.UInt32(DENTIN_LEFT), 0)
+        ray.entry = dr.select(begins, ray.travelled, ray.entry)
+        ray.surface = dr.select(begins, through, ray.surface)
+        ray.dentin_entry = dr.select(enters, ray.travelled, ray.dentin_entry)
+        # Until it leaves, all the rest is dentin.
+        ray.dentin_exit = dr.select(enters, self._near, dr.select(leaves, ray.travelled, ray.dentin_exit))
+        ray.limit = dr.select(ends, ray.travelled, ray.limit)
+        ray.alive &= met & ~ends
+
+    def _store(self, ray: MapRay) -> None:
+        first = ray.meetings & FIRST
+        solids = range(1, self._geometry.teeth + 2)
+        kinds = tuple(number | dentin for number in solids for dentin in (0, DENTIN_ENTERED, DENTIN_ENTERED | DENTIN_LEFT))
+        entry = dr.select(first == 0, self._near, ray.entry)
+        limit = mi.UInt32(self._depth_code(ray.limit)) | (first << 16)
+        self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, kinds, (limit,))
+
+    def _view(
+        self,
+        direction: mi.Vector3f,
+        falloff: mi.Float,
+        depth: mi.Float,
+        corners: list[list[mi.UInt32]],
+        between: Callable[[int, int], mi.Float],
+        place: mi.UInt32,
+        inside: mi.Bool,
+    ) -> LightView:
+        halves = ((0, 0), (0, 16), (1, 0), (2, 0))
+        entry, dentin_entry, dentin_exit, limit = (dr.fma(between(*half), self._depth_step, -self._near) for half in halves)
+        thing = self._geometry.inside(place)
+        outside = thing > self._geometry.teeth
+        followed = ((corners[0][1] & 0x10000) != 0) & ((corners[0][2] >> 16) == thing + 1) & (depth < limit)
+        nearest = corners[0][0] & 0xFFFF
+        for corner in corners[1:]:
+            nearest = dr.minimum(nearest, corner[0] & 0xFFFF)
+        # On a wall the first thing is the wall itself, as far as the grid can tell.
+        free = outside & (depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm)
+
+        dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
+        enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
+        lengths_mm = [dr.select(outside, 0, enamel_mm), dr.select(outside, 0, dentin_mm)]
+        numbers = self._geometry.numbers
+        medium = dr.select(outside, mi.UInt32(1), thing * (1 + numbers.dentin) + 1)
+        media = [medium, dr.select(thing < self._geometry.teeth, medium + 1, mi.UInt32(1))]
+        surface = dr.select(outside, 1, between(1, 16) * (1 / 65535))
+        known = inside & (followed | free)
+        return LightView(direction, falloff, tuple(media[: 1 + numbers.dentin]), tuple(lengths_mm[: 1 + numbers.dentin]), surface, known)

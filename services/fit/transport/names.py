@@ -1,0 +1,113 @@
+"""What the parameters of a scene are called, and which medium and field each name means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from services.core.errors import InputError
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
+from services.fit.transport.recipe import SceneRecipe
+
+
+@dataclass(frozen=True)
+class MediaNumbers:
+    """Numbers of the media of a scene: enamel and dentin of each tooth in turn, gums, and the wall's reflectance as an albedo. 0 is empty space."""
+
+    teeth: int
+    dentin: bool
+    """Whether any tooth has dentin; then each has two numbers."""
+    gums: bool
+    cavity: bool
+
+    def of(self, tooth: int, part: str) -> int:
+        """``enamel`` or ``dentin`` of a tooth."""
+        return 1 + tooth * (1 + self.dentin) + (part == "dentin")
+
+    @property
+    def of_gums(self) -> int:
+        """The gums'."""
+        return 1 + self.teeth * (1 + self.dentin)
+
+    @property
+    def of_cavity(self) -> int:
+        """The wall's."""
+        return self.of_gums + self.gums
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a scene."""
+
+    medium: int
+    field: str
+    shape: int | None = None
+    """The tooth whose dentin it blends."""
+
+
+def media_numbers(recipe: SceneRecipe) -> MediaNumbers:
+    """How the scene's media are numbered."""
+    return MediaNumbers(len(recipe.teeth), any(tooth.dentin is not None for tooth in recipe.teeth), recipe.gums is not None, recipe.cavity is not None)
+
+
+def parameter_names(recipe: SceneRecipe) -> dict[str, Parameter]:
+    """All parameters of a scene by name; a single tooth's carry no number (see ``Tissue`` and ``Mouth``)."""
+    numbers = media_numbers(recipe)
+    named: dict[str, Parameter] = {}
+    for k, tooth in enumerate(recipe.teeth):
+        prefix = "" if len(recipe.teeth) == 1 else f"{k}."
+        for part in ("enamel",) if tooth.dentin is None else ("enamel", "dentin"):
+            named |= {f"{prefix}{part}.{field}": Parameter(numbers.of(k, part), field) for field in MEDIUM_FIELDS}
+        modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)
+        named |= {f"{prefix}shape.{mode}": Parameter(0, "shape", k) for mode in range(modes)}
+    if numbers.gums:
+        named |= {f"gums.{field}": Parameter(numbers.of_gums, field) for field in MEDIUM_FIELDS}
+    if numbers.cavity:
+        named["cavity.reflectance"] = Parameter(numbers.of_cavity, "alpha")
+    return named
+
+
+def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
+    """A scene's media in the order of their numbers, checked; the wall's reflectance is the last one's albedo.
+
+    Raises:
+        InputError: a part is missing or too many, or a parameter is outside its physical range.
+    """
+    from services.fit.transport.media import require_medium
+
+    numbers, media = media_numbers(recipe), []
+    if len(mouth.teeth) != len(recipe.teeth):
+        raise InputError(f"Tissues of {len(mouth.teeth)} teeth were given for a scene of {len(recipe.teeth)}; give one for each.")
+    for k, (tissue, tooth) in enumerate(zip(mouth.teeth, recipe.teeth, strict=True)):
+        prefix = "" if len(recipe.teeth) == 1 else f"{k}."
+        require_medium(f"{prefix}enamel", tissue.enamel)
+        media.append(tissue.enamel)
+        if numbers.dentin:
+            # A tooth without dentin has no place where its second number counts.
+            media.append(tissue.enamel if tooth.dentin is None else tissue.dentin)
+            require_medium(f"{prefix}dentin", media[-1])
+        modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)
+        # A solver's step that ends on a bound may be off by a rounding.
+        if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
+            raise InputError(f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it.")
+    if (mouth.gums is None) == numbers.gums:
+        raise InputError(f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither.")
+    if mouth.gums is not None:
+        require_medium("gums", mouth.gums)
+        media.append(mouth.gums)
+    if (mouth.reflectance is None) == numbers.cavity:
+        raise InputError(
+            f"The scene has {'a' if numbers.cavity else 'no'} cavity and its media {'no' if numbers.cavity else 'a'} reflectance; give both or neither."
+        )
+    if mouth.reflectance is not None:
+        if not 0 <= mouth.reflectance <= 1:
+            raise InputError(f"cavity.reflectance = {mouth.reflectance:.10g} must lie in 0 to 1; correct it.")
+        media.append(Medium(1.0, mouth.reflectance))
+    return media
+
+
+def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:
+    """The same without absorption."""
+    if isinstance(tissue, Tissue):
+        return Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
+    teeth = tuple(Tissue(replace(t.enamel, alpha=1.0), replace(t.dentin, alpha=1.0), t.shape) for t in tissue.teeth)
+    return Mouth(teeth, None if tissue.gums is None else replace(tissue.gums, alpha=1.0), None if tissue.reflectance is None else 1.0)
