@@ -185,12 +185,12 @@ def test_dentin_has_room_inside_enamel() -> None:
     centred = ellipsoid(axes - 0.3)
     shifted = Mesh(centred.vertices_mm + np.array([0.0, 0.5, 0.0]), centred.faces)
     for dentin, part in (
-        (outer, "touches"), (ellipsoid(axes - 2e-4), "touches"),
+        (outer, "touches"), (ellipsoid(axes - 5e-5), "touches"),
         (shifted, "passes through"), (ellipsoid(axes + 0.5), "passes through"),
     ):  # fmt: skip
         with pytest.raises(MeshError, match=part):
             Engine(scene(dentin))
-    Engine(scene(ellipsoid(axes - 1e-3)))
+    Engine(scene(ellipsoid(axes - 2e-4)))
     inside = np.array([[0, 0, 0], [2.9, 0, 0], [3.1, 0, 0], [0, 0, 40.0]])
     np.testing.assert_allclose(winding_number(outer, inside), [1, 1, 0, 0], atol=1e-9)
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""
-RAY_EPSILON = 8.9e-5
-"""Mitsuba's relative ray offset in single precision, 1500 ulp."""
+RAY_EPSILON = 1e-5
+"""Offset of a ray that starts on a surface, over 1 + the largest coordinate: 170 roundings. What it skips is neither absorbed nor scattered, so it is nine
+times less than Mitsuba's own; of two million rays none met its surface again at thirty times less."""
 
 
 @dataclass
