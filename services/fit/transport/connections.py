@@ -1,8 +1,8 @@
 """Connections from scattering vertices to all lights, with their derivatives.
 
 Looking up every light costs as much as dozens of steps of the walk. So a lane keeps one of its last few vertices, chosen in
-proportion to the most that it could contribute, and connects that one. All lanes connect in the same turn, which
-keeps the vector units full where each vertex deciding for itself would not.
+proportion to the most that it could contribute, and connects that one, to one light of every group (``light_groups``). All lanes
+connect in the same turn, which keeps the vector units full where each vertex deciding for itself would not.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Connections:
         """Add the kept vertex's light from everywhere; returns the advanced generator."""
 
         def to_lights(vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
-            kept = self._look_everywhere(vertex, lane, rng.next_float32(), active, tally)
+            kept, rng = self._look_around(vertex, lane, rng, active, tally)
 
             # Correct what the maps said about one light by a shadow ray, cast with a probability in proportion to the doubt.
             chance = dr.clip(ROULETTE_GAIN * kept.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
@@ -114,40 +114,38 @@ class Connections:
 
         return dr.if_stmt((vertex, lane, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection")
 
-    def _look_everywhere(self, vertex: Vertex, lane: mi.UInt32, u: mi.Float, active: mi.Bool, tally: Tally) -> Doubt:
-        """Count what the light maps expect from every light, and keep one light in proportion to the doubt about it."""
-        maps, count = self.lights.maps, self.lights.count
+    def _look_around(self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> tuple[Doubt, mi.PCG32]:
+        """Count what the light maps expect from one light of every group, and keep one of these in proportion to the doubt about it."""
+        maps, groups = self.lights.maps, self.lights.groups
         doubt = MAP_DOUBT if self.plan.shape is None else 1.0
-        # A vertex stands for all that were offered with it.
-        strength = vertex.total / dr.maximum(vertex.clear, 1e-30)
 
         def step(
-            light: mi.UInt32, u: mi.Float, kept: Doubt, vertex: Vertex, lane: mi.UInt32, strength: mi.Float, active: mi.Bool
-        ) -> tuple[mi.UInt32, mi.Float, Doubt, Vertex, mi.UInt32, mi.Float, mi.Bool]:
+            group: mi.UInt32, rng: mi.PCG32, kept: Doubt, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
+        ) -> tuple[mi.UInt32, mi.PCG32, Doubt, Vertex, mi.UInt32, mi.Bool]:
+            u = rng.next_float32() if groups.size > 1 else mi.Float(0)
+            light, brightness = groups.choose(group, vertex.point, lambda direction: self._density(vertex, direction), u)
             seen = maps.look(light, vertex.point, vertex.place, active)
-            weight = strength * self._density(vertex, seen.direction) * seen.falloff
+            # A vertex stands for all that were offered with it, and a light for its group.
+            weight = vertex.total / dr.maximum(vertex.clear, 1e-30) * brightness
             expected, lengths = seen.transmittance(self.media), seen.lengths(self.book.sigma_media)
             self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
 
             importance = weight * dr.select(seen.certain, doubt * expected + MAP_FAILURE * vertex.clear, vertex.clear)
             total = kept.total + importance
-            share = dr.select(total > 0, importance / total, 0)
-            take = u < share
+            take = rng.next_float32() * total < importance
             kept = dr.select(take, Doubt(light, seen.direction, weight, expected, lengths, importance, total), kept)
             kept.total = total
-            # The same random number serves all lights: what is left of it is uniform again.
-            u = dr.clip(dr.select(take, u / share, (u - share) / (1 - share)), 0, 0.99999994)
-            return light + 1, u, kept, vertex, lane, strength, active
+            return group + 1, rng, kept, vertex, lane, active
 
         zero = mi.Float(0)
         kept = Doubt(mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0), mi.Float(0))
         state = dr.while_loop(
-            (mi.UInt32(0), u, kept, vertex, lane, strength, active),
-            lambda light, _u, _k, _v, _l, _s, active: active & (light < count),
+            (mi.UInt32(0), rng, kept, vertex, lane, active),
+            lambda group, _r, _k, _v, _l, active: active & (group < groups.count),
             step,
-            label="every light",
+            label="every group of lights",
         )
-        return state[2]
+        return state[2], state[1]
 
     def _count(
         self,
