@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 MEDIUM_FIELDS = ("sigma", "alpha", "beta", "g1", "g2")
 
 
@@ -40,6 +43,14 @@ class Medium:
         return self.sigma_s_reduced / total if total > 0 else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Stain:
+    """A texture on a tooth's outer surface, by which light is dimmed that passes through it (teeth 2018 Eq. 1)."""
+
+    transmittance: NDArray[np.float64]
+    """a_t, (H, W), above 0 and at most 1; the first row's centre lies at v = 1 / 2H."""
+
+
 @dataclass(frozen=True)
 class Tissue:
     """Everything a fit may change, for one colour channel. Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``."""
@@ -48,6 +59,8 @@ class Tissue:
     dentin: Medium
     shape: tuple[float, ...] = ()
     """Dentin blend weights c, 0 to 1, in the order of the anatomy's modes."""
+    stain: Stain | None = None
+    """None for a surface without stains."""
 
     def value(self, name: str) -> float:
         """The parameter called ``name``."""
@@ -65,7 +78,7 @@ class Tissue:
                 enamel = replace(enamel, **{leaf: value})
             else:
                 dentin = replace(dentin, **{leaf: value})
-        return Tissue(enamel, dentin, tuple(shape))
+        return Tissue(enamel, dentin, tuple(shape), self.stain)
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,18 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
         raise InputError(f"Camera {name} lists lights = {view.lights}; they must be different indices below {lights}, at least one.")
 
 
+def require_cotangent(cotangent: NDArray[np.float64], view: View, lights: int) -> None:
+    """Refuse weights that are not one finite number for every light and pixel.
+
+    Raises:
+        InputError: gives shapes or count.
+    """
+    if cotangent.shape != (lights, len(view)):
+        raise InputError(f"cotangent has shape {cotangent.shape} and must be ({lights}, {len(view)}), one number for each light and pixel.")
+    if not np.isfinite(cotangent).all():
+        raise InputError(f"cotangent has {int((~np.isfinite(cotangent)).sum())} values that are not finite; mask them with 0.")
+
+
 def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
     """Refuse results (batches, N, slots) that hold NaN or infinity, whatever the slot.
 

@@ -16,6 +16,7 @@ from services.fit.transport.geometry import Geometry
 from services.fit.transport.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
+from services.fit.transport.stains import FaceCrossing, StainTally
 from services.fit.transport.tally import Tally
 
 MAP_DOUBT = 0.03
@@ -41,6 +42,8 @@ class Vertex:
     shape_factor: list[mi.Float]
     wall: list[mi.Bool]
     """Whether it lies on an opaque surface, whose normal ``omega`` then is; empty in scenes that have none."""
+    stains: list[FaceCrossing]
+    """One of the stained faces on the way; empty unless they are asked for."""
     total: mi.Float
     """Sum of ``carried * clear`` over the vertices offered; 0 when there was none."""
 
@@ -60,6 +63,8 @@ class Doubt:
     importance: mi.Float
     total: mi.Float
     """Importance of all lights together."""
+    expected_sum: list[mi.Float]
+    """By the maps, what all lights bring, weighted by the cotangent; empty unless stains are asked for."""
 
 
 class Connections:
@@ -79,7 +84,8 @@ class Connections:
 
         return Vertex(
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.book.unscattered(),
-            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque, mi.Float(0),
+            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque,
+            [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
     def offer(self, kept: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
@@ -100,8 +106,21 @@ class Connections:
             chance = dr.clip(ROULETTE_GAIN * kept.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
             casts = active & (kept.total > 0) & (rng.next_float32() < chance)
             weight = kept.weight * kept.total / (kept.importance * chance)
-            dr.if_stmt((vertex, lane, kept, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction")
+            if isinstance(tally, StainTally):
+                tally.credit(lane, vertex.stains[0], kept.expected_sum[0], active)
+                ray_stains = [FaceCrossing.none(rng.next_float32())]
+                dr.if_stmt((vertex, lane, kept, weight, ray_stains, casts), casts, correct_stains, lambda *_: mi.Float(0), label="correction")
+            else:
+                dr.if_stmt((vertex, lane, kept, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction")
             return rng
+
+        def correct_stains(vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, stains: list[FaceCrossing], casts: mi.Bool) -> mi.Float:
+            assert isinstance(tally, StainTally)
+            ray = shadow(self.geometry, self.media, vertex.point, kept.direction, vertex.place, casts, thin_ior=self.ior, stains=stains)
+            value = weight * tally.weight(lane, kept.light, casts)
+            tally.credit(lane, vertex.stains[0], value * (ray.transmittance() - kept.expected), casts)
+            tally.credit(lane, ray.stains[0], value * ray.transmittance(), casts)
+            return weight
 
         def correct(vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, casts: mi.Bool) -> mi.Float:
             ray = shadow(
@@ -117,7 +136,7 @@ class Connections:
     def _look_around(self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> tuple[Doubt, mi.PCG32]:
         """Count what the light maps expect from one light of every group, and keep one of these in proportion to the doubt about it."""
         maps, groups = self.lights.maps, self.lights.groups
-        doubt = MAP_DOUBT if self.plan.shape is None else 1.0
+        doubt = MAP_DOUBT if self.plan.shape is None and not self.plan.stains else 1.0
 
         def step(
             group: mi.UInt32, rng: mi.PCG32, kept: Doubt, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
@@ -128,17 +147,25 @@ class Connections:
             # A vertex stands for all that were offered with it, and a light for its group.
             weight = vertex.total / dr.maximum(vertex.clear, 1e-30) * brightness
             expected, lengths = seen.transmittance(self.media), seen.lengths(self.book.sigma_media)
-            self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
-
             importance = weight * dr.select(seen.certain, doubt * expected + MAP_FAILURE * vertex.clear, vertex.clear)
+            expected_sum = kept.expected_sum
+            if isinstance(tally, StainTally):
+                cotangent = tally.weight(lane, light, active)
+                importance *= dr.abs(cotangent)
+                expected_sum = [dr.fma(weight * expected, cotangent, kept.expected_sum[0])]
+            else:
+                self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
             total = kept.total + importance
             take = rng.next_float32() * total < importance
-            kept = dr.select(take, Doubt(light, seen.direction, weight, expected, lengths, importance, total), kept)
-            kept.total = total
+            kept = dr.select(take, Doubt(light, seen.direction, weight, expected, lengths, importance, total, expected_sum), kept)
+            kept.total, kept.expected_sum = total, expected_sum
             return group + 1, rng, kept, vertex, lane, active
 
         zero = mi.Float(0)
-        kept = Doubt(mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0), mi.Float(0))
+        kept = Doubt(
+            mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0), mi.Float(0),
+            [mi.Float(0)] * self.plan.stains,
+        )  # fmt: skip
         state = dr.while_loop(
             (mi.UInt32(0), rng, kept, vertex, lane, active),
             lambda group, _r, _k, _v, _l, active: active & (group < groups.count),

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.checks import require_finite, require_lights, require_surfaces, require_view
+from services.fit.transport.checks import require_cotangent, require_finite, require_lights, require_surfaces, require_view
 from services.fit.transport.names import media_of, parameter_names, whitened
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
 from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
 
 if TYPE_CHECKING:
@@ -157,19 +157,55 @@ class Engine:
         (orders,) = self._among_all(view, (sums / count).mean(axis=0).reshape(len(view), -1, bins).T)
         return orders
 
-    def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
-        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
-        from services.fit.transport.media import Media
+    def stain_gradient(
+        self, tissue: Tissue | Mouth, view: View, cotangent: NDArray[np.float64], *, seed: int, samples: int, batches: int = 16
+    ) -> StainGradient:
+        """Derivatives of sum(cotangent x images) to every texel of the stains, in one pass, both of a path's crossings included (teeth 2018 Eq. 10).
+
+        Args:
+            cotangent: (L, N), such as the residual of an L2 loss; independent of this pass where the result is to be unbiased.
+
+        Raises:
+            As ``images``; InputError also for a cotangent of another shape, or a scene without stains.
+        """
+        from services.fit.transport.scores import Plan
+        from services.fit.transport.stains import StainTally
         from services.fit.transport.starts import CameraStart
+
+        media, lights = self._prepare(tissue, view)
+        require_cotangent(cotangent, view, len(self.recipe.light_positions_mm))
+        textures = self._geometry.textures
+        if textures is None:
+            raise InputError("The scene has no stains to differentiate; give a tooth's tissue a stain.")
+        seen = cotangent if view.lights is None else cotangent[list(view.lights)]
+        largest = float(np.abs(seen).max())
+        batches, count = Effort(samples=samples, batches=batches).shares(samples)
+        tally = StainTally(textures, seen / (largest or 1.0), batches)
+        start = CameraStart(view, batches, seed, self._radius_mm)
+        (sums, _) = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
+        require_finite([sums.reshape(batches, 1, -1)], view)
+        means = sums * (largest / count)
+        gradient, variance = means.mean(axis=0), means.var(axis=0, ddof=1) / batches if batches > 1 else np.full(textures.count, np.nan)
+        return StainGradient(textures.cut(gradient), textures.cut(variance), batches * count)
+
+    def _prepare(self, tissue: Tissue | Mouth, view: View) -> tuple[Media, PointLights]:
+        """Check a request, put surfaces and stains in their places, and give the media and lights of its kernel."""
+        from services.fit.transport.media import Media
 
         require_view(view, self.recipe)
         mouth = tissue if isinstance(tissue, Mouth) else Mouth((tissue,))
         media = media_of(mouth, self.recipe)
-        if self._geometry.reshape(tuple(tuple(tooth.shape) for tooth in mouth.teeth)):
+        reshaped = self._geometry.reshape(tuple(tuple(tooth.shape) for tooth in mouth.teeth))
+        if self._geometry.restain(tuple(tooth.stain for tooth in mouth.teeth)) or reshaped:
             self._lights.maps.trace(self._geometry, self._ior)
             self._some_lights.clear()
+        return Media(media), self._lights_of(view)
 
-        lights, kernel_media = self._lights_of(view), Media(media)
+    def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
+        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
+        from services.fit.transport.starts import CameraStart
+
+        media, lights = self._prepare(tissue, view)
         bins = max(len(plan.order_edges) - 1, 1)
         slots = lights.count * bins
         tables = 1 + len(plan.scores) + (0 if plan.shape is None else self._geometry.modes_of[plan.shape])
@@ -178,7 +214,7 @@ class Engine:
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
             start = CameraStart(piece, batches, seed, self._radius_mm, skipped=numbers.start)
-            sums, derivatives = self._walk(kernel_media, lights, start, plan).run(len(numbers)).arrays()
+            sums, derivatives = self._walk(media, lights, start, plan).run(len(numbers)).arrays()
             pieces.append([array.reshape(batches, len(piece), slots) for array in (sums, *derivatives)])
         whole = [np.concatenate(arrays, axis=1) for arrays in zip(*pieces, strict=True)]
         require_finite(whole, view)

@@ -51,6 +51,10 @@ class Geometry(Protocol):
     single: bool
     """One tooth and nothing else: what its face mirrors to a camera is empty space."""
 
+    @property
+    def stained(self) -> bool:
+        """Whether what crosses outer faces is dimmed."""
+
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
         """Next surface."""
 
@@ -69,6 +73,12 @@ class Geometry(Protocol):
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:
         """Ratio of the indices of refraction on the two sides of an outer face; ``ior`` is the teeth's."""
 
+    def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:
+        """Transmittance of the stains where an outer face is crossed; asked only of what is stained."""
+
+    def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:
+        """Whether a stained face is crossed between two places."""
+
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:
         """Normal speed n . dx/dc_m of the hit border point for each shape mode m of a tooth."""
 
@@ -78,6 +88,7 @@ class SlabGeometry:
 
     epsilon = 0.0
     opaque = False
+    stained = False
     single = True
 
     def __init__(self, thicknesses_mm: Sequence[float | NDArray[np.float64]], *, moving_border: bool) -> None:
@@ -119,6 +130,14 @@ class SlabGeometry:
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:  # noqa: ARG002 - meshes need the places
         """Layers are all of one index."""
         return ior
+
+    def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - faces have none
+        """No stains."""
+        return mi.Float(1)
+
+    def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - faces have none
+        """No stains."""
+        return mi.Bool(False)
 
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - there is one border
         """The first inner border moves along +z."""

@@ -156,6 +156,8 @@ class LightMaps:
             through = mi.Float(1)
             if ior is not None:
                 through = 1 - fresnel.reflectance(dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.place, behind))
+            if geometry.stained:
+                through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.place, behind))
             self._meet(ray, geometry, hit, through)
             ray.point = dr.select(hit.valid, geometry.advance(ray.point, ray.direction, hit, hit.valid), ray.point)
             ray.place = dr.select(hit.valid, behind, ray.place)

@@ -17,6 +17,7 @@ from services.fit.transport.geometry import Geometry
 from services.fit.transport.light_groups import LightGroups
 from services.fit.transport.light_maps import DARK_DEPTH, LightMaps
 from services.fit.transport.media import Media
+from services.fit.transport.stains import FaceCrossing
 
 CANDIDATES = 8
 """Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
@@ -88,6 +89,8 @@ class ShadowRay:
     """Path length in mm inside each medium asked for."""
     border: list[mi.Float]
     """d ln T / dc per shape mode: (sigma_B - sigma_A) dt/dc per crossing (teeth 2018 Eq. 30-32)."""
+    stains: list[FaceCrossing]
+    """One of the stained faces crossed, where that is asked for."""
     alive: mi.Bool
 
     def transmittance(self) -> mi.Float:
@@ -106,6 +109,7 @@ def shadow(
     measured: tuple[int, ...] = (),
     shape: int | None = None,
     thin_ior: mi.Float | None = None,
+    stains: list[FaceCrossing] | None = None,
 ) -> ShadowRay:
     """Follow straight lines to distant lights through all media.
 
@@ -113,6 +117,7 @@ def shadow(
         measured: media whose path lengths are wanted.
         shape: tooth to whose border's shape derivatives are wanted.
         thin_ior: index of refraction of ``thin`` outer faces; None where they are index-matched.
+        stains: an empty reservoir for one of the stained faces crossed.
     """
 
     def step(ray: ShadowRay, direction: mi.Vector3f) -> tuple[ShadowRay, mi.Vector3f]:
@@ -130,6 +135,10 @@ def shadow(
         if thin_ior is not None:
             contrast = geometry.contrast(thin_ior, ray.place, behind)
             ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
+        if geometry.stained:
+            crosses = ray.alive & geometry.on_stain(hit, ray.place, behind)
+            ray.surface *= geometry.stain(hit, crosses)
+            ray.stains = [kept.offer(hit, crosses) for kept in ray.stains]
         if geometry.opaque:
             ray.surface = dr.select(hit.opaque, 0, ray.surface)
         ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)
@@ -138,6 +147,7 @@ def shadow(
         return ray, direction
 
     modes = 0 if shape is None else geometry.modes_of[shape]
-    ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)], mi.Bool(active))
+    lengths, border = [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)]
+    ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), lengths, border, stains or [], mi.Bool(active))
     ray, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
     return ray

@@ -10,11 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from services.fit.optics.parameters import Stain
 from services.fit.transport.clearance import Clearance
 from services.fit.transport.geometry import RAY_EPSILON, Hit
 from services.fit.transport.names import media_numbers
 from services.fit.transport.nesting import require_nested
 from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.stains import StainTextures
 
 Shapes = tuple[tuple[float, ...], ...]
 """Blend weights of each tooth's dentin."""
@@ -49,6 +51,8 @@ class MeshGeometry:
         self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
 
         self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32))
+        self.textures: StainTextures | None = None
+        self._stains: tuple[Stain | None, ...] = (None,) * self.teeth
         self._shapes: Shapes | None = None
         self.reshape(tuple((0.0,) * modes for modes in self.modes_of))
         self._displacements = self._displacement_tables()
@@ -81,6 +85,33 @@ class MeshGeometry:
         dr.eval(self._normals)
         changed, self._shapes = self._shapes is not None, shapes
         return changed
+
+    @property
+    def stained(self) -> bool:
+        """Whether any tooth has stains now."""
+        return self.textures is not None
+
+    def restain(self, stains: tuple[Stain | None, ...]) -> bool:
+        """Put these textures on the teeth; returns whether any changed."""
+        if stains == self._stains:
+            return False
+        self._stains, self.textures = stains, None
+        if any(stain is not None for stain in stains):
+            teeth = self.recipe.teeth
+            corners = [np.zeros((len(tooth.outer.faces), 3, 2)) if tooth.stain_uv is None else tooth.stain_uv for tooth in teeth]
+            self.textures = StainTextures(corners, stains)
+        return True
+
+    def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:
+        """Transmittance of the stains where an outer face is crossed."""
+        assert self.textures is not None
+        return self.textures.transmittance(hit, active)
+
+    def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:
+        """Whether a tooth's outer face is crossed that is not hidden within another tooth."""
+        if self.single:
+            return hit.valid & hit.outer
+        return hit.valid & (hit.surface < self.teeth) & (self.inside(before) != self.inside(after))
 
     def _displacement_tables(self) -> list[mi.Float]:
         """B_m - B0 at the corners of every dentin face, a table per mode; zero where a tooth has fewer modes."""

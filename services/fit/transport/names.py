@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from services.core.errors import InputError
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
-from services.fit.transport.recipe import SceneRecipe
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Stain, Tissue
+from services.fit.transport.recipe import SceneRecipe, ToothSurfaces
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         # A solver's step that ends on a bound may be off by a rounding.
         if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
             raise InputError(f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it.")
+        require_stain(f"{prefix}stain", tissue.stain, tooth)
     if (mouth.gums is None) == numbers.gums:
         raise InputError(f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither.")
     if mouth.gums is not None:
@@ -105,9 +108,30 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
     return media
 
 
+def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
+    """Refuse a texture that dims nothing or everything, or that a tooth has no coordinates for.
+
+    Raises:
+        InputError: names it.
+    """
+    if stain is None:
+        return
+    texels = stain.transmittance
+    if tooth.stain_uv is None:
+        raise InputError(f"{name} is given for a tooth without texture coordinates; give its surface stain_uv, or leave the texture out.")
+    if tooth.stain_uv.shape != (len(tooth.outer.faces), 3, 2) or not np.isfinite(tooth.stain_uv).all():
+        raise InputError(f"{name}'s coordinates have shape {tooth.stain_uv.shape}; they must be finite and ({len(tooth.outer.faces)}, 3, 2), one per corner.")
+    if texels.ndim != 2 or texels.size == 0:
+        raise InputError(f"{name} has shape {texels.shape}; it must be one channel, (H, W).")
+    bad = ~((texels > 0) & (texels <= 1))
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise InputError(f"{name}[{row}, {column}] = {texels[row, column]:.10g} must be above 0 and at most 1; correct {int(bad.sum())} texels.")
+
+
 def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:
     """The same without absorption."""
     if isinstance(tissue, Tissue):
-        return Tissue(replace(tissue.enamel, alpha=1.0), replace(tissue.dentin, alpha=1.0), tissue.shape)
-    teeth = tuple(Tissue(replace(t.enamel, alpha=1.0), replace(t.dentin, alpha=1.0), t.shape) for t in tissue.teeth)
+        return replace(tissue, enamel=replace(tissue.enamel, alpha=1.0), dentin=replace(tissue.dentin, alpha=1.0))
+    teeth = tuple(replace(t, enamel=replace(t.enamel, alpha=1.0), dentin=replace(t.dentin, alpha=1.0)) for t in tissue.teeth)
     return Mouth(teeth, None if tissue.gums is None else replace(tissue.gums, alpha=1.0), None if tissue.reflectance is None else 1.0)

@@ -30,6 +30,8 @@ class ToothSurfaces:
 
     outer: Mesh
     dentin: DentinShape | None = None
+    stain_uv: NDArray[np.float64] | None = None
+    """Texture coordinates of the outer faces' corners (F, 3, 2), where it may have stains."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,15 @@ class StackEstimate:
     def rel_error(self) -> float:
         """sqrt(sum of variances) / norm over all pixels and lights."""
         return relative_error(self.mean, self.variance)
+
+
+@dataclass(frozen=True)
+class StainGradient:
+    """Derivatives of sum(cotangent x images) to the texels of each tooth's stain, (H, W) each, None where it has none; variances are of the means."""
+
+    gradient: tuple[NDArray[np.float64] | None, ...]
+    variance: tuple[NDArray[np.float64] | None, ...]
+    samples: int
 
 
 @dataclass(frozen=True)

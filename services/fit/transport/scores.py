@@ -26,6 +26,8 @@ class Plan:
     """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
+    stains: bool = False
+    """Instead of images, the derivative of their sum, weighted by a cotangent, to the texels of stains."""
     most_steps: int | None = None
     """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
 

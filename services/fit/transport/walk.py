@@ -18,6 +18,7 @@ from services.fit.transport.geometry import Geometry, Hit
 from services.fit.transport.lights import PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
+from services.fit.transport.stains import FaceCrossing
 from services.fit.transport.starts import CameraStart, SlabStart
 from services.fit.transport.tally import Tally
 
@@ -53,6 +54,8 @@ class Walker:
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     kept: Crossing
+    stains: list[FaceCrossing]
+    """One of the stained faces crossed; empty unless they are asked for."""
     vertex: Vertex | None
     """Waits for its connection to the lights."""
     turn: mi.UInt32
@@ -95,9 +98,9 @@ class Walk:
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
 
-    def run(self, samples: int) -> Tally:
-        """Trace ``samples`` paths in every lane; returns their sums, evaluated."""
-        tally = Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
+    def run(self, samples: int, tally: Tally | None = None) -> Tally:
+        """Trace ``samples`` paths in every lane; returns their sums, evaluated. A plan for stains brings its own tally."""
+        tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
         limit = dr.opaque(mi.UInt32, samples)
         lane = dr.arange(mi.UInt32, self.start.lanes)
         path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
@@ -117,6 +120,7 @@ class Walk:
             sums=self.book.zero(),
             border_sums=zeros(self.modes),
             kept=no_crossing(self.modes),
+            stains=[FaceCrossing.none(path.rng.next_float32()) for _ in range(self.plan.stains)],
             vertex=None if self.connections is None else self.connections.no_vertex(),
             turn=mi.UInt32(0),
             secondary=mi.Bool(False),
@@ -224,6 +228,10 @@ class Walk:
             walker.kept = offer(
                 walker.kept, dr.fma(omega, hit.distance, walker.origin), omega, hit, walker.place, behind, carried, shifts, walker.rng.next_float32(), at_border
             )
+        if self.geometry.stained:
+            stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
+            walker.weight *= self.geometry.stain(hit, stained)
+            walker.stains = [kept.offer(hit, stained) for kept in walker.stains]
         reached = self.geometry.advance(walker.origin, omega, hit, crosses)
         walker.origin = dr.select(flight.scatters, dr.fma(omega, flight.distance, walker.origin), dr.select(flight.meets, reached, walker.origin))
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
@@ -240,7 +248,7 @@ class Walk:
             omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
             walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums, walker.border_sums, walker.secondary,
-            walker.shape_factor, wall, mi.Float(0),
+            walker.shape_factor, wall, walker.stains, mi.Float(0),
         )  # fmt: skip
         walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces)
         walker.turn += 1
@@ -334,6 +342,7 @@ class Walk:
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
             walker.kept.total = mi.Float(0)
+            walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
             if self.plan.shape is not None:
                 walker.secondary = mi.Bool(False)
             walker.active = walker.sample < limit
