@@ -2,7 +2,7 @@
 
 Media: 1/2 sum (C - reference)^2 to sigma, alpha, g and the lobes' weight of enamel and dentin. Ours is J'(C - reference) from a few Jacobian passes, each
 one's derivatives with the images of the others, so that the two always have independent seeds. The peer is stock ``prbvolpath``, an image and backward,
-light by light on a few of the lights, scaled to all. Shape: see ``shape_gradient``. There are no stains in the engine yet, so none are measured.
+light by light on a few of the lights, scaled to all. Shape and stains: see ``shape_gradient`` and ``stain_gradient``.
 
 Noise of the images times noise of the derivatives falls as 1 / paths squared and rules short runs on both sides, so they are compared at nearly equal
 error: the peer at its largest count, ours at the count whose error is nearest.
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from services.fit.bench.gradient_rows import Estimate, GradientRow, of_parts
 from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
 from services.fit.bench.shape_gradient import shape_rows
+from services.fit.bench.stain_gradient import stain_rows
 from services.fit.bench.stock_gradient import StockGradient, shared_names
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
@@ -41,7 +42,7 @@ PASSES = 4
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
     """Rows by parameter of this engine and of the peers, and the peers' summary rows."""
-    return [row.model_dump() for row in [*media_rows(quick=quick), *shape_rows(quick=quick)]]
+    return [row.model_dump() for row in [*media_rows(quick=quick), *shape_rows(quick=quick), *stain_rows(quick=quick)]]
 
 
 def media_rows(*, quick: bool) -> list[GradientRow]:

@@ -21,7 +21,7 @@ from services.fit.anatomy.blend import dentin_blend_shape
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.bench import Row
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View, single_tooth
 
@@ -75,6 +75,9 @@ def cases() -> list[Case]:
     dentin = dentin_blend_shape(incisor.outer)
     modelled = Mesh(dentin.vertices_mm(TISSUE.shape), dentin.base.faces)
     plain, unable = Engine(homogeneous), PlainEngine(homogeneous)
+    (tooth,), coordinates = homogeneous.teeth, np.zeros((len(incisor.outer.faces), 3, 2))
+    stainable = Engine(replace(homogeneous, teeth=(replace(tooth, stain_uv=coordinates),)))
+    stained = replace(TISSUE, shape=(), stain=Stain(np.full((4, 4), 0.8)))
     blend = Engine(single_tooth(incisor.outer, dentin, positions, intensities))
     known = Engine(single_tooth(incisor.outer, DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape))), positions, intensities))
     camera = dome_cameras(1, PIXEL_MM, (incisor.outer,))[0]
@@ -103,6 +106,7 @@ def cases() -> list[Case]:
         Case("dentin", images(plain, unused), bare, images(known)),
         Case("second lobe", images(plain, ready), bare, images(plain, two)),
         Case("thin faces", images(Engine(replace(homogeneous, boundary="thin", ior=1.0))), bare, images(Engine(replace(homogeneous, boundary="thin")))),
+        Case("stains", images(stainable), bare, images(stainable, stained)),
         Case("order bins", images(plain), bare, orders),
         Case("unseen lights", images(plain, view=replace(every_pixel, lights=FEW_LIGHTS)), images(Engine(few)), images(plain)),
         Case("masked pixels", images(plain, view=crop), images(plain, view=_view(cropped_camera)), images(plain)),
