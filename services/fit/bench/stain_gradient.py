@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
         ratio = float(theirs * differences.var(ddof=1) / (share * values.var(ddof=1)))
         ratios.append(ratio)
         size_of = abs(float(values.mean()))
-        common = {"benchmark": "transport-gradient stains", "parameter": name, "samples": samples}
+        common: dict[str, Any] = {"benchmark": "transport-gradient stains", "parameter": name, "samples": samples}
         rows.append(GradientRow(**common, peer="dentine", seconds=share, error=float(values.std(ddof=1)) / size_of, gradient=float(values.mean())))
         peer = GradientRow(**common, peer=PEER, seconds=theirs, error=float(differences.std(ddof=1)) / size_of, gradient=float(differences.mean()))
         summary = {"benchmark": "transport-gradient-summary stains", "efficiency_ratio": ratio, "z": z}
