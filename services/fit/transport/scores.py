@@ -21,10 +21,19 @@ class Plan:
     """Count what leaves the slab's faces instead of connecting to lights."""
     bend: bool = False
     """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
+    exit_cosines: tuple[float, ...] = ()
+    """With ``faces``: also the radiance that leaves at these cosines."""
+    ring_edges_mm: tuple[float, ...] = ()
+    """With ``faces``: also what leaves within rings about the point of entry, between these radii and beyond the last."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
     most_steps: int | None = None
     """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
+
+    @property
+    def rings(self) -> int:
+        """Number of rings, the unbounded one included."""
+        return len(self.ring_edges_mm) + 1 if self.ring_edges_mm else 0
 
 
 class Scores:
