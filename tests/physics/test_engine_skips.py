@@ -45,7 +45,7 @@ def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, s
         assert theirs.any()
 
 
-FEATURES = ("scores", "shape", "dentin", "second lobe", "thin faces", "order bins", "unseen lights", "masked pixels")
+FEATURES = ("scores", "shape", "dentin", "second lobe", "phase table", "thin faces", "order bins", "unseen lights", "masked pixels")
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from pydantic import Field
 from services.core.errors import InputError, NonFiniteError
 from services.core.geometry import Record
 from services.fit.optics.parameters import Medium
+from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.platform import prepare_device
 
 LANES = 8192
@@ -41,6 +42,7 @@ class Layer(Record):
     beta: float = Field(default=1.0, description="weight of the first lobe")
     g1: float = Field(default=0.0, description="mean cosine of the first lobe")
     g2: float = Field(default=0.0, description="mean cosine of the second lobe")
+    table: PhaseTable | None = Field(default=None, description="phase function in place of the lobes")
     thickness_mm: float = Field(description="thickness; the last layer may be infinite")
 
     model_config = Record.model_config | {"allow_inf_nan": True}
@@ -288,19 +290,25 @@ def _check_directions(source: str, mu_incident: float, exit_cosines: tuple[float
 
 
 def _medium(layer: Layer) -> Medium:
-    return Medium(layer.sigma, layer.alpha, layer.beta, layer.g1, layer.g2)
+    return Medium(layer.sigma, layer.alpha, layer.beta, layer.g1, layer.g2, layer.table)
 
 
 def _derivatives(layers: tuple[Layer, ...]) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
     """Names as printed, and (medium, field) of each score."""
+    fields = [("sigma", "alpha", *_phase_fields(layer)) for layer in layers]
     if len(layers) == 1 and layers[0].beta == 1:
-        return ("sigma", "alpha", "g"), ((1, "sigma"), (1, "alpha"), (1, "g1"))
+        return tuple({"g1": "g"}.get(field, field) for field in fields[0]), tuple((1, field) for field in fields[0])
     pairs = []
-    for number, layer in enumerate(layers, 1):
-        fields = ("sigma", "alpha", "beta", "g1", "g2") if layer.beta < 1 else ("sigma", "alpha", "g1")
+    for number, of_layer in enumerate(fields, 1):
         printed = {"g1": f"g{number}a", "g2": f"g{number}b"}
-        pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in fields]
+        pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in of_layer]
     return tuple(name for name, _ in pairs), tuple(score for _, score in pairs)
+
+
+def _phase_fields(layer: Layer) -> tuple[str, ...]:
+    if layer.table is not None:
+        return ()
+    return ("beta", "g1", "g2") if layer.beta < 1 else ("g1",)
 
 
 def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> float:

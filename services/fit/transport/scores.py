@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from services.core.errors import InputError
 from services.fit.transport.media import Media, Score
 
 
@@ -42,6 +43,9 @@ class Scores:
     def __init__(self, plan: Plan, media: Media) -> None:
         self.plan, self.media = plan, media
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
+        for s in plan.scores:
+            if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
+                raise InputError(f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives.")
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
 
     def zero(self) -> list[mi.Float]:
