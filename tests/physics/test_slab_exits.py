@@ -1,8 +1,8 @@
 """Where, and in which directions, light leaves a slab, against van de Hulst's tables, Chandrasekhar's H function and rings of a pencil beam.
 
-The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings of
-5e-4) in every run and of 1e-4 in the slow ones. Radiances
-have one of 0.3 % of their value: their standard error of 0.1 % is then at least ten times what rounding leaves of the printed digits.
+The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings 5e-4, the half space of albedo 0.5 1e-4) in every
+run and of 1e-4 in the slow ones. Radiances have one of 0.3 % of their value: their standard error of 0.1 % is then at least ten times
+what rounding leaves of the printed digits.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def test_radiance_at_every_exit_cosine_agrees_with_van_de_hulst() -> None:
 
 
 def test_half_spaces_agree_with_the_h_function() -> None:
-    cases = half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99", "0.999")
-    assert len(cases) == 15
+    cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5") + half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.8", "0.9", "0.99")
+    assert len(cases) == 12
     require_truth(cases, seed=811)
 
 
