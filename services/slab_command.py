@@ -34,7 +34,13 @@ def simulate_slab_command(
     sigma: Annotated[float | None, typer.Option(min=0, help="Extinction, per mm.")] = None,
     g: Annotated[float, typer.Option(min=-1, max=1, help="Mean cosine of the Henyey-Greenstein phase function.")] = 0.0,
     width: Annotated[float | None, typer.Option(min=0, help="Thickness, mm, or inf.")] = None,
-    layers: Annotated[str | None, typer.Option(help="Instead of one slab: JSON list of {sigma, alpha, beta, g1, g2, thickness_mm}, first layer lit.")] = None,
+    layers: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead of one slab: JSON list of {sigma, alpha, beta, g1, g2, thickness_mm}, first layer lit; a phase function may be "
+            "table: {angles_rad, values} instead of beta, g1, g2."
+        ),
+    ] = None,
     ior: Annotated[float, typer.Option(min=1, max=3, help="Index of refraction, used by boundaries thin and smooth.")] = 1.0,
     boundary: Annotated[SlabBoundary, typer.Option(help="Optical boundary.")] = SlabBoundary.MATCHED,
     source: Annotated[SlabSource, typer.Option(help="Light along the normal, or diffuse.")] = SlabSource.NORMAL,

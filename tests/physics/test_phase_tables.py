@@ -202,7 +202,7 @@ def test_tables_that_make_no_sense_are_refused(angles: tuple[float, ...], values
 
 
 def test_a_layers_table_comes_from_plain_numbers_and_has_no_lobes_to_derive() -> None:
-    plain: dict[str, Any] = {"sigma": 1, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1, math.pi], "values": [4, 2, 0]}}
+    plain: dict[str, Any] = {"sigma": 1, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1, 3.14159265], "values": [4, 2, 0]}}
     layer = Layer.model_validate(plain)
     assert layer.table == PhaseTable((0.0, 1.0, math.pi), (4.0, 2.0, 0.0))
     result = simulate_slab((layer,), gradient=True, rel_error=0.05, max_seconds=5)

@@ -31,21 +31,23 @@ class PhaseTable:
     """Phase function at each angle, 1/sr."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "angles_rad", tuple(float(angle) for angle in self.angles_rad))
+        angles = np.array(self.angles_rad, dtype=np.float64)
         values = tuple(float(value) for value in self.values)
-        if len(values) < FEWEST_NODES or len(values) != len(self.angles_rad):
-            raise InputError(f"A phase table has {len(values)} values at {len(self.angles_rad)} angles; give as many of each, at least two.")
-        for angle, value in zip(self.angles_rad, values, strict=True):
+        if len(values) < FEWEST_NODES or len(values) != len(angles):
+            raise InputError(f"A phase table has {len(values)} values at {len(angles)} angles; give as many of each, at least two.")
+        for angle, value in zip(angles, values, strict=True):
             if not math.isfinite(value) or value < 0:
                 raise InputError(f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and not negative.")
-        angles = np.array(self.angles_rad)
-        if angles[0] != 0 or not math.isclose(angles[-1], math.pi, rel_tol=1e-12) or not (np.diff(_cosine_deviations(angles)) > 0).all():
+        # Pi need not have all its digits.
+        angles[-1] = math.pi if math.isclose(angles[-1], math.pi, rel_tol=1e-6) else math.nan
+        if angles[0] != 0 or not (np.diff(_cosine_deviations(angles)) > 0).all():
             raise InputError("The angles of a phase table must increase from 0 to pi; add or sort them.")
         largest = max(values)
         if largest == 0:
             raise InputError("All values of the phase table are zero; give some light a direction.")
         relative = np.array(values) / largest
         integral = float(relative @ tent_weights(angles))
+        object.__setattr__(self, "angles_rad", tuple(angles.tolist()))
         object.__setattr__(self, "values", tuple((relative / integral).tolist()))
 
     @property
