@@ -99,6 +99,16 @@ def test_values_in_a_kernel(name: str) -> None:
     assert (ours <= near.max(axis=0) + slack).all()
 
 
+def test_nodes_closer_than_single_precision_stay_finite() -> None:
+    import mitsuba as mi
+
+    from services.fit.transport.tables import PhaseTables
+
+    kernel = PhaseTables([PhaseTable((0.0, math.pi / 2 - 1e-9, math.pi / 2 + 1e-9, math.pi), (1.0, 2.0, 2.0, 1.0))])
+    sideways = kernel.density(mi.UInt32(1), mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0))
+    assert np.array(sideways) == pytest.approx(2 / (6 * math.pi), rel=1e-6)
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
     import drjit as dr
