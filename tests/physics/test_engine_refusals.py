@@ -245,6 +245,12 @@ def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
         ((layer,), {"boundary": "glass"}, "boundary = glass"),
         ((layer,), {"source": "laser"}, "source = laser"),
         ((layer,), {"rel_error": 0.0}, "rel-error = 0"),
+        ((layer,), {"mu_incident": 0.0}, "mu-incident = 0"),
+        ((layer,), {"mu_incident": math.nan}, "mu-incident = nan"),
+        ((layer,), {"mu_incident": 0.5, "source": "diffuse"}, "mu-incident = 0.5 is for a beam"),
+        ((layer,), {"exit_cosines": (0.5, 1.5)}, "exit-cosines has 1.5"),
+        ((layer,), {"ring_edges_mm": (0.5, 0.5)}, "ring-edges = 0.5, 0.5"),
+        ((layer,), {"ring_edges_mm": (0.5, math.inf)}, "ring-edges = 0.5, inf"),
     ]
     for layers, options, part in calls:
         with pytest.raises(InputError) as caught:

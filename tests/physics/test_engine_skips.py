@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from services.fit.bench.transport_skip import Case, cases, kernel_operations
 from services.fit.optics.parameters import Medium, Tissue
+from services.fit.slab.simulate import Layer, accumulate
 from services.fit.transport.engine import Engine
 from tests.support.small_tooth import LIGHTS_MM, camera_at, recipe, whole_view
 
@@ -43,7 +45,7 @@ def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, s
         assert theirs.any()
 
 
-FEATURES = ("scores", "shape", "dentin", "second lobe", "thin faces", "stains", "order bins", "unseen lights", "masked pixels")
+FEATURES = ("scores", "shape", "dentin", "second lobe", "phase table", "thin faces", "stains", "order bins", "unseen lights", "masked pixels")
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +68,19 @@ def test_what_is_off_is_not_in_the_kernel(features: dict[str, Case], feature: st
 def test_what_is_off_changes_no_bit(features: dict[str, Case], feature: str) -> None:
     case = features[feature]
     np.testing.assert_array_equal(case.off(16, 3).mean, case.without(16, 3).mean)
+
+
+SLAB = Layer(sigma=2, alpha=0.9, g1=0.5, thickness_mm=1)
+SLAB_FEATURES: dict[str, dict[str, Any]] = {"oblique beam": {"mu_incident": 0.5}, "exit cosines": {"exit_cosines": (0.5,)}, "rings": {"ring_edges_mm": (0.5,)}}
+
+
+def slab_operations(**options: Any) -> int:
+    return kernel_operations(lambda *_: accumulate((SLAB,), lambda _: 0.0, ior=1.5, boundary="smooth", **options), 16)
+
+
+@pytest.mark.parametrize("feature", SLAB_FEATURES)
+def test_a_slab_pays_only_for_what_is_asked_of_it(feature: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = slab_operations(**SLAB_FEATURES[feature])
+    # What is never built is in no kernel, whatever the counts say.
+    monkeypatch.delattr("services.fit.transport.walk.Exits")
+    assert slab_operations() < asked

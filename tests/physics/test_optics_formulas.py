@@ -161,7 +161,7 @@ def fresnel_at_normal(values: NDArray[np.float64], cosine: NDArray[np.float32]) 
 
 
 def test_free_flight_functions_do_not_cancel() -> None:
-    from services.fit.transport.walk import minus_log1m, one_minus_exp
+    from services.fit.optics.free_flight import minus_log1m, one_minus_exp
 
     depth = np.concatenate([[0.0], np.logspace(-20, 2, 600)]).astype(np.float32)
     np.testing.assert_allclose(kernel(one_minus_exp, depth), -np.expm1(-np.float64(depth)), rtol=2e-6)

@@ -90,6 +90,9 @@ def test_benchmarks_are_listed_and_an_unknown_one_is_named() -> None:
         (["--layers", '[{"sigma": 2, "alpha": 0.9}]'], "thickness_mm"),
         (["--layers", '[{"sigma": 2, "alpha": 0.9, "thickness_mm": 1, "colour": 1}]'], "colour"),
         (["--layers", "[]", "--sigma", "2"], "leave out --sigma"),
+        (["--layers", '[{"sigma": 2, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1], "values": [1, 2]}}]'], "must increase from 0 to pi"),
+        (["--alpha", "0.9", "--sigma", "2", "--width", "1", "--exit-cosines", "0.1;1"], "--exit-cosines = 0.1;1 is not a list"),
+        (["--alpha", "0.9", "--sigma", "2", "--width", "1", "--ring-edges", "2,1"], "ring-edges = 2, 1"),
     ],
 )
 def test_a_wrong_slab_is_named(arguments: list[str], named: str) -> None:

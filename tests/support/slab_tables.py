@@ -60,7 +60,7 @@ def passes(count: int) -> Callable[[Sums], float]:
 def total_cases() -> list[SlabCase]:
     """``slab_totals.csv``: extinction 1 per mm, so the thickness is the optical depth."""
     cases = []
-    for row in _rows("slab_totals.csv"):
+    for row in rows_of("slab_totals.csv"):
         ior = float(row["n"])
         layer = Layer(sigma=1, alpha=float(row["a"]), g1=float(row["g"]), thickness_mm=float(row["tau"]))
         for source in SOURCES:
@@ -73,7 +73,7 @@ def total_cases() -> list[SlabCase]:
 def derivative_cases() -> list[SlabCase]:
     """``slab_derivatives.csv``, in the order in which the simulation prints its derivatives."""
     groups: dict[str, list[dict[str, str]]] = {}
-    for row in _rows("slab_derivatives.csv"):
+    for row in rows_of("slab_derivatives.csv"):
         groups.setdefault(row["case"], []).append(row)
     cases = []
     for name, rows in groups.items():
@@ -89,7 +89,7 @@ def derivative_cases() -> list[SlabCase]:
 def zero_cases() -> list[SlabCase]:
     """``boundary_zero_test.csv``, lit uniformly, with the border at the table's middle depth; dR/dc, the last value, is exactly zero."""
     cases = []
-    for row in _rows("boundary_zero_test.csv"):
+    for row in rows_of("boundary_zero_test.csv"):
         border, depth = float(row["c2_mm"]), float(row["depth_mm_T_below_1e-6"])
         optics = {"alpha": float(row["alpha"]), "beta": float(row["beta"]), "g1": float(row["g1"]), "g2": float(row["g2"])}
         layers = (
@@ -116,6 +116,7 @@ def _layer(row: dict[str, str], number: int) -> Layer:
     )
 
 
-def _rows(file: str) -> list[dict[str, str]]:
+def rows_of(file: str) -> list[dict[str, str]]:
+    """Rows of a reference table."""
     with shared_path(f"reference/{file}").open(newline="") as stream:
         return list(csv.DictReader(stream))

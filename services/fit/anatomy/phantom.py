@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +17,7 @@ from services.core.store import write_atomic, write_record
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, View, single_tooth
 
@@ -213,7 +212,11 @@ def _write_image(path: Path, image: NDArray[np.float64]) -> None:
 
 def _truth(names: tuple[str, ...], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
     tissues = {
-        name: {part: asdict(medium) | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced} for part, medium in parts}
+        name: {
+            part: {field: getattr(medium, field) for field in MEDIUM_FIELDS}
+            | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced}
+            for part, medium in parts
+        }
         for name, parts in ((name, (("enamel", TRUE_TISSUE[name].enamel), ("dentin", TRUE_TISSUE[name].dentin))) for name in names)
     }
     surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None

@@ -9,13 +9,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.engine import Engine
 from services.fit.transport.lights import PointLights
 from services.fit.transport.media import Media, PhaseFunction
 from services.fit.transport.scores import Plan
 from services.fit.transport.starts import CameraStart
 from services.fit.transport.tally import Tally
-from services.fit.transport.walk import ROULETTE_WEIGHT, Flight, Walk, Walker, minus_log1m
+from services.fit.transport.walk import ROULETTE_WEIGHT, Flight, Walk, Walker
 
 
 class PlainEngine(Engine):

@@ -22,6 +22,7 @@ from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.bench import Row
 from services.fit.optics.parameters import Medium, Stain, Tissue
+from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View, single_tooth
 
@@ -30,6 +31,7 @@ LIGHTS, FEW_LIGHTS = 18, (2, 7, 11)
 PIXEL_MM = 0.5
 ONE_LOBE = Medium(4.5, 0.99, 1.0, 0.75)
 TWO_LOBES = replace(ONE_LOBE, beta=0.9, g2=-0.3)
+TABLE = PhaseTable((0.0, 0.5, 1.5, np.pi), (10.0, 3.0, 0.5, 0.3))
 TISSUE = Tissue(ONE_LOBE, replace(ONE_LOBE, sigma=9.0), (0.5, 0.3, 0.4))
 ORDER_EDGES = np.array([0, 4, 16, 1 << 20])
 
@@ -82,9 +84,10 @@ def cases() -> list[Case]:
     known = Engine(single_tooth(incisor.outer, DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape))), positions, intensities))
     camera = dome_cameras(1, PIXEL_MM, (incisor.outer,))[0]
     every_pixel, (crop, cropped_camera) = _view(camera), _crop(camera)
-    one, unused, ready, two, layered = (
+    one, unused, tabulated, ready, two, layered = (
         replace(TISSUE, shape=()),
         Tissue(ONE_LOBE, TWO_LOBES),
+        Tissue(ONE_LOBE, replace(ONE_LOBE, table=TABLE)),
         Tissue(replace(ONE_LOBE, g2=-0.3), ONE_LOBE),
         Tissue(TWO_LOBES, ONE_LOBE),
         TISSUE,
@@ -105,6 +108,7 @@ def cases() -> list[Case]:
         Case("shape", images(blend, layered), images(known), jacobian(blend, layered, "shape.0")),
         Case("dentin", images(plain, unused), bare, images(known)),
         Case("second lobe", images(plain, ready), bare, images(plain, two)),
+        Case("phase table", images(plain, tabulated), bare, images(plain, Tissue(tabulated.dentin, ONE_LOBE))),
         Case("thin faces", images(Engine(replace(homogeneous, boundary="thin", ior=1.0))), bare, images(Engine(replace(homogeneous, boundary="thin")))),
         Case("stains", images(stainable), bare, images(stainable, stained)),
         Case("order bins", images(plain), bare, orders),

@@ -83,7 +83,7 @@ def tissue_of(table: dict[str, Estimate]) -> Tissue:
     """The tissue that a table of estimates describes; a part that was not modelled is empty."""
     parts = {}
     for part in ("enamel", "dentin"):
-        values = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
+        values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
         parts[part] = Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
     return Tissue(parts["enamel"], parts["dentin"])
 

@@ -22,7 +22,12 @@ SceneDict = dict[str, Any]
 
 
 def medium_dict(medium: Medium) -> SceneDict:
-    """A homogeneous medium; two lobes become a blended phase function."""
+    """A homogeneous medium; two lobes become a blended phase function.
+
+    Raises:
+        InputError: its phase function is a table.
+    """
+    medium.require_lobes("An exported scene")
     first: SceneDict = {"type": "hg", "g": float(medium.g1)}
     second: SceneDict = {"type": "hg", "g": float(medium.g2)}
     phase = first if medium.beta >= 1 else {"type": "blendphase", "weight": float(1 - medium.beta), "first": first, "second": second}

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from services.core.errors import InputError
+from services.fit.optics.phase_table import PhaseTable
 
 MEDIUM_FIELDS = ("sigma", "alpha", "beta", "g1", "g2")
 
@@ -24,10 +28,23 @@ class Medium:
     """Mean cosine of the first lobe."""
     g2: float = 0.0
     """Mean cosine of the second lobe."""
+    table: PhaseTable | None = None
+    """Phase function in place of the lobes."""
+
+    def require_lobes(self, place: str) -> None:
+        """Refuse a tabulated phase function where only lobes can be written.
+
+        Raises:
+            InputError: names the place.
+        """
+        if self.table is not None:
+            raise InputError(f"{place} cannot hold a phase table; fit lobes to it first.")
 
     @property
     def mean_cosine(self) -> float:
         """First moment of the phase function."""
+        if self.table is not None:
+            return self.table.mean_cosine
         return self.beta * self.g1 + (1 - self.beta) * self.g2
 
     @property
@@ -72,12 +89,13 @@ class Tissue:
         enamel, dentin, shape = self.enamel, self.dentin, list(self.shape)
         for name, value in values.items():
             part, leaf = name.split(".")
+            change: dict[str, Any] = {leaf: value}
             if part == "shape":
                 shape[int(leaf)] = value
             elif part == "enamel":
-                enamel = replace(enamel, **{leaf: value})
+                enamel = replace(enamel, **change)
             else:
-                dentin = replace(dentin, **{leaf: value})
+                dentin = replace(dentin, **change)
         return Tissue(enamel, dentin, tuple(shape), self.stain)
 
 
@@ -110,7 +128,8 @@ class Mouth:
             part, leaf = name.split(".", 1)
             if part == "gums":
                 assert gums is not None
-                gums = replace(gums, **{leaf: value})
+                change: dict[str, Any] = {leaf: value}
+                gums = replace(gums, **change)
             elif part == "cavity":
                 reflectance = value
             else:

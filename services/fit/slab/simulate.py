@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from pydantic import Field
 from services.core.errors import InputError, NonFiniteError
 from services.core.geometry import Record
 from services.fit.optics.parameters import Medium
+from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.platform import prepare_device
 
 LANES = 8192
@@ -26,6 +28,8 @@ FIRST_SAMPLES = 32
 GRADIENT_ERROR = 0.003
 """Standard error of a derivative, as a fraction of its value or of ``GRADIENT_FLOOR`` of the largest beside it."""
 GRADIENT_FLOOR = 1e-3
+EXIT_FLOOR = 0.1
+"""Standard errors of radiances and of rings are relative to the value, or to this fraction of the largest of its kind."""
 MOST_SAMPLES = 4096
 MOST_PATHS = 2**37
 
@@ -38,9 +42,19 @@ class Layer(Record):
     beta: float = Field(default=1.0, description="weight of the first lobe")
     g1: float = Field(default=0.0, description="mean cosine of the first lobe")
     g2: float = Field(default=0.0, description="mean cosine of the second lobe")
+    table: PhaseTable | None = Field(default=None, description="phase function in place of the lobes")
     thickness_mm: float = Field(description="thickness; the last layer may be infinite")
 
     model_config = Record.model_config | {"allow_inf_nan": True}
+
+
+class FaceValues(Record):
+    """Values of scattered light that leaves the lit face (R) and the far face (T), one per exit cosine or per ring, with standard errors."""
+
+    R: tuple[float, ...]
+    T: tuple[float, ...]
+    R_se: tuple[float, ...]
+    T_se: tuple[float, ...]
 
 
 class SlabResult(Record):
@@ -54,6 +68,8 @@ class SlabResult(Record):
     dT: dict[str, float] = Field(default_factory=dict)
     dR_se: dict[str, float] = Field(default_factory=dict)
     dT_se: dict[str, float] = Field(default_factory=dict)
+    radiance: FaceValues | None = Field(default=None, description="azimuthal mean at each exit cosine, per sr and incident irradiance")
+    rings: FaceValues | None = Field(default=None, description="share of the incident flux that leaves within each ring, the last one unbounded")
     paths: int = Field(description="number of walks")
     complete: bool = Field(description="whether every standard error asked for was reached before the time ran out")
 
@@ -64,7 +80,7 @@ class SlabResult(Record):
 
 @dataclass
 class Sums:
-    """Float64 sums over lanes; rows are the totals and then each derivative, columns R and T."""
+    """Float64 sums over lanes; rows are the totals, then each derivative, each exit cosine and each ring, columns R and T."""
 
     rows: int
     specular: float
@@ -89,7 +105,7 @@ class Sums:
         self.passes += 1
 
     def mean(self) -> NDArray[np.float64]:
-        """Totals and derivatives (rows, 2)."""
+        """Totals and what follows them (rows, 2)."""
         mean = self.first / self.samples
         mean[0, 0] += self.specular
         return mean
@@ -106,6 +122,9 @@ def simulate_slab(
     ior: float = 1.0,
     boundary: Literal["matched", "thin", "smooth"] = "matched",
     source: Literal["normal", "diffuse"] = "normal",
+    mu_incident: float = 1.0,
+    exit_cosines: tuple[float, ...] = (),
+    ring_edges_mm: tuple[float, ...] = (),
     rel_error: float = 1e-3,
     gradient: bool = False,
     seed: int = 1,
@@ -116,33 +135,59 @@ def simulate_slab(
 
     Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1, beta1,
     g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner border at fixed total depth. A derivative's standard
-    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger. After
-    ``max_seconds`` the result is given as it stands, with ``complete`` false and its true standard errors.
+    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger; that of a radiance or
+    ring to ``rel_error`` of its value or of a tenth of the largest. After ``max_seconds`` the result is given as it stands, with
+    ``complete`` false and its true standard errors.
+
+    Args:
+        layers: the first one is lit.
+        mu_incident: cosine to the normal of the collimated beam of source ``normal``.
+        exit_cosines: cosines to the normal, in air, at which the radiance that leaves each face is wanted; scattered light only.
+        ring_edges_mm: radii about the point of entry between which, and beyond the last of which, the light that leaves is wanted;
+            scattered light only.
 
     Raises:
         InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not finite.
     """
+    ring_count = len(ring_edges_mm) + 1 if ring_edges_mm else 0
+
+    def parts(table: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Totals, derivatives, radiances and rings."""
+        rows = len(table)
+        return np.split(table, [1, rows - ring_count - len(exit_cosines), rows - ring_count])
 
     def shortfall(sums: Sums) -> float:
-        mean, error = sums.mean(), sums.standard_error()
-        worst = max(error[0, 0] / (max(mean[0, 0], 1e-30) * rel_error), error[0, 1] / (max(mean[0, 1], 1e-3) * rel_error))
-        if gradient:
-            values = np.abs(mean[1:])
-            allowed = GRADIENT_ERROR * np.maximum(values, GRADIENT_FLOOR * values.max())
-            worst = max(worst, np.max(error[1:] / np.maximum(allowed, 1e-30)))
+        mean, error = parts(sums.mean()), parts(sums.standard_error())
+        (R, T), (R_se, T_se) = mean[0][0], error[0][0]
+        worst = max(R_se / (max(R, 1e-30) * rel_error), T_se / (max(T, 1e-3) * rel_error))
+        rules = ((GRADIENT_ERROR, GRADIENT_FLOOR), (rel_error, EXIT_FLOOR), (rel_error, EXIT_FLOOR))
+        for values, errors, (asked, floor) in zip(mean[1:], error[1:], rules, strict=True):
+            sizes = np.abs(values)
+            allowed = asked * np.maximum(sizes, floor * sizes.max(initial=0))
+            worst = max(worst, np.max(errors / np.maximum(allowed, 1e-30), initial=0))
         return float(worst)
 
     if not 0 < rel_error < 1:
         raise InputError(f"rel-error = {rel_error:g} must lie between 0 and 1; 1e-3 is usual.")
-    names, sums = accumulate(layers, shortfall, ior=ior, boundary=boundary, source=source, gradient=gradient, seed=seed, max_seconds=max_seconds)
-    mean, error = sums.mean(), sums.standard_error()
+    names, sums = accumulate(
+        layers, shortfall, ior=ior, boundary=boundary, source=source, mu_incident=mu_incident, exit_cosines=exit_cosines,
+        ring_edges_mm=ring_edges_mm, gradient=gradient, seed=seed, max_seconds=max_seconds,
+    )  # fmt: skip
     if numbered:
         names = tuple({"sigma": "sigma1", "alpha": "alpha1", "g": "g1a"}.get(name, name) for name in names)
-    columns = [dict(zip(names, column[1:].tolist(), strict=True)) for column in (*mean.T, *error.T)]
+    totals, derivatives, radiances, rings = (np.hstack(pair) for pair in zip(parts(sums.mean()), parts(sums.standard_error()), strict=True))
+    dR, dT, dR_se, dT_se = (dict(zip(names, column.tolist(), strict=True)) for column in derivatives.T)
+    R, T, R_se, T_se = totals[0].tolist()
     return SlabResult(
-        R=mean[0, 0], T=mean[0, 1], R_se=error[0, 0], T_se=error[0, 1], dR=columns[0], dT=columns[1], dR_se=columns[2], dT_se=columns[3],
-        paths=sums.samples, complete=shortfall(sums) <= 1,
+        R=R, T=T, R_se=R_se, T_se=T_se, dR=dR, dT=dT, dR_se=dR_se, dT_se=dT_se,
+        radiance=_face_values(radiances), rings=_face_values(rings), paths=sums.samples, complete=shortfall(sums) <= 1,
     )  # fmt: skip
+
+
+def _face_values(rows: NDArray[np.float64]) -> FaceValues | None:
+    """From rows of R, T and their standard errors."""
+    R, T, R_se, T_se = (tuple(column.tolist()) for column in rows.T)
+    return FaceValues(R=R, T=T, R_se=R_se, T_se=T_se) if R else None
 
 
 def accumulate(
@@ -152,6 +197,9 @@ def accumulate(
     ior: float = 1.0,
     boundary: str = "matched",
     source: str = "normal",
+    mu_incident: float = 1.0,
+    exit_cosines: tuple[float, ...] = (),
+    ring_edges_mm: tuple[float, ...] = (),
     gradient: bool = False,
     seed: int = 1,
     max_seconds: float = math.inf,
@@ -164,9 +212,10 @@ def accumulate(
     The first pass tells which is less noisy; ``border_terms_only`` keeps the first.
 
     Returns:
-        Names of the derivatives, and the sums: rows are the totals and then each derivative, columns R and T.
+        Names of the derivatives, and the sums.
     """
     ior = _checked(layers, ior, boundary, source)
+    _check_directions(source, mu_incident, exit_cosines, ring_edges_mm)
     prepare_device()
     from services.fit.transport.geometry import SlabGeometry
     from services.fit.transport.media import Media, Score
@@ -178,23 +227,26 @@ def accumulate(
     border = gradient and len(layers) == 2
     geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
     media = Media([_medium(layer) for layer in layers])
-    plan = Plan(scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True, bend=boundary == "smooth")
-    sums = Sums(1 + len(scores) + border, float(specular_share(ior, source)))
+    plan = Plan(
+        scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True, bend=boundary == "smooth", exit_cosines=exit_cosines,
+        ring_edges_mm=ring_edges_mm,
+    )  # fmt: skip
+    sums = Sums(1 + len(scores) + border + len(exit_cosines) + plan.rings, float(specular_share(ior, source, mu_incident)))
     spread = np.array([_spread_of_border(layers, score) for score in scores])
     from_scores: bool | None = False if border_terms_only or not border else None
     begun_s = time.monotonic()
     samples, missing = FIRST_SAMPLES, math.inf
     while missing > 1 and sums.samples < MOST_PATHS and time.monotonic() < begun_s + max_seconds:
-        start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend)
-        totals, derivatives = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
-        table = np.stack([totals, *derivatives], axis=1)
+        start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend, cosine=mu_incident)
+        slots, slopes = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
+        table = np.stack([faces[:, :2] for faces in (slots, *slopes)], axis=1)
         if from_scores is not False:
             equivalent = np.tensordot(table[:, 1:-1], spread, axes=(1, 0))
             if from_scores is None:
                 from_scores = bool(equivalent.var(axis=0).max() < table[:, -1].var(axis=0).max())
             if from_scores:
                 table[:, -1] = equivalent
-        sums.add(table, samples)
+        sums.add(np.concatenate([table, slots[:, 2:].reshape(LANES, -1, 2)], axis=1), samples)
         missing = shortfall(sums)
         # As many paths as the error asks for, but no pass far beyond the time that is left.
         elapsed_s = time.monotonic() - begun_s
@@ -225,20 +277,38 @@ def _checked(layers: tuple[Layer, ...], ior: float, boundary: str, source: str) 
     return 1.0 if boundary == "matched" else ior
 
 
+def _check_directions(source: str, mu_incident: float, exit_cosines: tuple[float, ...], ring_edges_mm: tuple[float, ...]) -> None:
+    if not 0 < mu_incident <= 1:
+        raise InputError(f"mu-incident = {mu_incident:g} must lie in 0 to 1, 0 excluded; it is the cosine of the beam to the normal.")
+    if source == "diffuse" and mu_incident != 1:
+        raise InputError(f"mu-incident = {mu_incident:g} is for a beam; leave it out, or choose source normal.")
+    for cosine in exit_cosines:
+        if not 0 < cosine <= 1:
+            raise InputError(f"exit-cosines has {cosine:g}; give cosines to the normal in 0 to 1, 0 excluded.")
+    if not all(low < high < math.inf for low, high in pairwise((0.0, *ring_edges_mm))):
+        raise InputError(f"ring-edges = {', '.join(f'{edge:g}' for edge in ring_edges_mm)} must be positive, finite and increasing, in mm.")
+
+
 def _medium(layer: Layer) -> Medium:
-    return Medium(layer.sigma, layer.alpha, layer.beta, layer.g1, layer.g2)
+    return Medium(layer.sigma, layer.alpha, layer.beta, layer.g1, layer.g2, layer.table)
 
 
 def _derivatives(layers: tuple[Layer, ...]) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
     """Names as printed, and (medium, field) of each score."""
+    fields = [("sigma", "alpha", *_phase_fields(layer)) for layer in layers]
     if len(layers) == 1 and layers[0].beta == 1:
-        return ("sigma", "alpha", "g"), ((1, "sigma"), (1, "alpha"), (1, "g1"))
+        return tuple({"g1": "g"}.get(field, field) for field in fields[0]), tuple((1, field) for field in fields[0])
     pairs = []
-    for number, layer in enumerate(layers, 1):
-        fields = ("sigma", "alpha", "beta", "g1", "g2") if layer.beta < 1 else ("sigma", "alpha", "g1")
+    for number, of_layer in enumerate(fields, 1):
         printed = {"g1": f"g{number}a", "g2": f"g{number}b"}
-        pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in fields]
+        pairs += [(printed.get(field, f"{field}{number}"), (number, field)) for field in of_layer]
     return tuple(name for name, _ in pairs), tuple(score for _, score in pairs)
+
+
+def _phase_fields(layer: Layer) -> tuple[str, ...]:
+    if layer.table is not None:
+        return ()
+    return ("beta", "g1", "g2") if layer.beta < 1 else ("g1",)
 
 
 def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> float:
@@ -248,18 +318,22 @@ def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> floa
     return (1 if number == 1 else -1) * layer.sigma / layer.thickness_mm if name == "sigma" else 0.0
 
 
-def specular_share(ior: ArrayLike, source: str) -> NDArray[np.float64]:
+def specular_share(ior: ArrayLike, source: str, mu_incident: float = 1.0) -> NDArray[np.float64]:
     """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre in float64."""
     eta = np.asarray(ior, dtype=np.float64)
     if source == "normal":
-        return ((eta - 1) / (eta + 1)) ** 2
-    eta = eta[..., None]
+        return _fresnel(eta, mu_incident)
     nodes, weights = np.polynomial.legendre.leggauss(400)
     cosine = 0.5 * (nodes + 1)
-    transmitted = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    return np.asarray(np.sum(weights * cosine * _fresnel(eta[..., None], cosine), axis=-1))
+
+
+def _fresnel(eta: NDArray[np.float64], cosine: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Unpolarised reflectance from air."""
+    transmitted = np.sqrt(1 - (1 - np.square(cosine)) / eta**2)
     s = (cosine - eta * transmitted) / (cosine + eta * transmitted)
     p = (eta * cosine - transmitted) / (eta * cosine + transmitted)
-    return np.asarray(np.sum(weights * cosine * 0.5 * (s**2 + p**2), axis=-1))
+    return 0.5 * (s**2 + p**2)
 
 
 def _pass_seed(seed: int, number: int) -> int:

@@ -139,6 +139,14 @@ class SlabGeometry:
         """No stains."""
         return mi.Bool(False)
 
+    def depths(self, z: mi.Float, sigma: Sequence[mi.Float]) -> tuple[mi.Float, mi.Float]:
+        """Optical depths from ``z`` inside straight to the lit and to the far face."""
+        above, below = mi.Float(0), mi.Float(0)
+        for coefficient, top, bottom in zip(sigma, self._planes[:-1], self._planes[1:], strict=True):
+            above += coefficient * dr.clip(z - top, 0, bottom - top)
+            below += coefficient * dr.clip(bottom - z, 0, bottom - top)
+        return above, below
+
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - there is one border
         """The first inner border moves along +z."""
         return [dr.select(active & hit.valid & ~hit.outer, mi.Float(1), 0)]

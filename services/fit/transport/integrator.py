@@ -55,7 +55,13 @@ class ToothProperties:
 
 
 def medium_properties(part: str, media: tuple[Medium, ...]) -> dict[str, Any]:
-    """Properties of ``enamel`` or ``dentin`` for the media of one or three colour channels."""
+    """Properties of ``enamel`` or ``dentin`` for the media of one or three colour channels.
+
+    Raises:
+        InputError: a phase function is a table.
+    """
+    for medium in media:
+        medium.require_lobes("The integrator")
     values = {field: [float(getattr(medium, field)) for medium in media] for field in MEDIUM_FIELDS}
     return {f"{part}_{field}": numbers if len(numbers) > 1 else numbers[0] for field, numbers in values.items()}
 

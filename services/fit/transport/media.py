@@ -13,6 +13,7 @@ import numpy as np
 from services.core.errors import InputError
 from services.fit.optics import phase
 from services.fit.optics.parameters import Medium
+from services.fit.transport.tables import PhaseTables
 
 MOST_SELECTED = 3
 """Values of more media than this are gathered from a table."""
@@ -53,7 +54,13 @@ class Media:
     def __init__(self, media: Sequence[Medium | Sequence[Medium]]) -> None:
         """Take each medium once for all lanes, or as a sequence of one per lane."""
         self.count = len(media)
-        self.two_lobes = any(m.beta < 1 for entry in media for m in ([entry] if isinstance(entry, Medium) else entry))
+        each = [[entry] if isinstance(entry, Medium) else entry for entry in media]
+        self.two_lobes = any(m.beta < 1 for entry in each for m in entry)
+        if any(m.table is not None for entry in each for m in entry if len(entry) > 1):
+            raise InputError("Media that differ from lane to lane cannot have phase tables; give them lobes.")
+        tables = [entry[0].table for entry in each]
+        self.tabulated = tuple(table is not None for table in tables)
+        self.tables = PhaseTables(tables) if any(self.tabulated) else None
 
         def opaque(value: Callable[[Medium], float]) -> list[mi.Float]:
             return [
@@ -89,10 +96,10 @@ class Media:
 
 
 class PhaseFunction:
-    """The phase function of each lane's medium: one or two lobes, as the scene needs."""
+    """The phase function of each lane's medium: one or two lobes or a table, as the scene needs."""
 
     def __init__(self, media: Media, index: mi.UInt32) -> None:
-        self.two_lobes = media.two_lobes
+        self.index, self.tables, self.two_lobes = index, media.tables, media.two_lobes
         self.g1 = media.pick(media.g1, index)
         if self.two_lobes:
             self.g2 = media.pick(media.g2, index)
@@ -100,6 +107,12 @@ class PhaseFunction:
 
     def density(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
         """Value, 1/sr."""
+        value = self._density_of_lobes(omega, omega_out)
+        if self.tables is None:
+            return value
+        return dr.select(self.tables.known(self.index), self.tables.density(self.index, omega, omega_out), value)
+
+    def _density_of_lobes(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
         f1 = phase.density(self.g1, phase.deviation(self.g1, omega, omega_out))
         if not self.two_lobes:
             return f1
@@ -109,7 +122,10 @@ class PhaseFunction:
     def sample(self, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Float, v: mi.Float) -> mi.Vector3f:
         """Direction distributed as the phase function."""
         g = self.g1 if u_lobe is None else dr.select(u_lobe < self.beta, self.g1, self.g2)
-        return phase.turn(omega, g, phase.sample_deviation(g, u), v)
+        onward = phase.turn(omega, g, phase.sample_deviation(g, u), v)
+        if self.tables is None:
+            return onward
+        return dr.select(self.tables.known(self.index), self.tables.sample(self.index, omega, u, v), onward)
 
     def scores(self, fields: frozenset[str], omega: mi.Vector3f, omega_out: mi.Vector3f) -> dict[str, mi.Float]:
         """Derivatives d ln(density) / d(field) for the lobe fields asked for (teeth 2018 Eq. 12, 13)."""

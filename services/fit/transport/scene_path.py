@@ -14,11 +14,12 @@ import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics import fresnel
+from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.channel_media import ChannelMedia, ToothOptics
 from services.fit.transport.geometry import ENAMEL
 from services.fit.transport.gloss import Gloss
 from services.fit.transport.scene_teeth import SceneTeeth
-from services.fit.transport.walk import ROULETTE_WEIGHT, minus_log1m
+from services.fit.transport.walk import ROULETTE_WEIGHT
 
 CONNECTION_GAIN = 3.0
 CONNECTION_FLOOR = 0.02

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from services.core.errors import InputError
 from services.fit.transport.media import Media, Score
 
 MOST_COUNTED = 3
@@ -24,12 +25,21 @@ class Plan:
     """Count what leaves the slab's faces instead of connecting to lights."""
     bend: bool = False
     """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
+    exit_cosines: tuple[float, ...] = ()
+    """With ``faces``: also the radiance that leaves at these cosines."""
+    ring_edges_mm: tuple[float, ...] = ()
+    """With ``faces``: also what leaves within rings about the point of entry, between these radii and beyond the last."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
     stains: bool = False
     """Instead of images, the derivative of their sum, weighted by a cotangent, to the texels of stains."""
     most_steps: int | None = None
     """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
+
+    @property
+    def rings(self) -> int:
+        """Number of rings, the unbounded one included."""
+        return len(self.ring_edges_mm) + 1 if self.ring_edges_mm else 0
 
 
 @dataclass
@@ -50,6 +60,9 @@ class Scores:
     def __init__(self, plan: Plan, media: Media) -> None:
         self.plan, self.media = plan, media
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
+        for s in plan.scores:
+            if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
+                raise InputError(f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives.")
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
         # Of few media all are counted; of many, those whose albedo is free.
         self.counts_all = media.count <= MOST_COUNTED

@@ -12,9 +12,11 @@ import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics import fresnel
+from services.fit.optics.free_flight import minus_log1m, one_minus_exp
 from services.fit.transport.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
 from services.fit.transport.connections import Connections, Vertex
-from services.fit.transport.geometry import Geometry, Hit
+from services.fit.transport.exits import Exits
+from services.fit.transport.geometry import Geometry, Hit, SlabGeometry
 from services.fit.transport.lights import PointLights, shadow
 from services.fit.transport.media import Media, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
@@ -24,16 +26,6 @@ from services.fit.transport.tally import Tally
 
 ROULETTE_WEIGHT = 0.1
 """Paths below this fraction of their first weight survive in proportion to it."""
-
-
-def one_minus_exp(x: mi.Float) -> mi.Float:
-    """1 - exp(-x), without cancellation for small x."""
-    return dr.select(x < 0.05, x * (1 - x / 2 * (1 - x / 3 * (1 - x / 4))), 1 - dr.exp(-x))
-
-
-def minus_log1m(p: mi.Float) -> mi.Float:
-    """-log(1 - p), without cancellation for small p."""
-    return dr.select(p < 0.02, p * (1 + p * (1 / 2 + p * (1 / 3 + p / 4))), -dr.log(1 - p))
 
 
 @dataclass
@@ -97,6 +89,11 @@ class Walk:
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
+        self.exits: Exits | None = None
+        if plan.exit_cosines or plan.ring_edges_mm:
+            assert isinstance(geometry, SlabGeometry)
+            self.exits = Exits(geometry, media, plan, self.ior, first_slot=self.slots)
+            self.slots += self.exits.slots
 
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
         """Trace ``samples`` paths in every lane; returns their sums, evaluated. A plan for stains brings its own tally."""
@@ -194,6 +191,9 @@ class Walk:
         lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.book.sigma_media}
         primary = walker.active & leaving & ~walker.secondary
         tally.add(walker.lane, face, value, primary)
+        if self.exits is not None:
+            self.exits.count_ring(walker, self.book.order(walker.so_far), hit, face, value, tally)
+            self.exits.connect(walker, hit, sigma, carried * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally)
         for which, score in enumerate(self.book.complete(walker.sums, walker.so_far, mi.UInt32(0), {}, lengths)):
             tally.add_derivative(which, walker.lane, face, value * score, primary)
         for mode in range(self.modes):
