@@ -20,7 +20,7 @@ from services.fit.optics.phase_table import PhaseTable, tent_weights
 from services.fit.slab.simulate import Layer, simulate_slab
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe
+from services.fit.transport.recipe import DentinShape, single_tooth
 from tests.support.exit_tables import angular_cases
 from tests.support.phase_tables import TENT_SPACING_RAD, cumulative, density, henyey_greenstein, over_equal_angles, over_equal_cosines
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
@@ -178,7 +178,7 @@ def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     write_mesh(tmp_path / "outer.ply", outer)
     write_mesh(tmp_path / "dentin.ply", dentin.base)
     camera, light = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0), LIGHTS_MM[1]
-    scene = SceneRecipe(outer, dentin, light[None], np.array([INTENSITY]))
+    scene = single_tooth(outer, dentin, light[None], np.array([INTENSITY]))
     ours = Engine(scene).images(tissue, whole_view(camera), samples=2048, seed=931, batches=BATCHES)
     stock = nested_scene({"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}, Tissue(Medium(1.5, 0.95), lobes), (camera,), light, INTENSITY)
     stock["medium_enamel"]["phase"] = {"type": "tabphase", "values": ", ".join(f"{value:.9g}" for value in values[::-1])}
