@@ -109,6 +109,8 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         if tooth.dentin is not None:
             add(f"dentin{k}", tooth.dentin.base)
             arrays[f"dentin{k}_modes"] = tooth.dentin.modes_mm
+        if tooth.stain_uv is not None:
+            arrays[f"stain{k}_uv"] = tooth.stain_uv
     add("gums", recipe.gums)
     add("cavity", recipe.cavity)
     return _write(
@@ -120,6 +122,7 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         boundary=np.array(recipe.boundary),
         ior=np.array(recipe.ior),
         gums_ior=np.array(recipe.gums_ior),
+        border_width_mm=np.array(recipe.border_width_mm),
         device=np.array(recipe.device or ""),
         **arrays,
     )
@@ -135,7 +138,8 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
     def tooth(k: int) -> ToothSurfaces:
         outer, base = mesh(f"outer{k}"), mesh(f"dentin{k}")
         assert outer is not None
-        return ToothSurfaces(outer, None if base is None else DentinShape(base, a[f"dentin{k}_modes"].astype(float)))
+        dentin = None if base is None else DentinShape(base, a[f"dentin{k}_modes"].astype(float))
+        return ToothSurfaces(outer, dentin, a[f"stain{k}_uv"].astype(float) if f"stain{k}_uv" in a else None)
 
     return SceneRecipe(
         teeth=tuple(tooth(k) for k in range(int(np.asarray(a["teeth"], dtype=int)))),
@@ -147,6 +151,7 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         gums=mesh("gums"),
         gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
         cavity=mesh("cavity"),
+        border_width_mm=float(np.asarray(a["border_width_mm"], dtype=float)),
     )
 
 

@@ -222,7 +222,7 @@ def test_a_layers_table_comes_from_plain_numbers_and_has_no_lobes_to_derive() ->
 
 
 def test_derivatives_to_lobes_that_a_table_replaces_are_refused() -> None:
-    scene = SceneRecipe(ellipsoid(SEMI_AXES_MM), None, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY))
+    scene = single_tooth(ellipsoid(SEMI_AXES_MM), None, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY))
     tissue = Tissue(Medium(1.5, 0.95, table=TABLES["isotropic"]), Medium(1.0, 0.5))
     view = whole_view(camera_at((0, 1, 0)))
     with pytest.raises(InputError, match=r"Medium 1 has a phase table in place of lobes, and so no g1; ask"):

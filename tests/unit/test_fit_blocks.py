@@ -39,8 +39,8 @@ def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: li
 
 @pytest.mark.parametrize("device", [None, "llvm", "cuda"])
 def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) -> None:
-    teeth = (ToothSurfaces(ellipsoid(SEMI_AXES_MM), dentin_shape()), ToothSurfaces(sphere(2.0)))
-    scene = SceneRecipe(teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0))
+    teeth = (ToothSurfaces(ellipsoid(SEMI_AXES_MM), dentin_shape()), ToothSurfaces(sphere(2.0), stain_uv=np.ones((len(sphere(2.0).faces), 3, 2))))
+    scene = SceneRecipe(teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0), 0.5)
     stored = read_recipe(write_recipe(tmp_path, scene))
     assert (stored.boundary, stored.ior, stored.device, stored.gums_ior) == ("thin", 1.5, device, 1.4)
     np.testing.assert_equal(asdict(stored), asdict(scene))

@@ -121,7 +121,7 @@ def _inside_columns(mesh: Mesh, axes: list[NDArray[np.float64]]) -> NDArray[np.b
     with np.errstate(divide="ignore", invalid="ignore"):
         u = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
         v = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
-    hit = (area != 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
+        hit = (area != 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
     height = a[face, 2] + u * (b - a)[face, 2] + v * (c - a)[face, 2]
     crossings = np.zeros((len(xs), len(ys), len(zs) + 1), dtype=np.int32)
     np.add.at(crossings, (i[hit], j[hit], np.searchsorted(zs, height[hit])), 1)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from services.fit.transport.geometry import Geometry
 from services.fit.transport.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
-from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.stains import FaceCrossing, StainTally
 from services.fit.transport.tally import Tally
@@ -194,18 +194,34 @@ class Connections:
         lengths_of = dict(zip(self.book.sigma_media, lengths, strict=True))
         for which, score in enumerate(self.book.complete(vertex.sums, vertex.so_far, medium, terms, lengths_of)):
             tally.add_derivative(which, lane, slot, value * score, primary)
+        border_sums = vertex.border_sums
+        if isinstance(medium, Mixed) and self.plan.shape is not None:
+            change = self.book.mixed_motion(medium, PhaseFunction(self.media, medium).scores(LOBE_FIELDS, vertex.omega, direction))
+            motion = self.geometry.mixture_motion(vertex.point, self.plan.shape, active)
+            border_sums = [dr.fma(change, rate, total) for rate, total in zip(motion, border_sums, strict=True)]
         for mode in range(self.modes):
-            on_the_way = vertex.border_sums[mode] if border is None else vertex.border_sums[mode] + border[mode]
+            on_the_way = border_sums[mode] if border is None else border_sums[mode] + border[mode]
             factor = dr.select(vertex.secondary, vertex.shape_factor[mode], on_the_way)
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
-    def _medium(self, vertex: Vertex) -> mi.UInt32:
-        medium = self.geometry.medium(vertex.place)
-        return dr.select(vertex.wall[0], mi.UInt32(self.media.count), medium) if vertex.wall else medium
+    def _medium(self, vertex: Vertex) -> mi.UInt32 | Mixed:
+        """What a vertex scatters in, a wall where it lies on one."""
+        wall = mi.UInt32(self.media.count)
+        if not self.geometry.mixing:
+            medium = self.geometry.medium(vertex.place)
+            return dr.select(vertex.wall[0], wall, medium) if vertex.wall else medium
+        mixed = self.geometry.mixed(vertex.point, vertex.place, mi.Bool(True))
+        if vertex.wall:
+            (on_wall,) = vertex.wall
+            mixed = Mixed(
+                dr.select(on_wall, wall, mixed.first), dr.select(on_wall, wall, mixed.second), dr.select(on_wall, 1, mixed.share),
+                dr.select(on_wall, 0, mixed.slope),
+            )  # fmt: skip
+        return mixed
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
         """Phase function, or diffuse reflection of white, towards a direction, 1/sr."""
-        density = PhaseFunction(self.media, self.geometry.medium(vertex.place)).density(vertex.omega, direction)
+        density = PhaseFunction(self.media, self._medium(vertex)).density(vertex.omega, direction)
         if vertex.wall:
             density = dr.select(vertex.wall[0], dr.maximum(dr.dot(vertex.omega, direction), 0) * dr.inv_pi, density)
         return density

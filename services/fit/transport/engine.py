@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from services.fit.transport.starts import CameraStart
     from services.fit.transport.walk import Walk
 
+WIDEST_BORDER_MM = 5.0
 LANE_BUDGET = 24_000_000
 """Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
 
@@ -55,6 +56,8 @@ class Engine:
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
         self._radius_mm = reach_mm
+        if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
+            raise InputError(f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it.")
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
         self._ior = recipe.ior if recipe.boundary == "thin" and refracts else None
         self._lights.maps.trace(self._geometry, self._ior)

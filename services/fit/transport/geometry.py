@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.fit.transport.media import Mixed
+
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""
 RAY_EPSILON = 1e-5
@@ -48,6 +50,8 @@ class Geometry(Protocol):
     """Ray offset, mm."""
     opaque: bool
     """Whether any surface is."""
+    mixing: bool
+    """Whether albedo and phase function change gradually across borders."""
     single: bool
     """One tooth and nothing else: what its face mirrors to a camera is empty space."""
 
@@ -63,6 +67,12 @@ class Geometry(Protocol):
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Index of the medium, 0 for empty space."""
+
+    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
+        """The media that mix at a point; asked only where borders are gradual."""
+
+    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
+        """Change of the distance to a tooth's dentin with each of its shape modes."""
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after crossing the surface."""
@@ -89,6 +99,7 @@ class SlabGeometry:
     epsilon = 0.0
     opaque = False
     stained = False
+    mixing = False
     single = True
 
     def __init__(self, thicknesses_mm: Sequence[float | NDArray[np.float64]], *, moving_border: bool) -> None:
@@ -138,6 +149,14 @@ class SlabGeometry:
     def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - faces have none
         """No stains."""
         return mi.Bool(False)
+
+    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
+        """Layers do not mix."""
+        raise NotImplementedError
+
+    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
+        """Layers do not mix."""
+        raise NotImplementedError
 
     def depths(self, z: mi.Float, sigma: Sequence[mi.Float]) -> tuple[mi.Float, mi.Float]:
         """Optical depths from ``z`` inside straight to the lit and to the far face."""

@@ -15,6 +15,7 @@ from services.fit.optics import phase
 from services.fit.optics.parameters import Medium
 from services.fit.transport.tables import PhaseTables
 
+LOBE_FIELDS = frozenset({"beta", "g1", "g2"})
 MOST_SELECTED = 3
 """Values of more media than this are gathered from a table."""
 
@@ -48,6 +49,24 @@ class Score:
     field: str
 
 
+@dataclass
+class Mixed:
+    """Two media mixed near a gradual border; away from it one of them alone."""
+
+    first: mi.UInt32
+    """Number of the enamel, or of what there is no mixing of."""
+    second: mi.UInt32
+    """Number of the dentin."""
+    share: mi.Float
+    """Of the first."""
+    slope: mi.Float
+    """d share / d distance, per mm; 0 where nothing is mixed."""
+
+    def share_of(self, medium: int) -> mi.Float:
+        """How much of a lane's scattering is in a medium."""
+        return dr.select(self.first == medium, self.share, dr.select(self.second == medium, 1 - self.share, 0))
+
+
 class Media:
     """Parameters of media 1..M; index 0 is empty space."""
 
@@ -72,17 +91,20 @@ class Media:
         self.sigma_s = opaque(lambda m: m.sigma * m.alpha)
         self.log_alpha = opaque(lambda m: math.log(max(m.alpha, 1e-30)))
         self.inverse_alpha = opaque(lambda m: 1 / max(m.alpha, 1e-30))
+        self.absorbed = opaque(lambda m: 1 - m.alpha)
         self.beta = opaque(lambda m: m.beta)
         self.g1 = opaque(lambda m: m.g1)
         self.g2 = opaque(lambda m: m.g2)
         self._tables: dict[int, mi.Float] = {}
         if self.count > MOST_SELECTED:
-            columns = (self.sigma, self.sigma_s, self.log_alpha, self.beta, self.g1, self.g2)
+            columns = (self.sigma, self.sigma_s, self.log_alpha, self.absorbed, self.beta, self.g1, self.g2)
             self._tables = {id(column): dr.concat(column) for column in columns}
             dr.eval(self._tables)
 
-    def pick(self, values: list[mi.Float], index: mi.UInt32) -> mi.Float:
-        """Value of the medium an index names; any where it names empty space."""
+    def pick(self, values: list[mi.Float], index: mi.UInt32 | Mixed) -> mi.Float:
+        """Value of the medium an index names, or of the mixture; any where it names empty space."""
+        if isinstance(index, Mixed):
+            return dr.lerp(self.pick(values, index.second), self.pick(values, index.first), index.share)
         if self._tables:
             return dr.gather(mi.Float, self._tables[id(values)], dr.maximum(index, 1) - 1)
         result = values[-1]
@@ -98,7 +120,7 @@ class Media:
 class PhaseFunction:
     """The phase function of each lane's medium: one or two lobes or a table, as the scene needs."""
 
-    def __init__(self, media: Media, index: mi.UInt32) -> None:
+    def __init__(self, media: Media, index: mi.UInt32 | Mixed) -> None:
         self.index, self.tables, self.two_lobes = index, media.tables, media.two_lobes
         self.g1 = media.pick(media.g1, index)
         if self.two_lobes:
@@ -108,7 +130,7 @@ class PhaseFunction:
     def density(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
         """Value, 1/sr."""
         value = self._density_of_lobes(omega, omega_out)
-        if self.tables is None:
+        if self.tables is None or isinstance(self.index, Mixed):
             return value
         return dr.select(self.tables.known(self.index), self.tables.density(self.index, omega, omega_out), value)
 
@@ -123,7 +145,7 @@ class PhaseFunction:
         """Direction distributed as the phase function."""
         g = self.g1 if u_lobe is None else dr.select(u_lobe < self.beta, self.g1, self.g2)
         onward = phase.turn(omega, g, phase.sample_deviation(g, u), v)
-        if self.tables is None:
+        if self.tables is None or isinstance(self.index, Mixed):
             return onward
         return dr.select(self.tables.known(self.index), self.tables.sample(self.index, omega, u, v), onward)
 

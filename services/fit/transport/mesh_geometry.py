@@ -9,10 +9,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
+from services.core.geometry import Mesh
 from services.fit.optics.parameters import Stain
 from services.fit.transport.clearance import Clearance
 from services.fit.transport.geometry import RAY_EPSILON, Hit
+from services.fit.transport.media import Mixed
+from services.fit.transport.mixed_border import MixedBorder
 from services.fit.transport.names import media_numbers
 from services.fit.transport.nesting import require_nested
 from services.fit.transport.recipe import DentinShape, SceneRecipe
@@ -51,6 +55,8 @@ class MeshGeometry:
         self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
 
         self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32))
+        self.mixing = recipe.border_width_mm > 0 and bool(self._dentins)
+        self._border = MixedBorder(recipe.border_width_mm) if self.mixing else None
         self.textures: StainTextures | None = None
         self._stains: tuple[Stain | None, ...] = (None,) * self.teeth
         self._shapes: Shapes | None = None
@@ -66,6 +72,8 @@ class MeshGeometry:
         if moved:
             inner = self._faces[self.fixed_faces :].astype(np.int32) - len(self._fixed_mm)
             self._clearance.move_inner(points[len(self._fixed_mm) :], inner)
+        if self._border is not None:
+            self._border.move(*self._dentin_now(moved))
         positions = mi.Float(points.reshape(-1).astype(np.float32))
         if self._shapes is None:
             mesh = mi.Mesh("teeth", len(points), len(self._faces))
@@ -85,6 +93,33 @@ class MeshGeometry:
         dr.eval(self._normals)
         changed, self._shapes = self._shapes is not None, shapes
         return changed
+
+    def _dentin_now(self, moved: list[NDArray[np.float64]]) -> tuple[Mesh, NDArray[np.float64]]:
+        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a tooth's modes move its own alone."""
+        first = np.cumsum([0] + [len(vertices) for vertices in moved])
+        dentins = list(self._dentins.values())
+        faces = np.concatenate([dentin.base.faces + offset for dentin, offset in zip(dentins, first, strict=False)]).astype(np.int32)
+        modes = np.zeros((max(self.modes_of), first[-1], 3))
+        for dentin, start in zip(dentins, first, strict=False):
+            modes[: len(dentin.modes_mm), start : start + len(dentin.base.vertices_mm)] = dentin.modes_mm
+        return Mesh(np.concatenate(moved), faces), modes
+
+    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
+        """Enamel and dentin of the tooth at a point; elsewhere the medium alone."""
+        assert self._border is not None
+        medium, tooth = self.medium(place), self.inside(place)
+        in_tooth = tooth < self.teeth
+        enamel = tooth * 2 + 1
+        share, slope = self._border.share(point, active & in_tooth)
+        pure = mi.Float(1)
+        return Mixed(
+            dr.select(in_tooth, enamel, medium), dr.select(in_tooth, enamel + 1, medium), dr.select(in_tooth, share, pure), dr.select(in_tooth, slope, 0)
+        )
+
+    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
+        """Change of the distance to dentin with each shape mode of a tooth."""
+        assert self._border is not None
+        return self._border.motion(point, active)[: self.modes_of[tooth]]
 
     @property
     def stained(self) -> bool:

@@ -92,6 +92,8 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
             raise InputError(f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it.")
         require_stain(f"{prefix}stain", tissue.stain, tooth)
+    if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
+        raise InputError(f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes.")
     if (mouth.gums is None) == numbers.gums:
         raise InputError(f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither.")
     if mouth.gums is not None:

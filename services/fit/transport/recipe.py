@@ -55,6 +55,8 @@ class SceneRecipe:
     gums_ior: float = 1.33
     cavity: Mesh | None = None
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
+    border_width_mm: float = 0.0
+    """Over which albedo and phase function change from enamel's to dentin's, half of it on either side; 0 for a sharp border."""
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""

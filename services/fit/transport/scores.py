@@ -8,8 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from services.core.errors import InputError
-from services.fit.transport.media import Media, Score
+from services.fit.optics.free_flight import minus_log1m
+from services.fit.transport.media import Media, Mixed, Score
 
+NEARLY_ONE = 1 - 2.0**-24
 MOST_COUNTED = 3
 """Media of which each keeps a count of its own scatterings."""
 
@@ -57,16 +59,17 @@ class Scatterings:
 class Scores:
     """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
 
-    def __init__(self, plan: Plan, media: Media) -> None:
+    def __init__(self, plan: Plan, media: Media, *, mixing: bool = False) -> None:
         self.plan, self.media = plan, media
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
         for s in plan.scores:
             if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
                 raise InputError(f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives.")
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
-        # Of few media all are counted; of many, those whose albedo is free.
-        self.counts_all = media.count <= MOST_COUNTED
-        asked = {s.medium for s in plan.scores if s.field == "alpha"}
+        # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
+        self.mixing = mixing
+        self.counts_all = media.count <= MOST_COUNTED and not mixing
+        asked = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
         self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(asked))
 
     def zero(self) -> list[mi.Float]:
@@ -78,8 +81,11 @@ class Scores:
         rest = 0 if self.counts_all else 1
         return Scatterings([mi.UInt32(0) for _ in self.counted], [mi.Float(0)] * rest, [mi.UInt32(0)] * rest)
 
-    def scatter(self, so_far: Scatterings, medium: mi.UInt32, active: mi.Bool) -> Scatterings:
+    def scatter(self, so_far: Scatterings, medium: mi.UInt32 | Mixed, active: mi.Bool) -> Scatterings:
         """One more in each active lane."""
+        if isinstance(medium, Mixed):
+            log_alpha = -minus_log1m(dr.minimum(self.media.pick(self.media.absorbed, medium), NEARLY_ONE))
+            return Scatterings([], [so_far.others[0] + dr.select(active, log_alpha, 0)], [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)])
         counts = [dr.select(active & (medium == k), count + 1, count) for k, count in zip(self.counted, so_far.counts, strict=True)]
         if self.counts_all:
             return Scatterings(counts, [], [])
@@ -114,25 +120,53 @@ class Scores:
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
-    def turn(self, sums: list[mi.Float], medium: mi.UInt32, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
+    def mixed_albedo(self, sums: list[mi.Float], medium: Mixed, active: mi.Bool) -> list[mi.Float]:
+        """Albedos where media mix: their share over the mixture's albedo per scatter (Eq. 20)."""
+        inverse = dr.rcp(dr.maximum(1 - self.media.pick(self.media.absorbed, medium), 1 - NEARLY_ONE))
+        return [
+            total + dr.select(active, medium.share_of(s.medium) * inverse, 0) if s.field == "alpha" else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
+    def mixed_motion(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
+        """D ln / dq of the mixture's phase function: differences of the two media times ``terms``, all fields of its lobes (Eq. 19, corrected)."""
+        total = mi.Float(0)
+        for field, term in terms.items():
+            column = {"beta": self.media.beta, "g1": self.media.g1, "g2": self.media.g2}[field]
+            total = dr.fma(self.media.pick(column, medium.first) - self.media.pick(column, medium.second), term, total)
+        return total * medium.slope
+
+    def mixed_albedo_motion(self, medium: Mixed) -> mi.Float:
+        """D ln / dq of the mixture's albedo (Eq. 21)."""
+        absorbed = self.media.absorbed
+        less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
+        return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
+
+    def turn(self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
         """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
+        if isinstance(medium, Mixed):
+            return [
+                total + dr.select(active, medium.share_of(s.medium) * terms[s.field], 0) if s.field in terms else total
+                for s, total in zip(self.plan.scores, sums, strict=True)
+            ]
         return [
             dr.select(active & (medium == s.medium), total + terms[s.field], total) if s.field in terms else total
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
     def complete(
-        self, sums: list[mi.Float], so_far: Scatterings, medium: mi.UInt32, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
+        self, sums: list[mi.Float], so_far: Scatterings, medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
     ) -> list[mi.Float]:
         """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
         whole = []
         for s, total in zip(self.plan.scores, sums, strict=True):
             value = total
-            if s.field == "alpha":
+            if s.field == "alpha" and not self.mixing:
                 value = mi.Float(so_far.counts[self.counted.index(s.medium)]) * self.media.inverse_alpha[s.medium - 1]
             elif s.field == "sigma":
                 value = total - lengths.get(s.medium, mi.Float(0))
             elif s.field in terms:
-                value = total + dr.select(medium == s.medium, terms[s.field], 0)
+                own = medium.share_of(s.medium) * terms[s.field] if isinstance(medium, Mixed) else dr.select(medium == s.medium, terms[s.field], 0)
+                value = total + own
             whole.append(value)
         return whole

@@ -18,7 +18,7 @@ from services.fit.transport.connections import Connections, Vertex
 from services.fit.transport.exits import Exits
 from services.fit.transport.geometry import Geometry, Hit, SlabGeometry
 from services.fit.transport.lights import PointLights, shadow
-from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.stains import FaceCrossing
 from services.fit.transport.starts import CameraStart, SlabStart
@@ -84,7 +84,7 @@ class Walk:
     def __init__(self, geometry: Geometry, media: Media, lights: PointLights | None, start: CameraStart | SlabStart, plan: Plan, ior: float | None) -> None:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
-        self.book = Scores(plan, media)
+        self.book = Scores(plan, media, mixing=geometry.mixing)
         self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.book, self.ior)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
@@ -236,8 +236,29 @@ class Walk:
         walker.origin = dr.select(flight.scatters, dr.fma(omega, flight.distance, walker.origin), dr.select(flight.meets, reached, walker.origin))
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
         walker.place = dr.select(crosses, behind, walker.place)
-        scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium) if self.geometry.opaque else flight.medium
+        scattered_in: mi.UInt32 | Mixed = flight.medium
+        if self.geometry.opaque:
+            scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
+        if self.geometry.mixing:
+            scattered_in = self._mixed(walker, flight)
+            walker.sums = self.book.mixed_albedo(walker.sums, scattered_in, flight.scatters | flight.bounces)
+            self._score_mixture(walker, self.book.mixed_albedo_motion(scattered_in), flight.scatters)
         walker.so_far = self.book.scatter(walker.so_far, scattered_in, flight.scatters | flight.bounces)
+
+    def _mixed(self, walker: Walker, flight: Flight) -> Mixed:
+        """What the vertex that a flight ends at scatters in."""
+        mixed = self.geometry.mixed(walker.origin, walker.place, flight.scatters)
+        if self.geometry.opaque:
+            wall = mi.UInt32(self.media.count)
+            mixed.first, mixed.second = dr.select(flight.bounces, wall, mixed.first), dr.select(flight.bounces, wall, mixed.second)
+            mixed.share, mixed.slope = dr.select(flight.bounces, 1, mixed.share), dr.select(flight.bounces, 0, mixed.slope)
+        return mixed
+
+    def _score_mixture(self, walker: Walker, change: mi.Float, active: mi.Bool) -> None:
+        """Score what the border's motion changes in the mixture where a lane scatters, per mm of its distance."""
+        if self.plan.shape is not None:
+            motion = self.geometry.mixture_motion(walker.origin, self.plan.shape, active)
+            walker.border_sums = [total + dr.select(active, change * rate, 0) for total, rate in zip(walker.border_sums, motion, strict=True)]
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
         assert self.connections is not None
@@ -258,11 +279,14 @@ class Walk:
         walker.turn = dr.select(walker.turn == self.connections.turns, 0, walker.turn)
 
     def _turn(self, walker: Walker, flight: Flight) -> None:
-        phase, rng = PhaseFunction(self.media, flight.medium), walker.rng
+        medium = self._mixed(walker, flight) if self.geometry.mixing else flight.medium
+        phase, rng = PhaseFunction(self.media, medium), walker.rng
         u_lobe = rng.next_float32() if self.media.two_lobes else None
         u, v = rng.next_float32(), rng.next_float32()
         onward = phase.sample(walker.omega, u_lobe, u, v)
-        walker.sums = self.book.turn(walker.sums, flight.medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters)
+        walker.sums = self.book.turn(walker.sums, medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters)
+        if isinstance(medium, Mixed) and self.plan.shape is not None:
+            self._score_mixture(walker, self.book.mixed_motion(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters)
         if self.geometry.opaque:
             diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))
             walker.omega = dr.select(flight.bounces, diffuse, walker.omega)

@@ -1,0 +1,71 @@
+"""A gradual border between enamel and dentin: images against stock Mitsuba, which takes albedo and lobe weight from volumes, and derivatives to the shape.
+
+The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+from services.core.meshfiles import write_mesh
+from services.fit.anatomy.distance import SurfaceDistance
+from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.platform import prepare_device
+from services.fit.transport.recipe import DentinShape, single_tooth
+from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
+from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, ellipsoid, whole_view
+
+WIDTH_MM = 2.0
+# One pair of lobes, whose weight and albedo differ: stock media mix these by volumes, but not a lobe's g.
+TISSUE = Tissue(Medium(1.5, 0.98, 0.9, 0.6, -0.3), Medium(4.0, 0.75, 0.3, 0.6, -0.3))
+
+
+def test_a_gradual_border_looks_as_in_mitsuba(tmp_path: Path) -> None:
+    prepare_device()
+    outer, core = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.7)
+    known = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
+    lights = LIGHTS_MM[[1, 3]]
+    scene = replace(single_tooth(outer, known, lights, np.full(2, INTENSITY)), border_width_mm=WIDTH_MM)
+    camera = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0)
+    ours = Engine(scene).images(TISSUE, whole_view(camera), samples=2048, seed=21, batches=BATCHES)
+
+    write_mesh(tmp_path / "outer.ply", outer)
+    write_mesh(tmp_path / "dentin.ply", core)
+    share = share_of_enamel(core)
+    scores = []
+    for number, light in enumerate(lights):
+        described = nested_scene({"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}, TISSUE, (camera,), light, INTENSITY)
+        for name in ("medium_enamel", "medium_dentin"):
+            described[name]["albedo"] = volume(share * TISSUE.enamel.alpha + (1 - share) * TISSUE.dentin.alpha)
+            described[name]["phase"]["weight"] = volume(1 - (share * TISSUE.enamel.beta + (1 - share) * TISSUE.dentin.beta))
+        mean, variance = render_batches(load_scene(described), 0, samples=2048, seed=31 + number, batches=BATCHES)
+        scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
+    require_same_pictures(np.stack(scores), least=500)
+
+
+def share_of_enamel(core: Mesh, cells: int = 64) -> NDArray[np.float64]:
+    """l = logistic(8 q / width) at the centres of a box of cells around the tooth, (z, y, x)."""
+    axes = [(np.arange(cells) + 0.5) / cells * 10 - 5] * 3
+    z, y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+    points = np.stack([x, y, z], axis=1)
+    distance = SurfaceDistance(core).closest(points)[1]
+    # The core is convex and centred, so a ray from the middle tells inside from outside.
+    inside = ((points / (SEMI_AXES_MM - 0.7)) ** 2).sum(axis=1) < 1
+    q = np.where(inside, -distance, distance)
+    return (1 / (1 + np.exp(-8 * q / WIDTH_MM))).reshape(cells, cells, cells)
+
+
+def volume(values: NDArray[np.float64]) -> dict[str, Any]:
+    import mitsuba as mi
+
+    grid = mi.VolumeGrid(values[..., None].astype(np.float32))
+    to_world = mi.ScalarTransform4f().translate([-5, -5, -5]).scale(10)
+    return {"type": "gridvolume", "grid": grid, "to_world": to_world, "raw": True, "filter_type": "trilinear"}
