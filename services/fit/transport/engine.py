@@ -43,6 +43,8 @@ class Engine:
         for name, ior, usual in (("ior", recipe.ior, "enamel, 1.631"), ("gums_ior", recipe.gums_ior, "gums, 1.33")):
             if not math.isfinite(ior) or ior < 1:
                 raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
+        if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
+            raise InputError(f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it.")
         prepare_device(threads, recipe.device)
         from services.fit.transport.light_maps import LightMaps
         from services.fit.transport.lights import PointLights
@@ -56,8 +58,6 @@ class Engine:
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
         self._radius_mm = reach_mm
-        if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
-            raise InputError(f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it.")
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
         self._ior = recipe.ior if recipe.boundary == "thin" and refracts else None
         self._lights.maps.trace(self._geometry, self._ior)
