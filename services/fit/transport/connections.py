@@ -19,7 +19,7 @@ from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.stains import FaceCrossing, StainTally
 from services.fit.transport.tally import Tally
 
-MAP_DOUBT = 0.03
+MAP_DOUBT = 0.1
 """Relative error that a light map is trusted not to exceed where it is certain: the share of a connection that shadow rays check."""
 MAP_FAILURE = 0.003
 """The same, relative to the brightest that the vertex could be: no connection goes unchecked."""
