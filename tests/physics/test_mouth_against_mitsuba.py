@@ -14,6 +14,7 @@ import pytest
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import load_scene, render_batches
 from services.fit.transport.engine import Engine
+from services.fit.transport.mouth_maps import MouthMaps
 from services.fit.transport.platform import prepare_device
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import LIGHTS_MM, MOUTH, mouth_recipe, stock_mouth
@@ -33,3 +34,16 @@ def test_the_small_mouth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
         mean, variance = render_batches(stock, 0, samples=2048, seed=71 + number, batches=BATCHES)
         scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
     require_same_pictures(np.stack(scores), least=500)
+
+
+def test_coarser_tables_of_larger_scenes_change_the_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = whole_view(camera_at((0.1, 1, 0.2), size=12, span_mm=15.0))
+    fine = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=5, batches=BATCHES)
+    monkeypatch.setattr(MouthMaps, "MOST_BYTES", 2**14)
+    monkeypatch.setattr("services.fit.transport.clearance.MOST_CELLS", 2000)
+    coarse = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=6, batches=BATCHES)
+    # One pixel is independent of the next; its two lights are not.
+    spread = np.sqrt(sum(image.variance.sum(axis=1) for image in (fine, coarse)))
+    assert (np.abs(fine.mean.sum(axis=1) - coarse.mean.sum(axis=1)) < 4 * spread).all()
+    assert (spread < 0.01 * fine.mean.sum(axis=1)).all()
+    assert coarse.variance.sum() > fine.variance.sum()

@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 CELL_MM = 0.1
-SAMPLE_SPACING_MM = 0.03
-"""Surfaces are sampled so densely that no surface point is farther than this from a sample."""
+MOST_CELLS = 6_000_000
+"""Larger scenes have larger cells."""
+SPACING_PER_CELL = 0.3
+"""Surfaces are sampled so densely that no surface point is farther than this from a sample, over the size of a cell."""
 REBUILD_MM = 0.1
 """A border that moved less than this only lowers the bound; one that moved more is measured again."""
 
 
-def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Points on every triangle, none of whose points is farther than SAMPLE_SPACING_MM from one of them."""
+def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float) -> NDArray[np.float64]:
+    """Points on every triangle, none of whose points is farther than the spacing from one of them."""
     corners = vertices_mm[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # A sub-triangle of edge e has no point farther than e / sqrt(3) from its nearest corner.
-    parts = np.maximum(1, np.ceil(longest / (np.sqrt(3) * SAMPLE_SPACING_MM)).astype(int))
+    parts = np.maximum(1, np.ceil(longest / (np.sqrt(3) * spacing_mm)).astype(int))
     points = [vertices_mm]
     for count in np.unique(parts[parts > 1]):
         i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
@@ -34,11 +36,14 @@ def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) 
 
 
 class Clearance:
-    """Lower bound of the distance to any surface of a tooth, inside its outer surface."""
+    """Lower bound of the distance to any surface, inside solids."""
 
-    def __init__(self, outer_vertices_mm: NDArray[np.float64], outer_faces: NDArray[np.int32]) -> None:
-        low = outer_vertices_mm.min(axis=0)
-        self._shape = np.ceil((outer_vertices_mm.max(axis=0) - low) / CELL_MM).astype(int) + 1
+    def __init__(self, outer_vertices_mm: NDArray[np.float64], outer_faces: NDArray[np.int32], solids_mm: NDArray[np.float64] | None = None) -> None:
+        """Take the surfaces that never move, and the solids' vertices (V, 3) where not all of those bound one."""
+        solids_mm = outer_vertices_mm if solids_mm is None else solids_mm
+        low, extent = solids_mm.min(axis=0), np.ptp(solids_mm, axis=0)
+        self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MOST_CELLS)))
+        self._shape = np.ceil(extent / self._cell_mm).astype(int) + 1
         self._corner = low
         self._outer = self._distance(outer_vertices_mm, outer_faces)
         self._inner: NDArray[np.float64] | None = None
@@ -56,12 +61,13 @@ class Clearance:
 
     def _distance(self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
         empty = np.ones(self._shape, dtype=bool)
-        cells = ((surface_samples(vertices_mm, faces) - self._corner) / CELL_MM).astype(int)
+        spacing = SPACING_PER_CELL * self._cell_mm
+        cells = np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int)
         kept = ((cells >= 0) & (cells < self._shape)).all(axis=1)
         empty[tuple(cells[kept].T)] = False
         # From cell centre to cell centre; a sample may sit in its cell's corner.
-        between_centres = ndimage.distance_transform_edt(empty, sampling=CELL_MM)
-        return np.asarray(between_centres - np.sqrt(3) / 2 * CELL_MM - SAMPLE_SPACING_MM).reshape(-1)
+        between_centres = ndimage.distance_transform_edt(empty, sampling=self._cell_mm)
+        return np.asarray(between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing).reshape(-1)
 
     def _upload(self, bound: NDArray[np.float64]) -> None:
         self._table = mi.Float(bound.astype(np.float32))
@@ -69,12 +75,12 @@ class Clearance:
 
     def __call__(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Bound at ``point``, mm; not positive where nothing is known."""
-        cell = mi.Point3f(point - self._low) * (1 / CELL_MM)
+        cell = mi.Point3f(point - self._low) * (1 / self._cell_mm)
         index = dr.floor(cell)
         inside = active
         for k in range(3):
             inside &= (index[k] >= 0) & (index[k] < int(self._shape[k]))
         x, y, z = (mi.UInt32(dr.maximum(index[k], 0)) for k in range(3))
         flat = (x * int(self._shape[1]) + y) * int(self._shape[2]) + z
-        offset = dr.norm(cell - index - 0.5) * CELL_MM
+        offset = dr.norm(cell - index - 0.5) * self._cell_mm
         return dr.select(inside, dr.gather(mi.Float, self._table, flat, inside) - offset, 0)

@@ -9,6 +9,7 @@ Stamminger 2003, here as a control variate).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -107,7 +108,7 @@ class LightMaps:
         # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the map is not certain.
         half_mm = float((radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max())
         self.count = len(positions_mm)
-        self.texel_mm = max(TEXEL_MM, 2 * half_mm / np.sqrt(self.MOST_BYTES / (4 * self.WORDS * self.count)))
+        self.texel_mm = max(TEXEL_MM, 2 * half_mm / math.sqrt(self.MOST_BYTES / (4 * self.WORDS * self.count)))
         self.size = 2 * int(np.ceil(half_mm / self.texel_mm)) + 3
 
         helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

@@ -54,7 +54,8 @@ class MeshGeometry:
         numbers = [*fixed, *(self.teeth + k for k in self._dentins)]
         self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
 
-        self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32))
+        solids_mm = np.concatenate([mesh.vertices_mm for mesh in (*(tooth.outer for tooth in recipe.teeth), *([recipe.gums] if recipe.gums else []))])
+        self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32), solids_mm)
         self.mixing = recipe.border_width_mm > 0 and bool(self._dentins)
         self._border = MixedBorder(recipe.border_width_mm) if self.mixing else None
         self.textures: StainTextures | None = None
