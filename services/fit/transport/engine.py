@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import InputError
+from services.core.errors import InputError, NonFiniteError
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.checks import require_finite, require_lights, require_view
+from services.fit.transport.checks import require_cotangent, require_finite, require_lights, require_view
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, View
 from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
 
 if TYPE_CHECKING:
     from services.fit.transport.lights import PointLights
     from services.fit.transport.media import Media
     from services.fit.transport.scores import Plan
+    from services.fit.transport.shape_gradient import ShapeGradients
     from services.fit.transport.starts import CameraStart
     from services.fit.transport.walk import Walk
 
@@ -53,6 +54,7 @@ class Engine:
         maps = LightMaps(recipe.light_positions_mm, recipe.light_intensities, recipe.outer.vertices_mm)
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
+        self._shape_gradients: ShapeGradients | None = None
         self._radius_mm = reach_mm
         self._ior = recipe.ior if recipe.boundary == "thin" and recipe.ior != 1 else None
         self._lights.maps.trace(self._geometry, self._ior)
@@ -136,6 +138,42 @@ class Engine:
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
         return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
 
+    def shape_gradient(
+        self, tissue: Tissue, view: View, cotangent: NDArray[np.float64], *, seed: int, samples: int, photons: int | None = None, order: int = 5
+    ) -> ShapeGradient:
+        """Derivatives of sum(cotangent x images) to all weights of the dentin's shape, with far less noise than the Jacobian's.
+
+        Light and importance on the border (``border_series``) instead of single paths. It has a bias: the series ends at ``order``, and light
+        is averaged over patches of the border.
+
+        Args:
+            cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view does not list do not count.
+            samples: walks per pixel, rounded up to whole batches.
+            photons: per light, likewise; by default as many in all as there are walks.
+            order: of the spherical harmonics, 1 to 9.
+
+        Raises:
+            InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not finite.
+            NonFiniteError: the result is NaN or infinite.
+        """
+        from services.fit.transport.shape_gradient import ShapeGradients
+
+        cotangent = np.asarray(cotangent, dtype=np.float64)
+        if self._geometry.modes == 0:
+            raise InputError("The scene's dentin has no shape modes, so there is no gradient to its shape; build it from a blend shape.")
+        if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
+            raise InputError(f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them.")
+        self._prepare(tissue, view)
+        require_cotangent(cotangent, view, self.recipe)
+        if self._shape_gradients is None:
+            self._shape_gradients = ShapeGradients(self._geometry, self._ior, self._radius_mm)
+        lights = len(view.lights or self.recipe.light_positions_mm)
+        photons = photons or -(-samples * len(view) // lights)
+        found = self._shape_gradients(tissue, view, cotangent, seed=seed, samples=samples, photons=photons, order=order)
+        if not np.isfinite([found.gradient, found.variance]).all():
+            raise NonFiniteError(f"The shape gradient of camera {view.camera.name} came out non-finite; report the parameters.")
+        return found
+
     def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> NDArray[np.float64]:
         """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
 
@@ -155,10 +193,9 @@ class Engine:
     def _parts(self) -> tuple[str, ...]:
         return ("enamel",) if self.recipe.dentin is None else ("enamel", "dentin")
 
-    def _trace(self, tissue: Tissue, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
-        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
-        from services.fit.transport.media import Media, require_medium
-        from services.fit.transport.starts import CameraStart
+    def _prepare(self, tissue: Tissue, view: View) -> list[Medium]:
+        """Refuse what cannot be rendered, and give the dentin its shape; returns the media."""
+        from services.fit.transport.media import require_medium
 
         require_view(view, self.recipe)
         media: list[Medium] = [getattr(tissue, part) for part in self._parts()]
@@ -170,8 +207,15 @@ class Engine:
         if self._geometry.reshape(tissue.shape):
             self._lights.maps.trace(self._geometry, self._ior)
             self._some_lights.clear()
+        return media
 
-        lights, kernel_media = self._lights_of(view), Media(media)
+    def _trace(self, tissue: Tissue, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
+        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
+        from services.fit.transport.media import Media
+        from services.fit.transport.starts import CameraStart
+
+        kernel_media = Media(self._prepare(tissue, view))
+        lights = self._lights_of(view)
         bins = max(len(plan.order_edges) - 1, 1)
         slots = lights.count * bins
         tables = 1 + len(plan.scores) + (self._geometry.modes if plan.shape else 0)

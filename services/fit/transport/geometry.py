@@ -117,6 +117,13 @@ class MeshGeometry:
             self._build(tuple(shape))
         return changed
 
+    def dentin_areas_mm2(self) -> NDArray[np.float64]:
+        """Areas of the dentin's triangles at the present shape."""
+        assert self.shape is not None
+        assert self._current is not None
+        corners = self.shape.vertices_mm(self._current)[self.shape.base.faces]
+        return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2)
+
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the place
         """Next surface, by ray tracing."""
         ray = mi.Ray3f(origin, direction)
