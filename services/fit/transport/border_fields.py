@@ -1,7 +1,7 @@
 """Light on the dentin's border, gathered by photons, and the camera's walks that meet it.
 
-Both count where they cross the border, by 1 / |n . w|, and expand the direction in spherical harmonics (``border_series``). No path connects to a light or
-to another path, so both walks are cheap, and a product of their sums stands for all pairs of them.
+Both count where they cross the border, by 1 / |n . w|, and expand directions in spherical harmonics (``border_series``). Light that has not collided keeps
+its one direction instead. No path connects to a light or to another path, so both walks are cheap, and a product of their sums stands for all pairs.
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ FIXED_POINT = 2.0**36
 """Units of the table of light per unit of weight: fine against single precision, and 1e8 before it overflows."""
 
 Array = NDArray[np.float64]
+
+
+def harmonics(directions: Array, order: int) -> NDArray[np.float32]:
+    """Real spherical harmonics of unit vectors (N, 3): (N, (order + 1)^2)."""
+    values = dr.sh_eval(mi.Vector3f(directions.T.astype(np.float32)), order)
+    return np.stack([np.broadcast_to(np.array(value), len(directions)) for value in values], axis=1)
 
 
 def per_cosine(cosine: mi.Float) -> mi.Float:
@@ -51,7 +57,7 @@ class BorderWalk(Walk):
         super().__init__(geometry, media, None, start, Plan(), ior)
         self.mesh, self.texels, self.order = geometry, texels, order
         self.columns = (order + 1) ** 2 + 1
-        """Of a table: the harmonics, and what has not collided."""
+        """Of a table: harmonics of what has collided, and one for what has not."""
 
     def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
         crosses = flight.meets & ~flight.reflects & ~flight.hit.outer
@@ -83,7 +89,7 @@ class LightWalk(BorderWalk):
         dr.make_opaque(self.table)
 
     def gather(self, samples: int) -> NDArray[np.float32]:
-        """Mean radiance on texels in spherical harmonics, and the uncollided part's integral over directions: (L, batches, texels, columns)."""
+        """Mean radiance on texels, in spherical harmonics what has collided, integrated over directions what has not: (L, batches, texels, columns)."""
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.table)
         dr.sync_thread()
@@ -100,7 +106,7 @@ class LightWalk(BorderWalk):
         first = (self.photons.group(lane) * self.texels.count + self._texel(hit, crosses)) * self.columns
         units = strength * FIXED_POINT
         for k, harmonic in enumerate(dr.sh_eval(omega, self.order)):
-            dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses)
+            dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses & ~fresh)
         dr.scatter_add(self.table, mi.Int64(units), first + self.columns - 1, crosses & fresh)
 
 
@@ -117,7 +123,7 @@ class CameraWalk(BorderWalk):
         coefficients: Array,
         light: NDArray[np.float32],
     ) -> None:
-        """Take c_j (order + 1,), and light as (N, batches, texels, columns), the last column the change that uncollided crossings add."""
+        """Take c_j (order + 1,), and light as (N, batches, texels, columns): harmonics to meet crossings, and what uncollided ones, of one direction, meet."""
         super().__init__(geometry, media, start, texels, len(coefficients) - 1, ior)
         self.pixels, self.light_batches = light.shape[:2]
         self.shape_modes = geometry.modes
@@ -142,7 +148,7 @@ class CameraWalk(BorderWalk):
             first = ((lane % self.pixels * self.light_batches + batch) * self.texels.count + texel) * self.columns
             change = dr.gather(mi.Float, self.light, first + self.columns - 1, crosses & fresh)
             for k, harmonic in enumerate(weighted):
-                change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses), change)
+                change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~fresh), change)
             for mode, speed in enumerate(speeds):
                 slot = (lane * self.light_batches + batch) * self.shape_modes + mode
                 dr.scatter_add(self.sums, mi.Float64(-strength * speed * change), slot, crosses, mode=dr.ReduceMode.NoConflicts)

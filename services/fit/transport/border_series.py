@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -27,26 +26,24 @@ LLOYD_ROUNDS = 10
 
 @dataclass(frozen=True)
 class BorderSeries:
-    """The series to a finite order, of which the last counts half: the mean of the last two partial sums, as terms alternate where light is sent back."""
+    """The series of two media, and what stands in its place where it would not converge."""
 
     enamel: Medium
     dentin: Medium
-    order: int
 
-    def coefficients(self) -> Array:
-        """c_j for j = 0 ... order, per mm."""
-        j = np.arange(self.order + 1)
+    def coefficients(self, order: int) -> Array:
+        """c_j for j = 0 ... order, per mm, the last one halved: the mean of the last two partial sums, as terms alternate where light is sent back."""
+        j = np.arange(order + 1)
         terms = _attenuation(self.dentin, j) - _attenuation(self.enamel, j)
-        terms[-1] *= 0.5 if self.order else 1.0
+        terms[-1] *= 0.5 if order else 1.0
         return terms
 
     def uncollided(self, cosine: Array) -> Array:
-        """What the series lacks for light that arrives, and is seen, without a collision, per mm and sr, at the cosine between the two directions.
+        """sum_jk c_j Y_jk Y_jk between light that arrives and light that is seen in one direction each, per mm and sr, at the cosine between the two.
 
-        There the series would not converge. Unless both are one line extinction takes nothing, and what scatters is the phase function's own value.
+        Unless both are one line, extinction takes nothing, and what scatters is the phase function's own value.
         """
-        terms = self.coefficients() * (2 * np.arange(self.order + 1) + 1) / (4 * np.pi)
-        return _scattered(self.enamel, cosine) - _scattered(self.dentin, cosine) - legendre.legval(cosine, terms)
+        return _scattered(self.enamel, cosine) - _scattered(self.dentin, cosine)
 
 
 def _attenuation(medium: Medium, j: NDArray[np.int64]) -> Array:

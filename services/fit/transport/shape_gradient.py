@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics.parameters import Tissue
-from services.fit.transport.border_fields import CameraWalk, LightWalk, Texels
+from services.fit.transport.border_fields import CameraWalk, LightWalk, Texels, harmonics
 from services.fit.transport.border_series import BorderSeries, patches
 from services.fit.transport.geometry import MeshGeometry
 from services.fit.transport.media import Media
@@ -16,7 +16,9 @@ from services.fit.transport.starts import CameraStart, LightStart
 Array = NDArray[np.float64]
 TEXEL_MM2 = 0.8
 """Smaller texels hold more noise, larger ones mix light that differs."""
-LIGHT_BATCHES = 8
+UNCOLLIDED_ORDER = 7
+"""Of the series where the camera's line, or light's, has not collided: there it converges more slowly, and is less noisy."""
+LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
 """Numbers in a table of light by pixel, about 200 MB; more pixels are done in turn."""
@@ -34,41 +36,53 @@ class ShapeGradients:
     def __call__(self, tissue: Tissue, view: View, cotangent: Array, *, seed: int, samples: int, photons: int, order: int) -> ShapeGradient:
         """See ``Engine.shape_gradient``; all arguments are checked, and the geometry has the tissue's shape."""
         light_seed, camera_seed = (int(number) for number in np.random.SeedSequence(seed).generate_state(2))
-        media, series = Media([tissue.enamel, tissue.dentin]), BorderSeries(tissue.enamel, tissue.dentin, order)
+        media, series = Media([tissue.enamel, tissue.dentin]), BorderSeries(tissue.enamel, tissue.dentin)
         texels = Texels(self._patches, self.geometry.dentin_areas_mm2())
         chosen = list(range(len(self.recipe.light_positions_mm)) if view.lights is None else view.lights)
-        table = self._light(media, texels, chosen, photons, order, light_seed)
+        table = self._light(media, texels, chosen, photons, light_seed)
+        lights = self.recipe.light_positions_mm[chosen]
+        arriving = -lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
         per_batch = -(-samples // CAMERA_BATCHES)
         slice_size = max(1, TABLE_BUDGET // (LIGHT_BATCHES * texels.count * table.shape[-1]))
         crossed = np.zeros((CAMERA_BATCHES, LIGHT_BATCHES, self.geometry.modes))
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
-            light = self._light_of_pixels(table, series, piece, chosen, cotangent[chosen, first : first + slice_size])
+            light = self._light_of_pixels(table, series, order, piece, arriving, cotangent[chosen, first : first + slice_size])
             start = CameraStart(piece, CAMERA_BATCHES, camera_seed, self.radius_mm)
-            sums = CameraWalk(self.geometry, media, start, texels, self.ior, series.coefficients(), light).meet(per_batch)
+            sums = CameraWalk(self.geometry, media, start, texels, self.ior, series.coefficients(order), light).meet(per_batch)
             crossed += sums.reshape(CAMERA_BATCHES, len(piece), LIGHT_BATCHES, -1).sum(axis=1) / per_batch
         return ShapeGradient(*crossed_mean(crossed), samples=per_batch * CAMERA_BATCHES)
 
-    def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int) -> NDArray[np.float32]:
+    def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, seed: int) -> NDArray[np.float32]:
         per_group = -(-photons // LIGHT_BATCHES)
         lanes = min(MOST_LANES_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]
         start = LightStart(positions, intensities, self.recipe.outer.vertices_mm, LIGHT_BATCHES, lanes, seed)
-        return LightWalk(self.geometry, media, start, texels, order, self.ior).gather(-(-per_group // lanes))
+        return LightWalk(self.geometry, media, start, texels, UNCOLLIDED_ORDER, self.ior).gather(-(-per_group // lanes))
 
-    def _light_of_pixels(self, table: NDArray[np.float32], series: BorderSeries, view: View, chosen: list[int], weights: Array) -> NDArray[np.float32]:
-        """Light weighted by the cotangent (L, N): (N, batches, texels, columns)."""
-        lights = self.recipe.light_positions_mm[chosen]
-        light = np.tensordot(weights.T.astype(np.float32), table, axes=1)
-        # Both directions as from the tooth's middle.
-        arriving = -lights / np.linalg.norm(lights, axis=1, keepdims=True)
-        correction = weights * series.uncollided(-arriving @ _seen_along(view).T)
-        light[..., -1] = np.tensordot(correction.T.astype(np.float32), table[..., -1], axes=1)
+    def _light_of_pixels(
+        self, table: NDArray[np.float32], series: BorderSeries, order: int, view: View, arriving: Array, weights: Array
+    ) -> NDArray[np.float32]:
+        """Light weighted by the cotangent (L, N), as a ``CameraWalk`` meets it: (N, batches, texels, columns).
+
+        ``arriving`` are directions of uncollided light, (L, 3). These and the pixels' own are taken as from the tooth's middle.
+        """
+        collided, uncollided, columns = table[..., :-1], table[..., -1], (order + 1) ** 2
+        seen, weighting = -_along(view), weights.T.astype(np.float32)
+        light = np.empty((len(view), *table.shape[1:3], columns + 1), dtype=np.float32)
+        one_direction = harmonics(arriving, order)[:, None, None]
+        light[..., :-1] = np.tensordot(weighting, collided[..., :columns] + uncollided[..., None] * one_direction, axes=1)
+
+        # What meets a pixel's own uncollided line: collided light by a longer series, uncollided light by the phase function.
+        factors = np.repeat(series.coefficients(UNCOLLIDED_ORDER), 2 * np.arange(UNCOLLIDED_ORDER + 1) + 1)
+        light[..., -1] = np.einsum("nbtk,nk->nbt", np.tensordot(weighting, collided, axes=1), harmonics(seen, UNCOLLIDED_ORDER) * factors)
+        exact = weights * series.uncollided(arriving @ seen.T)
+        light[..., -1] += np.tensordot(exact.T.astype(np.float32), uncollided, axes=1)
         return light
 
 
-def _seen_along(view: View) -> Array:
+def _along(view: View) -> Array:
     """Unit directions from the camera through the pixels' middles, (N, 3)."""
     rotation = np.asarray(view.camera.camera_from_world)[:3, :3]
     middles = np.concatenate([view.pixels + 0.5, np.ones((len(view), 1))], axis=1)
