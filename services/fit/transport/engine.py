@@ -139,7 +139,7 @@ class Engine:
         return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
 
     def shape_gradient(
-        self, tissue: Tissue, view: View, cotangent: NDArray[np.float64], *, seed: int, samples: int, photons: int | None = None, order: int = 4
+        self, tissue: Tissue, view: View, cotangent: NDArray[np.float64], *, seed: int, samples: int, photons: int | None = None, order: int = 5
     ) -> ShapeGradient:
         """Derivatives of sum(cotangent x images) to all weights of the dentin's shape, with far less noise than the Jacobian's.
 
