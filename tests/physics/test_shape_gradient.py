@@ -90,7 +90,7 @@ def test_lights_that_the_view_does_not_list_do_not_count() -> None:
         ({"cotangent": np.full((5, 16), np.nan)}, "finite"),
         ({"samples": 0}, "at least 1"),
         ({"photons": 0}, "at least 1"),
-        ({"order": 8}, "order"),
+        ({"order": 10}, "order"),
     ],
 )
 def test_refusals_are_sentences(change: dict[str, object], words: str) -> None:

@@ -150,7 +150,7 @@ class Engine:
             cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view does not list do not count.
             samples: walks per pixel, rounded up to whole batches.
             photons: per light, likewise; by default as many in all as there are walks.
-            order: of the spherical harmonics, 1 to 7.
+            order: of the spherical harmonics, 1 to 9.
 
         Raises:
             InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not finite.
@@ -161,8 +161,8 @@ class Engine:
         cotangent = np.asarray(cotangent, dtype=np.float64)
         if self._geometry.modes == 0:
             raise InputError("The scene's dentin has no shape modes, so there is no gradient to its shape; build it from a blend shape.")
-        if not 1 <= order <= 7 or samples < 1 or (photons is not None and photons < 1):
-            raise InputError(f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 7; correct them.")
+        if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
+            raise InputError(f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them.")
         self._prepare(tissue, view)
         require_cotangent(cotangent, view, self.recipe)
         if self._shape_gradients is None:

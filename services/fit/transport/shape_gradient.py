@@ -14,10 +14,8 @@ from services.fit.transport.recipe import ShapeGradient, View
 from services.fit.transport.starts import CameraStart, LightStart
 
 Array = NDArray[np.float64]
-TEXEL_MM2 = 0.8
+TEXEL_MM2 = 2.0
 """Smaller texels hold more noise, larger ones mix light that differs."""
-UNCOLLIDED_ORDER = 7
-"""Of the series where the camera's line, or light's, has not collided: there it converges more slowly, and is less noisy."""
 LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
@@ -39,7 +37,7 @@ class ShapeGradients:
         media, series = Media([tissue.enamel, tissue.dentin]), BorderSeries(tissue.enamel, tissue.dentin)
         texels = Texels(self._patches, self.geometry.dentin_areas_mm2())
         chosen = list(range(len(self.recipe.light_positions_mm)) if view.lights is None else view.lights)
-        table = self._light(media, texels, chosen, photons, light_seed)
+        table = self._light(media, texels, chosen, photons, order, light_seed)
         lights = self.recipe.light_positions_mm[chosen]
         arriving = -lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
@@ -54,12 +52,12 @@ class ShapeGradients:
             crossed += sums.reshape(CAMERA_BATCHES, len(piece), LIGHT_BATCHES, -1).sum(axis=1) / per_batch
         return ShapeGradient(*crossed_mean(crossed), samples=per_batch * CAMERA_BATCHES)
 
-    def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, seed: int) -> NDArray[np.float32]:
+    def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int) -> NDArray[np.float32]:
         per_group = -(-photons // LIGHT_BATCHES)
         lanes = min(MOST_LANES_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]
         start = LightStart(positions, intensities, self.recipe.outer.vertices_mm, LIGHT_BATCHES, lanes, seed)
-        return LightWalk(self.geometry, media, start, texels, UNCOLLIDED_ORDER, self.ior).gather(-(-per_group // lanes))
+        return LightWalk(self.geometry, media, start, texels, order, self.ior).gather(-(-per_group // lanes))
 
     def _light_of_pixels(
         self, table: NDArray[np.float32], series: BorderSeries, order: int, view: View, arriving: Array, weights: Array
@@ -68,17 +66,18 @@ class ShapeGradients:
 
         ``arriving`` are directions of uncollided light, (L, 3). These and the pixels' own are taken as from the tooth's middle.
         """
-        collided, uncollided, columns = table[..., :-1], table[..., -1], (order + 1) ** 2
-        seen, weighting = -_along(view), weights.T.astype(np.float32)
-        light = np.empty((len(view), *table.shape[1:3], columns + 1), dtype=np.float32)
-        one_direction = harmonics(arriving, order)[:, None, None]
-        light[..., :-1] = np.tensordot(weighting, collided[..., :columns] + uncollided[..., None] * one_direction, axes=1)
+        seen, weighting, uncollided = -_along(view), weights.T.astype(np.float32), table[..., -1]
+        light = np.tensordot(weighting, table, axes=1)
 
-        # What meets a pixel's own uncollided line: collided light by a longer series, uncollided light by the phase function.
-        factors = np.repeat(series.coefficients(UNCOLLIDED_ORDER), 2 * np.arange(UNCOLLIDED_ORDER + 1) + 1)
-        light[..., -1] = np.einsum("nbtk,nk->nbt", np.tensordot(weighting, collided, axes=1), harmonics(seen, UNCOLLIDED_ORDER) * factors)
+        # What meets a pixel's own uncollided line: collided light by the series, uncollided light by the phase function.
+        factors = np.repeat(series.coefficients(order), 2 * np.arange(order + 1) + 1)
         exact = weights * series.uncollided(arriving @ seen.T)
+        light[..., -1] = np.einsum("nbtk,nk->nbt", light[..., :-1], harmonics(seen, order) * factors)
         light[..., -1] += np.tensordot(exact.T.astype(np.float32), uncollided, axes=1)
+
+        # What meets all others: uncollided light by the series too.
+        for k, column in enumerate(harmonics(arriving, order).T):
+            light[..., k] += np.tensordot(weighting * column, uncollided, axes=1)
         return light
 
 
