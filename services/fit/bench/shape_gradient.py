@@ -1,11 +1,13 @@
 """The derivative to the dentin's shape against central differences with the engine itself.
 
-The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would show for dentin of another shape; so
-both sides are linear estimates whose variance falls as 1 / paths. Ours is one Jacobian pass (both border terms) for all modes; the peer is two image
-passes per mode with common random numbers, the surfaces already in place.
+The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would show for dentin of another shape.
+Ours is one ``shape_gradient`` for all modes, photons and camera walks included. One Jacobian pass (both border terms), for all modes too, stands beside it as
+a row of its own. The peer is two image passes per mode with common random numbers, the surfaces already in place.
 
-Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps and to our own
-derivative. Asked for an error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step.
+Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps. Asked for an
+error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step. Ours has a bias too, of its series and its texels: the
+distance to the peer's D(0), charged where it is more than noise. Part of our variance falls as 1 / paths squared (photons times walks), so more paths than
+taken here would favour ours.
 """
 
 from __future__ import annotations
@@ -36,18 +38,29 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
     """By tissue and mode: our row, the peer's at every step, and its summary at the best one."""
     stack = incisor_stack(18 if quick else 54)
     engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
-    samples, repeats = (32, 3) if quick else (64, 4)
+    samples, repeats = (32, 3) if quick else (64, 16)
+    walks, gradients = (256, 4) if quick else (1024, 8)
     rows: list[GradientRow] = []
     for name, media in TISSUES.items():
         tissue = replace(media, shape=SHAPE)
         view = stack.tooth_view(engine, tissue)
         other = engine.images(replace(media, shape=OTHER_SHAPE), view, samples=2 * samples, seed=7).mean
         picture = engine.images(tissue, view, samples=2 * samples, seed=7).mean - other
-        ours = _scores(engine, tissue, view, picture, samples, repeats)
+        ours = _gradients(engine, tissue, view, picture, walks, gradients)
+        scores = _scores(engine, tissue, view, picture, samples, min(repeats, 4))
         for mode in range(1 if quick else len(SHAPE)):
             differences = {h: _differences(engine, tissue, view, mode, h, picture, samples, repeats) for h in STEPS}
-            rows += _compare(name, mode, samples, ours[mode], differences)
+            rows += _compare(name, mode, (walks, samples), ours[mode], scores[mode], differences)
     return rows
+
+
+def _gradients(engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int) -> list[Estimate]:
+    """The derivative to every mode by light and importance on the border; each is charged its share of the time."""
+    engine.shape_gradient(tissue, view, picture, samples=16, seed=0)
+    begun = time.process_time()
+    found = np.stack([engine.shape_gradient(tissue, view, picture, samples=samples, seed=100 + repeat).gradient for repeat in range(repeats)])
+    seconds = (time.process_time() - begun) / repeats / found.shape[1]
+    return [of_parts(found[:, [mode], None], seconds) for mode in range(found.shape[1])]
 
 
 def _scores(engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int) -> list[Estimate]:
@@ -73,33 +86,36 @@ def _differences(engine: Engine, tissue: Tissue, view: View, mode: int, step: fl
     return of_parts(((sides[0] - sides[1]) * picture).sum(axis=1)[:, None] / (2 * step), seconds)
 
 
-def _compare(tissue: str, mode: int, samples: int, ours: Estimate, differences: dict[float, Estimate]) -> list[GradientRow]:
-    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias.
-    steps = np.array([0.0, *differences])
-    values = np.array([ours.mean[0], *(d.mean[0] for d in differences.values())])
-    spread = np.sqrt([ours.mean_variance[0], *(d.mean_variance[0] for d in differences.values())])
+def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, scores: Estimate, differences: dict[float, Estimate]) -> list[GradientRow]:
+    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias, from their own steps alone.
+    steps = np.array([*differences])
+    values = np.array([d.mean[0] for d in differences.values()])
+    spread = np.sqrt([d.mean_variance[0] for d in differences.values()])
     design = np.stack([np.ones_like(steps), steps**2], axis=1) / spread[:, None]
     covariance = np.linalg.inv(design.T @ design)
-    derivative, bias = covariance @ design.T @ (values / spread)
-    # The square of a noisy k is too large by its variance; what is not resolved counts as no bias, in the peer's favour.
-    bias_squared = max(bias**2 - covariance[1, 1], 0.0)
+    theirs, curvature = covariance @ design.T @ (values / spread)
+    # The square of a noisy number is too large by its variance; what is not resolved counts as no bias, on either side.
+    noise_squared = covariance[0, 0] + ours.mean_variance[0]
+    curvature_squared = max(curvature**2 - covariance[1, 1], 0.0)
+    our_bias_squared = max((theirs - ours.mean[0]) ** 2 - noise_squared, 0.0)
 
+    derivative = np.average([theirs, ours.mean[0]], weights=[1 / covariance[0, 0], 1 / ours.mean_variance[0]])
     wanted = (WANTED_ERROR * derivative) ** 2
-    costs = {h: d.seconds * d.variance[0] / max(wanted - bias_squared * h**4, 1e-300) for h, d in differences.items()}
+    costs = {h: d.seconds * d.variance[0] / max(wanted - curvature_squared * h**4, 1e-300) for h, d in differences.items()}
     best = min(costs, key=lambda h: costs[h])
-    # z against the peer alone: its own D(0), from its own steps.
-    own = np.linalg.inv(design[1:].T @ design[1:])
-    theirs = (own @ design[1:].T @ (values / spread)[1:])[0]
-    z = float((theirs - values[0]) / np.sqrt(own[0, 0] + spread[0] ** 2))
+    our_cost = ours.seconds * ours.variance[0] / max(wanted - our_bias_squared, 1e-300)
+    z = float((theirs - ours.mean[0]) / np.sqrt(noise_squared))
 
-    def row(peer: str, estimate: Estimate) -> GradientRow:
+    def row(peer: str, estimate: Estimate, paths: int) -> GradientRow:
         error = float(np.sqrt(estimate.variance[0]) / abs(derivative))
         return GradientRow(
             benchmark=f"transport-gradient {tissue}", peer=peer, seconds=estimate.seconds, error=error,
-            parameter=f"shape.{mode}", samples=samples, gradient=float(estimate.mean[0]),
+            parameter=f"shape.{mode}", samples=paths, gradient=float(estimate.mean[0]),
         )  # fmt: skip
 
-    rows = [row("dentine", ours), *(row(f"central differences, step {h:g}", d) for h, d in differences.items())]
-    ratio = float(costs[best] * wanted / (ours.seconds * ours.variance[0]))
-    summary = row(f"central differences, step {best:g}", differences[best])
+    walks, paths = samples
+    rows = [row("dentine", ours, walks), row("dentine jacobian", scores, paths)]
+    rows += [row(f"central differences, step {h:g}", d, paths) for h, d in differences.items()]
+    summary = row(f"central differences, step {best:g}", differences[best], paths)
+    ratio = float(costs[best] / our_cost)
     return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient-summary {tissue}", "efficiency_ratio": ratio, "z": z})]

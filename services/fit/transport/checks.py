@@ -83,16 +83,20 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
         raise InputError(f"Camera {name} lists lights = {view.lights}; they must be different indices below {lights}, at least one.")
 
 
-def require_cotangent(cotangent: NDArray[np.float64], view: View, lights: int) -> None:
-    """Refuse weights that are not one finite number for every light and pixel.
+def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneRecipe) -> None:
+    """Refuse weights that are not one finite number for each image's pixel.
 
     Raises:
-        InputError: gives shapes or count.
+        InputError: names the shape, or the first weight that is not finite.
     """
-    if cotangent.shape != (lights, len(view)):
-        raise InputError(f"cotangent has shape {cotangent.shape} and must be ({lights}, {len(view)}), one number for each light and pixel.")
-    if not np.isfinite(cotangent).all():
-        raise InputError(f"cotangent has {int((~np.isfinite(cotangent)).sum())} values that are not finite; mask them with 0.")
+    expected = len(recipe.light_positions_mm), len(view)
+    if np.shape(cotangent) != expected:
+        raise InputError(f"The cotangent has shape {np.shape(cotangent)}; give a weight for each of {expected[0]} lights and {expected[1]} pixels, {expected}.")
+    bad = np.argwhere(~np.isfinite(cotangent))
+    if len(bad):
+        raise InputError(
+            f"The cotangent is {cotangent[tuple(bad[0])]} at light {bad[0][0]} and pixel {bad[0][1]}; give finite weights, 0 for what does not count."
+        )
 
 
 def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:

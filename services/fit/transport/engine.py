@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import InputError
+from services.core.errors import InputError, NonFiniteError
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.checks import require_cotangent, require_finite, require_lights, require_surfaces, require_view
 from services.fit.transport.names import media_of, parameter_names, whitened
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, StainGradient, View
 from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
 
 if TYPE_CHECKING:
     from services.fit.transport.lights import PointLights
     from services.fit.transport.media import Media
     from services.fit.transport.scores import Plan
+    from services.fit.transport.shape_gradient import ShapeGradients
     from services.fit.transport.starts import CameraStart
     from services.fit.transport.walk import Walk
 
@@ -57,6 +58,7 @@ class Engine:
         maps = kind(recipe.light_positions_mm, recipe.light_intensities, recipe.vertices_mm())
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._some_lights: dict[tuple[int, ...], PointLights] = {}
+        self._shape_gradients: dict[int, ShapeGradients] = {}
         self._radius_mm = reach_mm
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
         self._ior = recipe.ior if recipe.boundary == "thin" and refracts else None
@@ -144,6 +146,57 @@ class Engine:
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
         return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
 
+    def shape_gradient(
+        self,
+        tissue: Tissue | Mouth,
+        view: View,
+        cotangent: NDArray[np.float64],
+        *,
+        seed: int,
+        samples: int,
+        photons: int | None = None,
+        order: int = 5,
+        tooth: int = 0,
+    ) -> ShapeGradient:
+        """Derivatives of sum(cotangent x images) to all weights of a tooth's dentin shape, with far less noise than the Jacobian's.
+
+        Light and importance on the border (``border_series``) instead of single paths. It has a bias: the series ends at ``order``, and light
+        is averaged over patches of the border.
+
+        Args:
+            cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view does not list do not count.
+            samples: walks per pixel, rounded up to whole batches.
+            photons: per light, likewise; by default as many in all as there are walks.
+            order: of the spherical harmonics, 1 to 9.
+            tooth: whose dentin moves.
+
+        Raises:
+            InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not finite.
+            NonFiniteError: the result is NaN or infinite.
+        """
+        from services.fit.transport.shape_gradient import ShapeGradients
+
+        cotangent = np.asarray(cotangent, dtype=np.float64)
+        if not 0 <= tooth < len(self.recipe.teeth) or self._geometry.modes_of[tooth] == 0:
+            raise InputError(f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a blend shape.")
+        if self.recipe.border_width_mm > 0:
+            raise InputError(f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take the Jacobian's.")
+        if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
+            raise InputError(f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them.")
+        media, _ = self._prepare(tissue, view)
+        require_cotangent(cotangent, view, self.recipe)
+        moved = tissue if isinstance(tissue, Tissue) else tissue.teeth[tooth]
+        if moved.enamel.table is not None or moved.dentin.table is not None:
+            raise InputError(f"Tooth {tooth} has a phase table, and this gradient needs lobes; give it lobes, or take the Jacobian's.")
+        if tooth not in self._shape_gradients:
+            self._shape_gradients[tooth] = ShapeGradients(self._geometry, tooth, self._ior, self._radius_mm)
+        lights = len(view.lights or self.recipe.light_positions_mm)
+        photons = photons or -(-samples * len(view) // lights)
+        found = self._shape_gradients[tooth](moved, media, view, cotangent, seed=seed, samples=samples, photons=photons, order=order)
+        if not np.isfinite([found.gradient, found.variance]).all():
+            raise NonFiniteError(f"The shape gradient of camera {view.camera.name} came out non-finite; report the parameters.")
+        return found
+
     def order_images(
         self, tissue: Tissue | Mouth, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1
     ) -> NDArray[np.float64]:
@@ -176,7 +229,7 @@ class Engine:
         from services.fit.transport.starts import CameraStart
 
         media, lights = self._prepare(tissue, view)
-        require_cotangent(cotangent, view, len(self.recipe.light_positions_mm))
+        require_cotangent(cotangent, view, self.recipe)
         textures = self._geometry.textures
         if textures is None:
             raise InputError("The scene has no stains to differentiate; give a tooth's tissue a stain.")

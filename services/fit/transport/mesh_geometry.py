@@ -149,6 +149,17 @@ class MeshGeometry:
             return hit.valid & hit.outer
         return hit.valid & (hit.surface < self.teeth) & (self.inside(before) != self.inside(after))
 
+    def first_dentin_face(self, tooth: int) -> int:
+        """Number of the first triangle of a tooth's dentin."""
+        return self.fixed_faces + sum(len(dentin.base.faces) for k, dentin in self._dentins.items() if k < tooth)
+
+    def dentin_areas_mm2(self, tooth: int) -> NDArray[np.float64]:
+        """Areas of the triangles of a tooth's dentin at its present shape."""
+        assert self._shapes is not None
+        dentin = self._dentins[tooth]
+        corners = dentin.vertices_mm(self._shapes[tooth])[dentin.base.faces]
+        return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2)
+
     def _displacement_tables(self) -> list[mi.Float]:
         """B_m - B0 at the corners of every dentin face, a table per mode; zero where a tooth has fewer modes."""
         tables = []

@@ -143,3 +143,13 @@ class JacobianEstimate:
         """The worst of the images and of each derivative, each relative to its own norm: units of parameters do not matter."""
         pairs = [(self.mean, self.variance), *zip(self.jacobian, self.jacobian_variance, strict=True)]
         return float(np.max([relative_error(*pair) for pair in pairs]))
+
+
+@dataclass(frozen=True)
+class ShapeGradient:
+    """Derivatives of a weighted sum of images to the shape modes, (M,), and the variances of these means."""
+
+    gradient: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    samples: int
+    """Paths per pixel behind them."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
 from services.fit.transport.recipe import View
@@ -71,6 +72,60 @@ class CameraStart:
         y = (pixel // self.width) + rng.next_float32()
         omega = dr.normalize(self._columns[0] * x + self._columns[1] * y + self._columns[2])
         return PathStart(rng, dr.fma(omega, self._near, self._eye), omega, mi.UInt32(0), mi.Float(1))
+
+
+class LightStart:
+    """Photons from every light, uniformly over a rectangle that holds the tooth as that light sees it, in batches of their own.
+
+    Weights are near 1; ``power`` says what 1 stands for. Lanes are ordered by light, then by batch: groups.
+    """
+
+    def __init__(
+        self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64], batches: int, lanes_per_group: int, seed: int
+    ) -> None:
+        """Take lights (L, 3) and (L,), and all vertices of the tooth."""
+        self.count, self.batches, self.lanes_per_group = len(positions_mm), batches, lanes_per_group
+        self.groups = self.count * batches
+        self.lanes = self.groups * lanes_per_group
+        distance = np.linalg.norm(positions_mm, axis=1)
+        forward = -positions_mm / distance[:, None]
+        helper = np.where(np.abs(forward[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        right = np.cross(forward, helper)
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        up = np.cross(forward, right)
+
+        # Project the tooth through each light onto the plane across the origin.
+        scale = distance[:, None] / (forward @ outer_mm.T + distance[:, None])
+        across = np.stack([right @ outer_mm.T, up @ outer_mm.T]) * scale
+        low, size = across.min(axis=2), np.ptp(across, axis=2)
+        corner = right * low[0, :, None] + up * low[1, :, None]
+        self.power = intensities * size[0] * size[1] / distance**2
+        """Radiant intensity times the solid angle of each rectangle seen face on, (L,)."""
+        before = np.minimum(np.linalg.norm(outer_mm, axis=1).max() + NEAR_MARGIN_MM, distance)
+        columns = [forward, right * size[0, :, None], up * size[1, :, None], corner, distance[:, None], before[:, None]]
+        self._frames = mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1))
+        self._lanes_per_group = dr.opaque(mi.UInt32, lanes_per_group)
+        self._batches = dr.opaque(mi.UInt32, batches)
+        self.seed = dr.opaque(mi.UInt32, seed)
+        dr.eval(self._frames)
+
+    def group(self, lane: mi.UInt32) -> mi.UInt32:
+        """Light and batch of a lane, as light x batches + batch."""
+        return lane // self._lanes_per_group
+
+    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
+        """A photon on its way to a random point of its light's rectangle."""
+        rng, first = stream(self.seed, lane, sample), self.group(lane) // self._batches * 14
+        forward, right, up, corner = (mi.Vector3f(*(dr.gather(mi.Float, self._frames, first + 3 * k + axis, active) for axis in range(3))) for k in range(4))
+        distance, before = (dr.gather(mi.Float, self._frames, first + k, active) for k in (12, 13))
+        across = corner + right * rng.next_float32() + up * rng.next_float32()
+        squared = dr.squared_norm(across)
+        inverse = dr.rsqrt(squared + dr.square(distance))
+        omega = (across + forward * distance) * inverse
+        # Where the ray is as far from the light as the near plane, without the difference of two long distances.
+        back = before + squared / (dr.rcp(inverse) + distance)
+        cosine = distance * inverse
+        return PathStart(rng, mi.Point3f(across - omega * back), omega, mi.UInt32(0), cosine * cosine * cosine)
 
 
 class SlabStart:

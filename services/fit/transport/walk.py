@@ -21,7 +21,7 @@ from services.fit.transport.lights import PointLights, shadow
 from services.fit.transport.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 from services.fit.transport.scores import Plan, Scatterings, Scores
 from services.fit.transport.stains import FaceCrossing
-from services.fit.transport.starts import CameraStart, SlabStart
+from services.fit.transport.starts import CameraStart, LightStart, SlabStart
 from services.fit.transport.tally import Tally
 
 ROULETTE_WEIGHT = 0.1
@@ -81,7 +81,9 @@ class Flight:
 class Walk:
     """The walk through one geometry under one plan. ``run`` is the only door."""
 
-    def __init__(self, geometry: Geometry, media: Media, lights: PointLights | None, start: CameraStart | SlabStart, plan: Plan, ior: float | None) -> None:
+    def __init__(
+        self, geometry: Geometry, media: Media, lights: PointLights | None, start: CameraStart | LightStart | SlabStart, plan: Plan, ior: float | None
+    ) -> None:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         self.book = Scores(plan, media, mixing=geometry.mixing)
@@ -98,6 +100,12 @@ class Walk:
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
         """Trace ``samples`` paths in every lane; returns their sums, evaluated. A plan for stains brings its own tally."""
         tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
+        self.trace(samples, tally)
+        tally.evaluate()
+        return tally
+
+    def trace(self, samples: int, tally: Tally) -> None:
+        """The loop itself; adds to ``tally`` without evaluating it."""
         limit = dr.opaque(mi.UInt32, samples)
         lane = dr.arange(mi.UInt32, self.start.lanes)
         path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
@@ -129,15 +137,13 @@ class Walk:
         (walker,) = dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
         if self.connections is not None:
             self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
-        tally.evaluate()
-        return tally
 
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
         carried = self._carried(walker)
         flight = self._fly_past_faces(walker, carried, tally) if self.plan.faces else self._fly(walker)
         carried = self._carried(walker)
         self._move(walker, flight, carried)
-        if not self.plan.faces:
+        if self.connections is not None:
             self._connect(walker, flight, tally)
         self._turn(walker, flight)
         ended = self._end(walker, flight)
@@ -168,12 +174,16 @@ class Walk:
             contrast = self.geometry.contrast(self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit))
             mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
             reflects = meets & hit.outer & ~hit.opaque
-            if self.geometry.single:
-                entry = (self.book.order(walker.so_far) == 0) & (medium == 0) & ~walker.secondary
-                walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
-                reflects &= ~entry
-            reflects &= walker.rng.next_float32() < mirrored
+            entry = self._unmirrored(walker, medium)
+            walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
+            reflects &= ~entry & (walker.rng.next_float32() < mirrored)
         return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
+
+    def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
+        """Lanes whose reflection at an outer face is left out."""
+        if not self.geometry.single:
+            return mi.Bool(False)
+        return (self.book.order(walker.so_far) == 0) & (medium == 0) & ~walker.secondary
 
     def _fly_past_faces(self, walker: Walker, carried: mi.Float, tally: Tally) -> Flight:
         medium = self.geometry.medium(walker.place)

@@ -1,0 +1,158 @@
+"""Light on the dentin's border, gathered by photons, and the camera's walks that meet it.
+
+Both count where they cross the border, by 1 / |n . w|, and expand directions in spherical harmonics (``border_series``). Light that has not collided keeps
+its one direction instead. No path connects to a light or to another path, so both walks are cheap, and a product of their sums stands for all pairs.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.transport.geometry import Hit
+from services.fit.transport.media import Media
+from services.fit.transport.mesh_geometry import MeshGeometry
+from services.fit.transport.scores import Plan
+from services.fit.transport.starts import CameraStart, LightStart
+from services.fit.transport.tally import Tally
+from services.fit.transport.walk import Flight, Walk, Walker
+
+GRAZING_COSINE = 0.2
+"""A crossing with less |n . w| counts with the mean of 1 / |n . w| below it, 2 / this, exact where radiance is constant there: 1 / |n . w| itself has a
+logarithmically divergent second moment."""
+FIXED_POINT = 2.0**36
+"""Units of the table of light per unit of weight: fine against single precision, and 1e8 before it overflows."""
+
+Array = NDArray[np.float64]
+
+
+def harmonics(directions: Array, order: int) -> NDArray[np.float32]:
+    """Real spherical harmonics of unit vectors (N, 3): (N, (order + 1)^2)."""
+    values = dr.sh_eval(mi.Vector3f(directions.T.astype(np.float32)), order)
+    return np.stack([np.broadcast_to(np.array(value), len(directions)) for value in values], axis=1)
+
+
+def per_cosine(cosine: mi.Float) -> mi.Float:
+    """1 / |cosine|, or its mean where that is grazing."""
+    size = dr.abs(cosine)
+    return dr.select(size < GRAZING_COSINE, 2 / GRAZING_COSINE, dr.rcp(dr.maximum(size, GRAZING_COSINE)))
+
+
+class Texels:
+    """Patches of the border over which light is averaged."""
+
+    def __init__(self, of_face: NDArray[np.int64], areas_mm2: Array, tooth: int) -> None:
+        """Take the patch of each triangle of a tooth's dentin, and its area."""
+        self.tooth = tooth
+        self.count = int(of_face.max()) + 1
+        self.areas_mm2 = np.bincount(of_face, areas_mm2)
+        self.of_face = mi.UInt32(of_face.astype(np.uint32))
+        dr.eval(self.of_face)
+
+
+class BorderWalk(Walk):
+    """The walk without connections, which instead counts its crossings of the border."""
+
+    def __init__(self, geometry: MeshGeometry, media: Media, start: CameraStart | LightStart, texels: Texels, order: int, ior: float | None) -> None:
+        super().__init__(geometry, media, None, start, Plan(), ior)
+        self.mesh, self.texels, self.order = geometry, texels, order
+        self.columns = (order + 1) ** 2 + 1
+        """Of a table: harmonics of what has collided, and one for what has not."""
+
+    def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
+        crosses = flight.meets & ~flight.reflects & ~flight.hit.outer
+        if not self.mesh.single:
+            crosses &= flight.hit.surface == self.mesh.teeth + self.texels.tooth
+        strength = carried * per_cosine(dr.dot(walker.omega, flight.hit.normal))
+        fresh = self.book.order(walker.so_far) == 0
+
+        def count(lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> mi.UInt32:
+            self._count(lane, hit, omega, strength, fresh, crosses)
+            return lane
+
+        dr.if_stmt((walker.lane, flight.hit, walker.omega, strength, fresh, crosses), crosses, count, lambda lane, *_: lane, label="border")
+        super()._move(walker, flight, carried)
+
+    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+        raise NotImplementedError
+
+    def _texel(self, hit: Hit, active: mi.Bool) -> mi.UInt32:
+        return dr.gather(mi.UInt32, self.texels.of_face, hit.primitive - self.mesh.first_dentin_face(self.texels.tooth), active)
+
+
+class LightWalk(BorderWalk):
+    """Photons from the lights; gathers how much light, from where, there is on each texel."""
+
+    def __init__(self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, ior: float | None) -> None:
+        super().__init__(geometry, media, start, texels, order, ior)
+        self.photons = start
+        # Whole numbers, so that sums do not depend on the order of threads.
+        self.table = dr.zeros(mi.Int64, start.groups * texels.count * self.columns)
+        dr.make_opaque(self.table)
+
+    def gather(self, samples: int) -> NDArray[np.float32]:
+        """Mean radiance on texels, in spherical harmonics what has collided, integrated over directions what has not: (L, batches, texels, columns)."""
+        self.trace(samples, Tally(1, 1, 0))
+        dr.eval(self.table)
+        dr.sync_thread()
+        lights = self.photons
+        sums = np.array(self.table).reshape(lights.count, lights.batches, -1, self.columns)
+        scale = lights.power[:, None] / (FIXED_POINT * lights.lanes_per_group * samples * self.texels.areas_mm2)
+        return np.asarray(sums * scale[:, None, :, None], dtype=np.float32)
+
+    def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - cameras need the medium
+        # As the straight connections of images have it, light that has not scattered is transmitted only.
+        return self.book.order(walker.so_far) == 0
+
+    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+        first = (self.photons.group(lane) * self.texels.count + self._texel(hit, crosses)) * self.columns
+        units = strength * FIXED_POINT
+        for k, harmonic in enumerate(dr.sh_eval(omega, self.order)):
+            dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses & ~fresh)
+        dr.scatter_add(self.table, mi.Int64(units), first + self.columns - 1, crosses & fresh)
+
+
+class CameraWalk(BorderWalk):
+    """Walks from the camera's pixels; at each crossing they meet the light that counts for their pixel, and sum up what each shape mode changes."""
+
+    def __init__(
+        self,
+        geometry: MeshGeometry,
+        media: Media,
+        start: CameraStart,
+        texels: Texels,
+        ior: float | None,
+        coefficients: Array,
+        light: NDArray[np.float32],
+    ) -> None:
+        """Take c_j (order + 1,), and light as (N, batches, texels, columns): harmonics to meet crossings, and what uncollided ones, of one direction, meet."""
+        super().__init__(geometry, media, start, texels, len(coefficients) - 1, ior)
+        self.pixels, self.light_batches = light.shape[:2]
+        self.shape_modes = geometry.modes_of[texels.tooth]
+        # Light that the camera counts travels against the walk, which turns the sign of odd harmonics.
+        self.coefficients = [dr.opaque(mi.Float, -c if j % 2 else c) for j, c in enumerate(coefficients.tolist())]
+        self.light = mi.Float(light.reshape(-1))
+        self.sums = dr.zeros(mi.Float64, start.lanes * self.light_batches * self.shape_modes)
+        dr.make_opaque(self.light, self.sums)
+
+    def meet(self, samples: int) -> Array:
+        """Sums over every lane's samples, (lanes, batches of light, M)."""
+        self.trace(samples, Tally(1, 1, 0))
+        dr.eval(self.sums)
+        dr.sync_thread()
+        return np.array(self.sums).reshape(-1, self.light_batches, self.shape_modes)
+
+    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+        texel, speeds = self._texel(hit, crosses), self.mesh.velocity(hit, self.texels.tooth, crosses)
+        harmonics = dr.sh_eval(omega, self.order)
+        weighted = [harmonics[k] * c for j, c in enumerate(self.coefficients) for k in range(j * j, (j + 1) ** 2)]
+        for batch in range(self.light_batches):
+            first = ((lane % self.pixels * self.light_batches + batch) * self.texels.count + texel) * self.columns
+            change = dr.gather(mi.Float, self.light, first + self.columns - 1, crosses & fresh)
+            for k, harmonic in enumerate(weighted):
+                change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~fresh), change)
+            for mode, speed in enumerate(speeds):
+                slot = (lane * self.light_batches + batch) * self.shape_modes + mode
+                dr.scatter_add(self.sums, mi.Float64(-strength * speed * change), slot, crosses, mode=dr.ReduceMode.NoConflicts)

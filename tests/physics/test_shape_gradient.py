@@ -1,0 +1,167 @@
+"""The shape gradient by light and importance on the border, against central differences of the images with common random numbers.
+
+Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly behind the camera and media that are
+clear or scatter forwards, that moves the derivative by up to 8 % (``services/fit/README.md``); so differences up to ``BIAS`` are none of noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from services.core.errors import InputError
+from services.core.records import Boundary
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.phase_table import PhaseTable
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import DentinShape, View
+from tests.support.small_mouth import FREE_MM, LIGHTS_MM, MOUTH, mouth_recipe, revolved
+from tests.support.small_tooth import camera_at, recipe, whole_view
+
+SEEDS = 8
+BIAS = 0.1
+LARGEST_ERROR = 0.05
+"""Standard error of gradient and of difference, as a fraction of the derivative."""
+FALSE_ALARM = 1e-3
+"""Chance that any t-test of this file's differences fails a gradient whose bias is below ``BIAS`` (Bonferroni)."""
+STEP = 0.3
+
+CLEAR = Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4))
+"""Dentin clearer than enamel, two lobes."""
+FORWARD = Tissue(Medium(2, 0.95, 0.93, 0.82, -0.1), Medium(4, 0.85, 1.0, 0.75), (0.5, 0.4))
+"""As the dark incisor of the benchmark, with thinner enamel."""
+CASES = [
+    pytest.param(CLEAR, "matched", 1024, id="clear-matched"),
+    pytest.param(CLEAR, "thin", 1024, id="clear-thin"),
+    pytest.param(FORWARD, "matched", 16384, id="forward-matched", marks=pytest.mark.slow),
+]
+"""With the paths per pixel that differences take."""
+
+
+@pytest.mark.parametrize(("tissue", "boundary", "paths"), CASES)
+def test_it_is_the_derivative_of_the_weighted_images(tissue: Tissue, boundary: Boundary, paths: int) -> None:
+    engine, view = Engine(recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1)
+    weights = _residual(engine, tissue, view)
+    found = np.array([engine.shape_gradient(tissue, view, weights, seed=seed, samples=1024, photons=16384).gradient for seed in range(SEEDS)])
+    limit = stats.t.isf(FALSE_ALARM / (2 * 2 * len(CASES)), SEEDS - 1)
+    for mode in range(2):
+        expected = [_difference(engine, tissue, view, weights, mode, paths, seed) for seed in range(SEEDS)]
+        gradients, differences = found[:, mode] / np.mean(expected), np.array(expected) / np.mean(expected)
+        assert _standard_error(gradients) <= LARGEST_ERROR
+        assert _standard_error(differences) <= LARGEST_ERROR
+        # Seeds are unrelated, so their pairing is arbitrary.
+        gap = gradients - differences
+        assert abs(gap.mean()) <= BIAS + limit * _standard_error(gap), mode
+
+
+def test_its_errors_are_honest() -> None:
+    engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 1)
+    weights = _residual(engine, CLEAR, view)
+    runs = [engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=64, photons=512) for seed in range(64)]
+    claimed = np.mean([run.variance for run in runs], axis=0)
+    found = np.var([run.gradient for run in runs], axis=0, ddof=1)
+    # The variance of 64 values is chi-square with 63 degrees of freedom; 0.6 to 1.6 holds it but once in 1e4, and the claim's own noise beside it.
+    assert ((found / claimed > 0.55) & (found / claimed < 1.7)).all()
+
+
+def test_it_repeats_bit_for_bit_and_seeds_matter() -> None:
+    engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
+    weights = np.ones((5, len(view)))
+    first, again, other = (engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=16).gradient for seed in (1, 1, 2))
+    assert (first == again).all()
+    assert (first != other).all()
+
+
+def test_lights_that_the_view_does_not_list_do_not_count() -> None:
+    engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
+    weights = np.ones((5, len(view)))
+    some = replace(view, lights=(1, 3))
+    listed = engine.shape_gradient(CLEAR, some, weights, seed=1, samples=16)
+    weights[[0, 2, 4]] = 1e6
+    assert (engine.shape_gradient(CLEAR, some, weights, seed=1, samples=16).gradient == listed.gradient).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"cotangent": np.zeros((4, 16))}, "shape"),
+        ({"cotangent": np.full((5, 16), np.nan)}, "finite"),
+        ({"samples": 0}, "at least 1"),
+        ({"photons": 0}, "at least 1"),
+        ({"order": 10}, "order"),
+    ],
+)
+def test_refusals_are_sentences(change: dict[str, object], words: str) -> None:
+    engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
+    arguments: dict[str, object] = {"cotangent": np.zeros((5, 16)), "seed": 0, "samples": 16} | change
+    with pytest.raises(InputError, match=words):
+        engine.shape_gradient(CLEAR, view, **arguments)  # type: ignore[arg-type]
+
+
+def test_a_known_shape_has_no_gradient() -> None:
+    scene = recipe()
+    (tooth,) = scene.teeth
+    assert tooth.dentin is not None
+    known = replace(scene, teeth=(replace(tooth, dentin=replace(tooth.dentin, modes_mm=tooth.dentin.modes_mm[:0])),))
+    view = whole_view(camera_at((0.2, 1, 0.1)), 2)
+    with pytest.raises(InputError, match="shape modes"):
+        Engine(known).shape_gradient(replace(CLEAR, shape=()), view, np.zeros((5, 16)), seed=0, samples=16)
+
+
+TABULATED = replace(CLEAR, dentin=replace(CLEAR.dentin, table=PhaseTable((0.0, np.pi), (1.0, 1.0))))
+
+
+@pytest.mark.parametrize(("tissue", "border_width_mm"), [(CLEAR, 0.5), (TABULATED, 0.0)])
+def test_borders_and_media_that_it_does_not_know_are_refused(tissue: Tissue, border_width_mm: float) -> None:
+    view = whole_view(camera_at((0.2, 1, 0.1)), 2)
+    with pytest.raises(InputError, match="take the Jacobian"):
+        Engine(replace(recipe(), border_width_mm=border_width_mm)).shape_gradient(tissue, view, np.ones((5, len(view))), seed=0, samples=16)
+
+
+def test_in_a_mouth_one_tooth_moves() -> None:
+    # The second of two teeth with dentin, beside gums and before a wall.
+    inner = revolved((1.2, 1.7), FREE_MM)
+    outward = (inner.vertices_mm - FREE_MM) / np.linalg.norm(inner.vertices_mm - FREE_MM, axis=1, keepdims=True)
+    scene = mouth_recipe("matched")
+    rooted, free = scene.teeth
+    engine = Engine(replace(scene, teeth=(rooted, replace(free, dentin=DentinShape(inner, -0.7 * outward[None])))))
+    mouth = replace(MOUTH, teeth=(MOUTH.teeth[0], replace(CLEAR, shape=(0.5,))))
+    view = whole_view(camera_at((0.1, 1, 0.2), span_mm=15.0))
+    weights = np.ones((len(LIGHTS_MM), len(view)))
+    found = np.array([engine.shape_gradient(mouth, view, weights, seed=seed, samples=1024, photons=2**18, tooth=1).gradient[0] for seed in range(SEEDS)])
+
+    def total(c: float, seed: int) -> float:
+        return float(engine.images(mouth.with_values({"1.shape.0": c}), view, samples=8192, seed=seed).mean.sum())
+
+    expected = np.array([(total(0.8, seed) - total(0.2, seed)) / 0.6 for seed in range(SEEDS)])
+    gap = (found - expected) / expected.mean()
+    assert _standard_error(gap) <= LARGEST_ERROR
+    assert abs(gap.mean()) <= BIAS + stats.t.isf(FALSE_ALARM / 2, SEEDS - 1) * _standard_error(gap)
+    with pytest.raises(InputError, match="Tooth 0 has no dentin with shape modes"):
+        engine.shape_gradient(mouth, view, weights, seed=0, samples=16, tooth=0)
+
+
+def _residual(engine: Engine, tissue: Tissue, view: View) -> NDArray[np.float64]:
+    other = tissue.with_values({"shape.0": 0.8, "shape.1": 0.8})
+    images = [engine.images(one, view, samples=1024, seed=900).mean for one in (other, tissue)]
+    return images[1] - images[0]
+
+
+def _difference(engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int, seed: int) -> float:
+    """Free of its bias to fourth order by two steps."""
+    middle = tissue.shape[mode]
+
+    def at(step: float) -> float:
+        sides = [tissue.with_values({f"shape.{mode}": middle + sign * step}) for sign in (1, -1)]
+        up, down = (engine.images(side, view, samples=paths, seed=1000 + seed).mean for side in sides)
+        return float(((up - down) * weights).sum()) / (2 * step)
+
+    return (4 * at(STEP / 2) - at(STEP)) / 3
+
+
+def _standard_error(values: NDArray[np.float64]) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
