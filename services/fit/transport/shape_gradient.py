@@ -14,8 +14,8 @@ from services.fit.transport.recipe import ShapeGradient, View
 from services.fit.transport.starts import CameraStart, LightStart
 
 Array = NDArray[np.float64]
-TEXEL_MM2 = 2.0
-"""Smaller texels hold more noise, larger ones mix light that differs."""
+TEXELS = 130
+"""Of the border: more of them hold more noise, fewer mix light that differs."""
 LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
@@ -29,7 +29,7 @@ class ShapeGradients:
     def __init__(self, geometry: MeshGeometry, ior: float | None, radius_mm: float) -> None:
         assert geometry.shape is not None
         self.geometry, self.recipe, self.ior, self.radius_mm = geometry, geometry.recipe, ior, radius_mm
-        self._patches = patches(geometry.shape.base, TEXEL_MM2)
+        self._patches = patches(geometry.shape.base, TEXELS)
 
     def __call__(self, tissue: Tissue, view: View, cotangent: Array, *, seed: int, samples: int, photons: int, order: int) -> ShapeGradient:
         """See ``Engine.shape_gradient``; all arguments are checked, and the geometry has the tissue's shape."""
