@@ -1,7 +1,7 @@
 """The shape gradient by light and importance on the border, against central differences of the images with common random numbers.
 
 Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly behind the camera and media that are
-clear or scatter forwards, that moves the derivative by up to 8 % (``services/fit/README.md``); so differences up to ``BIAS`` are none of noise.
+clear, or scatter forwards, that was measured to move the derivative by 1 % and by 10 to 15 % (``services/fit/README.md``): the bias each case allows.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from tests.support.small_mouth import FREE_MM, LIGHTS_MM, MOUTH, mouth_recipe, r
 from tests.support.small_tooth import camera_at, recipe, whole_view
 
 SEEDS = 8
-BIAS = 0.1
 LARGEST_ERROR = 0.05
 """Standard error of gradient and of difference, as a fraction of the derivative."""
 FALSE_ALARM = 1e-3
-"""Chance that any t-test of this file's differences fails a gradient whose bias is below ``BIAS`` (Bonferroni)."""
+"""Chance that any t-test of this file's differences fails a gradient whose bias is below the case's (Bonferroni)."""
 STEP = 0.3
 
 CLEAR = Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4))
@@ -35,15 +34,15 @@ CLEAR = Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3),
 FORWARD = Tissue(Medium(2, 0.95, 0.93, 0.82, -0.1), Medium(4, 0.85, 1.0, 0.75), (0.5, 0.4))
 """As the dark incisor of the benchmark, with thinner enamel."""
 CASES = [
-    pytest.param(CLEAR, "matched", 1024, id="clear-matched"),
-    pytest.param(CLEAR, "thin", 1024, id="clear-thin"),
-    pytest.param(FORWARD, "matched", 16384, id="forward-matched", marks=pytest.mark.slow),
+    pytest.param(CLEAR, "matched", 1024, 0.03, id="clear-matched"),
+    pytest.param(CLEAR, "thin", 1024, 0.03, id="clear-thin"),
+    pytest.param(FORWARD, "matched", 16384, 0.15, id="forward-matched", marks=pytest.mark.slow),
 ]
-"""With the paths per pixel that differences take."""
+"""With the paths per pixel that differences take, and the bias allowed."""
 
 
-@pytest.mark.parametrize(("tissue", "boundary", "paths"), CASES)
-def test_it_is_the_derivative_of_the_weighted_images(tissue: Tissue, boundary: Boundary, paths: int) -> None:
+@pytest.mark.parametrize(("tissue", "boundary", "paths", "bias"), CASES)
+def test_it_is_the_derivative_of_the_weighted_images(tissue: Tissue, boundary: Boundary, paths: int, bias: float) -> None:
     engine, view = Engine(recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1)
     weights = _residual(engine, tissue, view)
     found = np.array([engine.shape_gradient(tissue, view, weights, seed=seed, samples=1024, photons=16384).gradient for seed in range(SEEDS)])
@@ -55,7 +54,7 @@ def test_it_is_the_derivative_of_the_weighted_images(tissue: Tissue, boundary: B
         assert _standard_error(differences) <= LARGEST_ERROR
         # Seeds are unrelated, so their pairing is arbitrary.
         gap = gradients - differences
-        assert abs(gap.mean()) <= BIAS + limit * _standard_error(gap), mode
+        assert abs(gap.mean()) <= bias + limit * _standard_error(gap), mode
 
 
 def test_its_errors_are_honest() -> None:
@@ -130,7 +129,9 @@ def test_in_a_mouth_one_tooth_moves() -> None:
     rooted, free = scene.teeth
     engine = Engine(replace(scene, teeth=(rooted, replace(free, dentin=DentinShape(inner, -0.7 * outward[None])))))
     mouth = replace(MOUTH, teeth=(MOUTH.teeth[0], replace(CLEAR, shape=(0.5,))))
-    view = whole_view(camera_at((0.1, 1, 0.2), span_mm=15.0))
+    whole = whole_view(camera_at((0.1, 1, 0.2), size=16, span_mm=15.0))
+    x, y = whole.pixels.T
+    view = replace(whole, pixels=whole.pixels[(x >= 1) & (x <= 5) & (y >= 3) & (y <= 11)])
     weights = np.ones((len(LIGHTS_MM), len(view)))
     found = np.array([engine.shape_gradient(mouth, view, weights, seed=seed, samples=1024, photons=2**18, tooth=1).gradient[0] for seed in range(SEEDS)])
 
@@ -140,7 +141,7 @@ def test_in_a_mouth_one_tooth_moves() -> None:
     expected = np.array([(total(0.8, seed) - total(0.2, seed)) / 0.6 for seed in range(SEEDS)])
     gap = (found - expected) / expected.mean()
     assert _standard_error(gap) <= LARGEST_ERROR
-    assert abs(gap.mean()) <= BIAS + stats.t.isf(FALSE_ALARM / 2, SEEDS - 1) * _standard_error(gap)
+    assert abs(gap.mean()) <= 0.03 + stats.t.isf(FALSE_ALARM / 2, SEEDS - 1) * _standard_error(gap)
     with pytest.raises(InputError, match="Tooth 0 has no dentin with shape modes"):
         engine.shape_gradient(mouth, view, weights, seed=0, samples=16, tooth=0)
 

@@ -39,7 +39,7 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
     stack = incisor_stack(18 if quick else 54)
     engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
     samples, repeats = (32, 3) if quick else (64, 16)
-    walks, gradients = (256, 4) if quick else (1024, 8)
+    walks, gradients = (512, 4) if quick else (1024, 8)
     rows: list[GradientRow] = []
     for name, media in TISSUES.items():
         tissue = replace(media, shape=SHAPE)

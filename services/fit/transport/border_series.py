@@ -58,8 +58,8 @@ def _scattered(medium: Medium, cosine: Array) -> Array:
     return np.asarray(medium.sigma * medium.alpha * (medium.beta * lobe(medium.g1) + (1 - medium.beta) * lobe(medium.g2)))
 
 
-def patches(surface: Mesh, size_mm2: float) -> NDArray[np.int64]:
-    """Divide a surface into patches of about this area that bend little: each triangle's patch, (T,).
+def patches(surface: Mesh, count: int) -> NDArray[np.int64]:
+    """Divide a surface into at most so many patches of like size that bend little: each triangle's patch, (T,).
 
     Lloyd's algorithm on middles and unit normals of triangles (a turn by one radian counts as one millimetre), from farthest points.
     """
@@ -67,7 +67,7 @@ def patches(surface: Mesh, size_mm2: float) -> NDArray[np.int64]:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled_areas = np.linalg.norm(normals, axis=1)
     points = np.concatenate([corners.mean(axis=1), normals / np.maximum(doubled_areas, 1e-30)[:, None]], axis=1)
-    count = int(np.clip(round(doubled_areas.sum() / 2 / size_mm2), 1, len(points)))
+    count = min(count, len(points))
 
     chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < count:

@@ -14,8 +14,8 @@ from services.fit.transport.recipe import ShapeGradient, View
 from services.fit.transport.starts import CameraStart, LightStart
 
 Array = NDArray[np.float64]
-TEXEL_MM2 = 2.0
-"""Smaller texels hold more noise, larger ones mix light that differs."""
+TEXELS = 130
+"""Of the border: more of them hold more noise, fewer mix light that differs."""
 LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
@@ -30,7 +30,7 @@ class ShapeGradients:
         dentin = geometry.recipe.teeth[tooth].dentin
         assert dentin is not None
         self.geometry, self.tooth, self.recipe, self.ior, self.radius_mm = geometry, tooth, geometry.recipe, ior, radius_mm
-        self._patches = patches(dentin.base, TEXEL_MM2)
+        self._patches = patches(dentin.base, TEXELS)
 
     def __call__(self, tissue: Tissue, media: Media, view: View, cotangent: Array, *, seed: int, samples: int, photons: int, order: int) -> ShapeGradient:
         """See ``Engine.shape_gradient``; all arguments are checked, and the geometry has the tissue's shape."""
