@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from tests.support.small_tooth import camera_at, recipe, whole_view
+from tests.support.small_tooth import camera_at, whole_view
+from tests.support.stained_tooth import stain, stained_recipe
 
 NAMES = ("enamel.sigma", "dentin.alpha", "enamel.g1", "shape.0")
 TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3), (0.5, 0.4))
@@ -28,21 +29,29 @@ class Picture:
     """(F, L, N)"""
     orders: NDArray[np.float64]
     """(K, L, N)"""
+    shape: NDArray[np.float64]
+    """Gradient of the images' sum to the dentin's shape, (M,)."""
+    texels: NDArray[np.float64]
+    """The same to the texels of a stain; threads add to common slots, so its last bits depend on their order."""
 
 
 def picture(engine: Engine) -> Picture:
-    """Render 16 x 16 pixels: 4,096 lanes, which Dr.Jit splits over its threads."""
+    """Render 16 x 16 pixels of a tooth that may have stains: 4,096 lanes, which Dr.Jit splits over its threads."""
     view = whole_view(camera_at((0.2, 1, 0.1), size=16))
     image = engine.images(TISSUE, view, samples=32, seed=5)
     jacobian = engine.jacobian(TISSUE, view, NAMES, samples=32, seed=6, batches=16)
     orders = engine.order_images(TISSUE, view, bin_edges=np.array([0, 2, 8, 64]), samples=16, seed=7, batches=16)
-    return Picture(image.mean, image.variance, jacobian.jacobian, orders)
+    ones = np.ones(image.mean.shape)
+    shape = engine.shape_gradient(TISSUE, view, ones, samples=32, seed=8).gradient
+    (texels,) = engine.stain_gradient(replace(TISSUE, stain=stain()), view, ones, samples=32, seed=9).gradient
+    assert texels is not None
+    return Picture(image.mean, image.variance, jacobian.jacobian, orders, shape, texels)
 
 
 def render_into(connection: Connection, threads: int, boundary: Boundary) -> None:
     """Send the number of threads in use, and ``picture`` of an engine built with so many."""
     import drjit as dr
 
-    result = picture(Engine(recipe(boundary), threads))
+    result = picture(Engine(stained_recipe(boundary), threads))
     connection.send((dr.thread_count(), result))
     connection.close()
