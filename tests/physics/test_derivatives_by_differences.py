@@ -61,8 +61,8 @@ GRADUAL = Group(
 """Albedo and phase function differ far more than extinction, so that what they change near the border rules the derivative to its shape."""
 IN_A_MOUTH = Group(
     MOUTH,
-    {"0.dentin.alpha": 384, "1.enamel.alpha": 128, "1.enamel.sigma": 2048, "gums.alpha": 128, "gums.sigma": 2048, "cavity.reflectance": 64},
-    2048,
+    {"0.dentin.alpha": 384, "1.enamel.alpha": 128, "1.enamel.sigma": 5120, "gums.alpha": 128, "gums.sigma": 2048, "cavity.reflectance": 64},
+    3072,
     mouth_recipe,
     14.0,
 )
@@ -82,8 +82,10 @@ def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.floa
             tissue = group.tissue.with_values({name: parameter})
             return float((engine.images(tissue, view, samples=group.samples[name], seed=12_000 + seed).mean * picture).sum())
 
-        differences = [[(value(middle + h, seed) - value(middle - h, seed)) / (2 * h) for seed in range(SEEDS)] for h in (step, step / 2)]
-        extrapolated = (4 * np.array(differences[1]) - np.array(differences[0])) / 3
+        # All seeds at one value in turn: a new value may mean new surfaces.
+        up, down = ({h: np.array([value(middle + sign * h, seed) for seed in range(SEEDS)]) for h in (step, step / 2)} for sign in (1, -1))
+        differences = [(up[h] - down[h]) / (2 * h) for h in (step, step / 2)]
+        extrapolated = (4 * differences[1] - differences[0]) / 3
         compared[name] = scores / scores.mean(), extrapolated / scores.mean()
     return compared
 
