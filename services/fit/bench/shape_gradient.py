@@ -6,7 +6,7 @@ a row of its own. The peer is two image passes per mode with common random numbe
 
 Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps. Asked for an
 error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step. Ours has a bias too, of its series and its texels: the
-distance to the peer's D(0), charged where it is more than noise. Part of our variance falls as 1 / paths squared (photons times walks), so more paths than
+distance to the peer's D(0). On either side a bias counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times walks), so more paths than
 taken here would favour ours.
 """
 
@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 TISSUES = {"white": TISSUE, "dark": Tissue(Medium(2.0, 0.95, 0.93, 0.82, -0.1), Medium(4.0, 0.85, 1.0, 0.75))}
 SHAPE, OTHER_SHAPE = (0.5, 0.5, 0.5), (0.8, 0.8, 0.8)
 STEPS = (0.05, 0.1, 0.2, 0.4)
+RESOLVED = 3.0
+"""Standard errors beyond which a bias is known from noise."""
 WANTED_ERROR = 0.05
 """Of the derivative: the common error at which the two are compared."""
 
@@ -39,7 +41,7 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
     stack = incisor_stack(18 if quick else 54)
     engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
     samples, repeats = (32, 3) if quick else (64, 16)
-    walks, gradients = (512, 4) if quick else (1024, 8)
+    walks, gradients = (512, 4) if quick else (4096, 6)
     rows: list[GradientRow] = []
     for name, media in TISSUES.items():
         tissue = replace(media, shape=SHAPE)
@@ -94,10 +96,9 @@ def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, s
     design = np.stack([np.ones_like(steps), steps**2], axis=1) / spread[:, None]
     covariance = np.linalg.inv(design.T @ design)
     theirs, curvature = covariance @ design.T @ (values / spread)
-    # The square of a noisy number is too large by its variance; what is not resolved counts as no bias, on either side.
     noise_squared = covariance[0, 0] + ours.mean_variance[0]
-    curvature_squared = max(curvature**2 - covariance[1, 1], 0.0)
-    our_bias_squared = max((theirs - ours.mean[0]) ** 2 - noise_squared, 0.0)
+    curvature_squared = _resolved(curvature, covariance[1, 1])
+    our_bias_squared = _resolved(theirs - ours.mean[0], noise_squared)
 
     derivative = np.average([theirs, ours.mean[0]], weights=[1 / covariance[0, 0], 1 / ours.mean_variance[0]])
     wanted = (WANTED_ERROR * derivative) ** 2
@@ -119,3 +120,8 @@ def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, s
     summary = row(f"central differences, step {best:g}", differences[best], paths)
     ratio = float(costs[best] / our_cost)
     return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient-summary {tissue}", "efficiency_ratio": ratio, "z": z})]
+
+
+def _resolved(bias: float, variance: float) -> float:
+    """The square of a bias, less its own noise; 0 where it may be noise alone."""
+    return float(bias**2 - variance) if bias**2 > RESOLVED**2 * variance else 0.0
