@@ -6,8 +6,8 @@ a row of its own. The peer is two image passes per mode with common random numbe
 
 Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps. Asked for an
 error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step. Ours has a bias too, of its series and its texels: the
-distance to the peer's D(0). On either side a bias counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times walks), so more paths than
-taken here would favour ours.
+distance to the peer's D(0). On either side a bias counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times
+walks), so ours is taken at paths that come near the error asked for.
 """
 
 from __future__ import annotations
