@@ -1,0 +1,115 @@
+"""Gums from a scanned jaw: the gingiva's own triangles, a membrane where the teeth were, and a base that encloses the roots."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import MeshError
+from services.core.geometry import Mesh
+from services.fit.anatomy.patches import boundary_loops
+
+COVER_MM = 1.5
+"""Depth of gums beyond the deepest root and beyond the scan's rim."""
+ROW_MM = 0.8
+RIM_ROUNDS = 200
+"""Of smoothing the rim's outline, on its way to the base."""
+
+
+def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.float64], deepest_mm: float) -> Mesh:
+    """A watertight solid; on the gingiva it is the scan itself.
+
+    The crowns' triangles stay, but shrink to a membrane that each cervical line spans: every vertex off the gingiva moves to the mean of its neighbours.
+    The scan's rim is drawn away from the teeth to a flat base. Teeth stand in the solid and overlap it.
+
+    Args:
+        surface: the scan, manifold, with one boundary loop.
+        gingiva: which faces (F,) are gingiva.
+        occlusal: unit vector.
+        deepest_mm: coordinate along ``occlusal`` of the deepest root.
+
+    Raises:
+        MeshError: there is no outer rim, or its outline crosses itself.
+    """
+    loops = boundary_loops(surface.faces)
+    if len(loops) != 1:
+        raise MeshError(f"The scan has {len(loops)} open rims; give one open surface of the jaw, its holes filled.")
+    vertices = _membrane(surface, gingiva)
+    loop = loops[0]
+    height = vertices @ occlusal
+    base = min(deepest_mm, float(height.min())) - COVER_MM
+
+    # Rows from the rim to the base, whose outline is the rim's without its steps.
+    rim = vertices[loop] - np.outer(height[loop], occlusal)
+    outline = rim
+    for _ in range(RIM_ROUNDS):
+        outline = outline / 2 + (np.roll(outline, 1, axis=0) + np.roll(outline, -1, axis=0)) / 4
+    steps = max(2, int(np.ceil((height[loop].mean() - base) / ROW_MM)))
+    along = np.linspace(0, 1, steps + 1)[1:, None]
+    wall = rim + along[..., None] * (outline - rim) + (height[loop] + along * (base - height[loop]))[..., None] * occlusal
+    ring = np.concatenate([loop[None], len(vertices) + np.arange(steps * len(loop)).reshape(steps, -1)])
+    a, b = ring[:-1], np.roll(ring[:-1], -1, axis=1)
+    c, d = ring[1:], np.roll(ring[1:], -1, axis=1)
+    sides = np.concatenate([np.stack([b, a, c], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+
+    across = np.linalg.svd(occlusal[None])[2][1:]
+    across[1] = np.cross(occlusal, across[0])
+    lid = ring[-1][cut_ears(outline @ across.T)][:, ::-1]
+    solid = Mesh(np.concatenate([vertices, wall.reshape(-1, 3)]), np.concatenate([surface.faces, sides, lid]).astype(np.int32))
+    solid.require_solid("of the gums, closed by a base,", (2.0, 200.0))
+    return solid
+
+
+def cut_ears(outline: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Triangles (N - 2, 3) of a simple polygon (N, 2), counter-clockwise, by cutting the ear of the shortest chord first (Meisters 1975).
+
+    Raises:
+        MeshError: the outline crosses itself.
+    """
+    signed = _turn(outline, np.roll(outline, -1, axis=0), np.zeros(2)).sum()
+    left = list(range(len(outline))) if signed > 0 else list(range(len(outline)))[::-1]
+    triangles = []
+    while len(left) > 3:
+        index = np.array(left)
+        before, after = np.roll(index, 1), np.roll(index, -1)
+        chord = np.linalg.norm(outline[before] - outline[after], axis=1)
+        convex = _turn(outline[before], outline[index], outline[after]) > 0
+        reflex = index[~convex]
+        for place in np.argsort(np.where(convex, chord, np.inf)):
+            if not convex[place]:
+                raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
+            ear = np.array([before[place], index[place], after[place]])
+            if not _holds(outline[ear], outline[reflex[~np.isin(reflex, ear)]]):
+                break
+        else:
+            raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
+        triangles.append(ear)
+        left.pop(int(place))
+    triangles.append(np.array(left))
+    return np.array(triangles, dtype=np.int64)
+
+
+def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0]
+
+
+def _holds(triangle: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
+    inside = [_turn(triangle[k], triangle[(k + 1) % 3], points) >= 0 for k in range(3)]
+    return bool(np.logical_and.reduce(inside).any())
+
+
+def _membrane(surface: Mesh, gingiva: NDArray[np.bool_]) -> NDArray[np.float64]:
+    # The harmonic map with uniform weights: sum over neighbours of (v_j - v_i) = 0 at each free vertex i.
+    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse.linalg import spsolve
+
+    count = len(surface.vertices_mm)
+    edges = np.unique(np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    start, end = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count)).tocsr()
+    laplacian = (diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency).tocsr()
+    fixed = np.zeros(count, dtype=bool)
+    fixed[surface.faces[gingiva]] = True
+    vertices = surface.vertices_mm.copy()
+    vertices[~fixed] = spsolve(laplacian[~fixed][:, ~fixed].tocsc(), -laplacian[~fixed][:, fixed] @ vertices[fixed])
+    return vertices

@@ -1,0 +1,86 @@
+"""Roots for scanned crowns: an open crown becomes a solid by a tapering stub along the tooth's axis from its cervical line."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import MeshError
+from services.core.geometry import Mesh
+from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, manifold_piece, vector_area_mm2
+
+STUB_MM = 4.0
+"""How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""
+TAPER = 0.72
+"""Width of the root's end to that of the cervical line."""
+ROUNDING_MM = 1.2
+ROW_MM = 0.45
+HARMONICS = 3
+"""Of the closed curve that the root's cross-section ends in."""
+
+
+def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: float = STUB_MM) -> Mesh:
+    """A watertight solid whose surface outside the gums is the crown's own triangles.
+
+    Args:
+        crown: open surface, one piece but for what is thrown away: specks, and faces at edges of more than two.
+        occlusal: unit vector along the tooth's axis, out of the mouth's gums.
+        name: of the tooth, for errors.
+
+    Raises:
+        MeshError: the crown is closed, or not cut off by its cervical line across the axis.
+    """
+    crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
+    if not boundary_loops(crown.faces):
+        raise MeshError(f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is.")
+    crown, _ = fill_holes(crown)
+    if vector_area_mm2(crown) @ occlusal <= 0:
+        raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
+
+    rows, pole = _stub_rows(crown.vertices_mm[boundary_loops(crown.faces)[0]], occlusal, stub_mm)
+    loop = boundary_loops(crown.faces)[0]
+    first, around = len(crown.vertices_mm), len(loop)
+    ring = np.concatenate([loop[None], first + np.arange(len(rows) * around).reshape(len(rows), around)])
+    a, b = ring[:-1], np.roll(ring[:-1], -1, axis=1)
+    c, d = ring[1:], np.roll(ring[1:], -1, axis=1)
+    vertices = np.concatenate([crown.vertices_mm, rows.reshape(-1, 3), pole[None]])
+    # Each quad is split along its shorter diagonal.
+    short = (np.linalg.norm(vertices[b] - vertices[c], axis=-1) <= np.linalg.norm(vertices[a] - vertices[d], axis=-1))[..., None]
+    one = np.where(short, np.stack([b, a, c], -1), np.stack([b, a, d], -1))
+    two = np.where(short, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
+    cap = np.stack([np.roll(ring[-1], -1), ring[-1], np.full(around, len(vertices) - 1)], axis=-1)
+    solid = Mesh(vertices, np.concatenate([crown.faces, one.reshape(-1, 3), two.reshape(-1, 3), cap]).astype(np.int32))
+    solid.require_solid(f"of {name}, closed by a root,")
+    return solid
+
+
+def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Columns run from the cervical line to a smooth ring across the axis, and on over a rounded end to a pole.
+    height = loop_mm @ occlusal
+    flat = loop_mm - np.outer(height, occlusal)
+    centre = flat.mean(axis=0)
+    end = centre + TAPER * _smooth_ring(flat - centre, occlusal)
+    end_height = height.min() - stub_mm + ROUNDING_MM
+
+    steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
+    along = np.linspace(0, 1, steps + 1)[1:, None]
+    wall = flat + along[..., None] * (end - flat) + (height + along * (end_height - height))[..., None] * occlusal
+    bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
+    lid = np.stack([centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal for bend in bends])
+    return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
+
+
+def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    # The curve's lowest Fourier descriptors; an ellipse where more of them cross over themselves.
+    across = np.linalg.svd(axis[None])[2][1:]
+    across[1] = np.cross(axis, across[0])
+    spectrum = np.fft.fft(offsets_mm @ across[0] + 1j * (offsets_mm @ across[1]))
+    order = np.abs(np.fft.fftfreq(len(spectrum), 1 / len(spectrum)))
+    for harmonics in (HARMONICS, 1):
+        ring = np.fft.ifft(np.where((order <= harmonics) & (order > 0), spectrum, 0))
+        edge = np.roll(ring, -1) - ring
+        turn = np.angle(np.roll(edge, -1) / edge)
+        # Convex, once around.
+        if (turn * np.sign(turn.sum()) > 0).all() and abs(abs(turn.sum()) - 2 * np.pi) < 1e-6:
+            break
+    return np.outer(ring.real, across[0]) + np.outer(ring.imag, across[1])
