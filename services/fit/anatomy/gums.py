@@ -54,52 +54,38 @@ def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.f
 
     across = np.linalg.svd(occlusal[None])[2][1:]
     across[1] = np.cross(occlusal, across[0])
-    lid = ring[-1][cut_ears(outline @ across.T)][:, ::-1]
+    lid = ring[-1][fill_outline(outline @ across.T)][:, ::-1]
     solid = Mesh(np.concatenate([vertices, wall.reshape(-1, 3)]), np.concatenate([surface.faces, sides, lid]).astype(np.int32))
     solid.require_solid("of the gums, closed by a base,", (2.0, 200.0))
     return solid
 
 
-def cut_ears(outline: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Triangles (N - 2, 3) of a simple polygon (N, 2), counter-clockwise, by cutting the ear of the shortest chord first (Meisters 1975).
+def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Delaunay triangles (N - 2, 3), counter-clockwise, of a closed outline (N, 2) whose vertices are dense for its bends and for its width.
 
     Raises:
-        MeshError: the outline crosses itself.
+        MeshError: the outline crosses itself, or is not that dense.
     """
-    signed = _turn(outline, np.roll(outline, -1, axis=0), np.zeros(2)).sum()
-    left = list(range(len(outline))) if signed > 0 else list(range(len(outline)))[::-1]
-    triangles = []
-    while len(left) > 3:
-        index = np.array(left)
-        before, after = np.roll(index, 1), np.roll(index, -1)
-        chord = np.linalg.norm(outline[before] - outline[after], axis=1)
-        convex = _turn(outline[before], outline[index], outline[after]) > 0
-        reflex = index[~convex]
-        for place in np.argsort(np.where(convex, chord, np.inf)):
-            if not convex[place]:
-                raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
-            ear = np.array([before[place], index[place], after[place]])
-            if not _holds(outline[ear], outline[reflex[~np.isin(reflex, ear)]]):
-                break
-        else:
-            raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
-        triangles.append(ear)
-        left.pop(int(place))
-    triangles.append(np.array(left))
-    return np.array(triangles, dtype=np.int64)
+    from scipy.spatial import Delaunay
 
+    triangles = np.asarray(Delaunay(outline).simplices, dtype=np.int64)
+    a, b, c = (outline[triangles[:, k]] for k in range(3))
+    turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
+    triangles = np.where(turned[:, None], triangles[:, ::-1], triangles)
 
-def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    return (b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0]
-
-
-def _holds(triangle: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    inside = [_turn(triangle[k], triangle[(k + 1) % 3], points) >= 0 for k in range(3)]
-    return bool(np.logical_and.reduce(inside).any())
+    # Inside where a ray towards +x crosses the outline an odd number of times.
+    (x, y), start, end = ((a + b + c) / 3).T, outline, np.roll(outline, -1, axis=0)
+    spans = (start[:, 1] > y[:, None]) != (end[:, 1] > y[:, None])
+    rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
+    crossing = start[:, 0] + (y[:, None] - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
+    triangles = triangles[np.count_nonzero(spans & (crossing > x[:, None]), axis=1) % 2 == 1]
+    if len(triangles) != len(outline) - 2:
+        raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
+    return triangles
 
 
 def _membrane(surface: Mesh, gingiva: NDArray[np.bool_]) -> NDArray[np.float64]:
-    # The harmonic map with uniform weights: sum over neighbours of (v_j - v_i) = 0 at each free vertex i.
+    # The harmonic map of uniform weights: each free vertex lies at the mean of its neighbours.
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import spsolve
 
@@ -107,9 +93,9 @@ def _membrane(surface: Mesh, gingiva: NDArray[np.bool_]) -> NDArray[np.float64]:
     edges = np.unique(np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     start, end = np.concatenate([edges, edges[:, ::-1]]).T
     adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count)).tocsr()
-    laplacian = (diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency).tocsr()
-    fixed = np.zeros(count, dtype=bool)
-    fixed[surface.faces[gingiva]] = True
+    matrix = (diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency).tocsr()
+    free = np.ones(count, dtype=bool)
+    free[surface.faces[gingiva]] = False
     vertices = surface.vertices_mm.copy()
-    vertices[~fixed] = spsolve(laplacian[~fixed][:, ~fixed].tocsc(), -laplacian[~fixed][:, fixed] @ vertices[fixed])
+    vertices[free] = spsolve(matrix[free][:, free].tocsc(), -matrix[free][:, ~free] @ vertices[~free])
     return vertices
