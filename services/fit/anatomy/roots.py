@@ -63,11 +63,24 @@ def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub
     end_height = height.min() - stub_mm + ROUNDING_MM
 
     steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
-    along = np.linspace(0, 1, steps + 1)[1:, None]
-    wall = flat + along[..., None] * (end - flat) + (height + along * (end_height - height))[..., None] * occlusal
+    wall = _harmonic_rows(loop_mm, end + end_height * occlusal, steps)
     bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
     lid = np.stack([centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal for bend in bends])
     return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
+
+
+def _harmonic_rows(first: NDArray[np.float64], last: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    # Rings of N points after the first one up to the last one, each point the mean of its four neighbours. Around the ring that is a Fourier series, whose
+    # wave k falls off over the rows as a hyperbolic sine with 2 cosh(rate) = 4 - 2 cos(2 pi k / N): what is ragged ends within a few rows.
+    count = len(first)
+    rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(count) / count))
+    row = np.arange(1, steps + 1)[:, None]
+    with np.errstate(invalid="ignore"):
+        from_last = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
+        from_first = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
+    from_last[:, 0], from_first[:, 0] = row[:, 0] / steps, 1 - row[:, 0] / steps
+    waves = from_first[..., None] * np.fft.fft(first, axis=0) + from_last[..., None] * np.fft.fft(last, axis=0)
+    return np.asarray(np.fft.ifft(waves, axis=1).real)
 
 
 def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
