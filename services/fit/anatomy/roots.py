@@ -15,6 +15,9 @@ TAPER = 0.72
 """Width of the root's end to that of the cervical line."""
 ROUNDING_MM = 1.2
 ROW_MM = 0.45
+WIDEST_BRIDGE_MM = 3.5
+STEEP_NOTCH = 0.5
+"""Depth to width above which the cervical line's rise between two teeth is taken for a contact."""
 HARMONICS = 3
 """Of the closed curve that the root's cross-section ends in."""
 
@@ -37,6 +40,7 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     if vector_area_mm2(crown) @ occlusal <= 0:
         raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
 
+    crown = _bridge_contacts(crown, occlusal)
     rows, pole = _stub_rows(crown.vertices_mm[boundary_loops(crown.faces)[0]], occlusal, stub_mm)
     loop = boundary_loops(crown.faces)[0]
     first, around = len(crown.vertices_mm), len(loop)
@@ -52,6 +56,52 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     solid = Mesh(vertices, np.concatenate([crown.faces, one.reshape(-1, 3), two.reshape(-1, 3), cap]).astype(np.int32))
     solid.require_solid(f"of {name}, closed by a root,")
     return solid
+
+
+def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
+    # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two sides of each such notch.
+    for apex in _notches(crown, occlusal):
+        loop = boundary_loops(crown.faces)[0]
+        position = np.roll(crown.vertices_mm[loop], -int(np.argmin(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1))), axis=0)
+        loop = np.roll(loop, -int(np.argmin(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1))))
+        edges = set(map(tuple, np.sort(crown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()))
+        height = position @ occlusal
+        before, after, strip, whole = 0, 0, [], 0
+        while after - before < len(loop) // 2:
+            # The shorter of the two next chords.
+            steps = [(before - 1, after), (before, after + 1)] if before or after else [(-1, 1)]
+            steps = [(i, j) for i, j in steps if tuple(sorted((int(loop[i]), int(loop[j])))) not in edges]
+            chord, i, j = min(((float(np.linalg.norm(position[i] - position[j])), i, j) for i, j in steps), default=(np.inf, 0, 0))
+            if chord > WIDEST_BRIDGE_MM:
+                break
+            strip.append((loop[j], loop[after] if j > after else loop[before], loop[i]))
+            before, after = i, j
+            if height[0] - (height[i] + height[j]) / 2 > STEEP_NOTCH * chord:
+                whole = len(strip)
+        if whole:
+            crown = _with_strip(crown, np.array(strip[:whole]))
+    return crown
+
+
+def _notches(crown: Mesh, occlusal: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    # The cervical line's highest points on either side of the tooth.
+    loop = crown.vertices_mm[boundary_loops(crown.faces)[0]]
+    height = loop @ occlusal
+    first = int(height.argmax())
+    ahead = (np.arange(len(loop)) - first) % len(loop)
+    opposite = (ahead > len(loop) // 4) & (ahead < 3 * len(loop) // 4)
+    return [loop[first], loop[int(np.where(opposite, height, -np.inf).argmax())]]
+
+
+def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
+    # The last chord gets vertices as dense as the cervical line's.
+    j, k, i = strip[-1]
+    start, end = crown.vertices_mm[i], crown.vertices_mm[j]
+    pieces = max(1, round(float(np.linalg.norm(end - start)) / ROW_MM))
+    between = start + np.linspace(0, 1, pieces + 1)[1:-1, None] * (end - start)
+    chord = np.array([i, *(len(crown.vertices_mm) + np.arange(pieces - 1)), j])
+    fan = np.stack([chord[1:], np.full(pieces, k), chord[:-1]], axis=1)
+    return Mesh(np.concatenate([crown.vertices_mm, between]), np.concatenate([crown.faces, strip[:-1], fan]).astype(np.int32))
 
 
 def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
