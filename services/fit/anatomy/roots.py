@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, manifold_piece, vector_area_mm2
+from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, manifold_piece, neighbours, vector_area_mm2
 
 STUB_MM = 4.0
 """How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""
@@ -36,7 +36,7 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
     if not boundary_loops(crown.faces):
         raise MeshError(f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is.")
-    crown, _ = fill_holes(crown)
+    crown, _ = fill_holes(_without_spikes(crown))
     if vector_area_mm2(crown) @ occlusal <= 0:
         raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
 
@@ -56,6 +56,19 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     solid = Mesh(vertices, np.concatenate([crown.faces, one.reshape(-1, 3), two.reshape(-1, 3), cap]).astype(np.int32))
     solid.require_solid(f"of {name}, closed by a root,")
     return solid
+
+
+def _without_spikes(crown: Mesh, rounds: int = 4) -> Mesh:
+    # Triangles that hang on by one edge, and the steps that are left in the boundary by them.
+    for _ in range(rounds):
+        spiked = np.count_nonzero(neighbours(crown.faces) < 0, axis=1) > 1
+        crown = Mesh(crown.vertices_mm, crown.faces[~spiked])
+        crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
+    vertices = crown.vertices_mm.copy()
+    for _ in range(rounds):
+        for loop in boundary_loops(crown.faces):
+            vertices[loop] = vertices[loop] / 2 + (vertices[np.roll(loop, 1)] + vertices[np.roll(loop, -1)]) / 4
+    return Mesh(vertices, crown.faces)
 
 
 def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
