@@ -9,6 +9,7 @@ import base64
 import binascii
 import zlib
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -164,7 +165,7 @@ def _decoded(source: bytes, header: str, *, encoded: bool, compressed: bool) -> 
         at = 0
         sizes = numbers(3 + blocks)[3:]
         data, ends = take(sum(sizes)), np.cumsum([0, *sizes])
-        return b"".join(zlib.decompress(data[low:high]) for low, high in zip(ends[:-1], ends[1:], strict=True))
+        return b"".join(zlib.decompress(data[low:high]) for low, high in pairwise(ends))
     if encoded and not source[: 4 * (-(-width // 3))].endswith(b"="):
         # Some writers encode the length and the bytes as one stream.
         count = int(np.frombuffer(base64.b64decode(source[:16])[:width], header)[0])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import boundary_loops
+from services.fit.anatomy.patches import boundary_loops, harmonic_rows, ring_faces
 
 COVER_MM = 1.5
 """Depth of gums beyond the deepest root and beyond the scan's rim."""
@@ -45,17 +45,14 @@ def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.f
     for _ in range(RIM_ROUNDS):
         outline = outline / 2 + (np.roll(outline, 1, axis=0) + np.roll(outline, -1, axis=0)) / 4
     steps = max(2, int(np.ceil((height[loop].mean() - base) / ROW_MM)))
-    along = np.linspace(0, 1, steps + 1)[1:, None]
-    wall = rim + along[..., None] * (outline - rim) + (height[loop] + along * (base - height[loop]))[..., None] * occlusal
+    wall = harmonic_rows(vertices[loop], outline + base * occlusal, steps)
     ring = np.concatenate([loop[None], len(vertices) + np.arange(steps * len(loop)).reshape(steps, -1)])
-    a, b = ring[:-1], np.roll(ring[:-1], -1, axis=1)
-    c, d = ring[1:], np.roll(ring[1:], -1, axis=1)
-    sides = np.concatenate([np.stack([b, a, c], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)])
+    everything = np.concatenate([vertices, wall.reshape(-1, 3)])
 
     across = np.linalg.svd(occlusal[None])[2][1:]
     across[1] = np.cross(occlusal, across[0])
     lid = ring[-1][fill_outline(outline @ across.T)][:, ::-1]
-    solid = Mesh(np.concatenate([vertices, wall.reshape(-1, 3)]), np.concatenate([surface.faces, sides, lid]).astype(np.int32))
+    solid = Mesh(everything, np.concatenate([surface.faces, ring_faces(ring, everything), lid]).astype(np.int32))
     solid.require_solid("of the gums, closed by a base,", (2.0, 200.0))
     return solid
 

@@ -16,9 +16,9 @@ from services.fit.anatomy.patches import (
     compact,
     fill_holes,
     manifold_piece,
-    pieces,
     smooth_borders,
     smooth_labels,
+    touching_pieces,
     vector_area_mm2,
     without_specks,
 )
@@ -76,22 +76,12 @@ def _require_whole_teeth(scan: LabelledScan) -> None:
     area = areas_mm2(scan.mesh)
     for number in scan.teeth:
         own = scan.fdi == number
-        vertices = np.unique(scan.mesh.faces[own], return_inverse=True)[1].reshape(-1, 3)
-        size = np.bincount(_vertex_pieces(vertices), weights=area[own])
+        size = np.bincount(touching_pieces(scan.mesh.faces[own]), weights=area[own])
         if size.max() < LARGEST_SHARE * size.sum():
             raise CaptureInputError(
-                f"The label of tooth {number} is in {len(size)} pieces, the largest {size.max() / size.sum():.0%} of its area; relabel the scan so that it is one."
+                f"The label of tooth {number} is in {len(size)} pieces, the largest {size.max() / size.sum():.0%} of its area; "
+                "relabel the scan so that it is one."
             )
-
-
-def _vertex_pieces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    count = int(faces.max()) + 1
-    one, two = faces.reshape(-1), np.roll(faces, 1, axis=1).reshape(-1)
-    number = connected_components(coo_matrix((np.ones(len(one)), (one, two)), shape=(count, count)), directed=False)[1]
-    return np.unique(number[faces[:, 0]], return_inverse=True)[1]
 
 
 def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:

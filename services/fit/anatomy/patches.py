@@ -26,6 +26,13 @@ def pieces(faces: Faces) -> NDArray[np.int64]:
     return _components(np.repeat(np.arange(len(faces)), 3)[across.reshape(-1) >= 0], across[across >= 0], len(faces))
 
 
+def touching_pieces(faces: Faces) -> NDArray[np.int64]:
+    """The same where a vertex in common connects, and edges may have any number of faces."""
+    vertices = np.unique(faces, return_inverse=True)[1].reshape(-1, 3)
+    number = _components(vertices.reshape(-1), np.roll(vertices, 1, axis=1).reshape(-1), int(vertices.max()) + 1)
+    return np.unique(number[vertices[:, 0]], return_inverse=True)[1]
+
+
 def areas_mm2(mesh: Mesh) -> NDArray[np.float64]:
     """Area (F,) of each face."""
     return np.linalg.norm(_crosses(mesh), axis=1) / 2
@@ -87,6 +94,33 @@ def compact(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices_mm[used], index.reshape(-1, 3).astype(np.int32))
 
 
+def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    """Rings (steps, N, 3) that lead from one ring of points (N, 3), left out, to another, each point the mean of its four neighbours.
+
+    Around the ring that is a Fourier series, whose wave k falls off over the rows as a hyperbolic sine of the rate with cosh(rate) = 2 - cos(2 pi k / N):
+    what is ragged in a ring ends within a few rows.
+    """
+    count = len(first_mm)
+    rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(1, count) / count))
+    row = np.arange(1, steps + 1)[:, None]
+    from_first, from_last = 1 - np.broadcast_to(row, (steps, count)) / steps, np.broadcast_to(row, (steps, count)) / steps
+    # sinh(rate n) / sinh(rate steps) without overflow.
+    from_first[:, 1:] = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
+    from_last[:, 1:] = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
+    waves = from_first[..., None] * np.fft.fft(first_mm, axis=0) + from_last[..., None] * np.fft.fft(last_mm, axis=0)
+    return np.asarray(np.fft.ifft(waves, axis=1).real)
+
+
+def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads split along their shorter diagonal."""
+    a, b = rings[:-1], np.roll(rings[:-1], -1, axis=1)
+    c, d = rings[1:], np.roll(rings[1:], -1, axis=1)
+    falling = (np.linalg.norm(vertices_mm[b] - vertices_mm[c], axis=-1) <= np.linalg.norm(vertices_mm[a] - vertices_mm[d], axis=-1))[..., None]
+    one = np.where(falling, np.stack([b, a, c], -1), np.stack([b, a, d], -1))
+    two = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
+    return np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
+
+
 def smooth_labels(faces: Faces, labels: NDArray[np.int64], rounds: int = 10) -> NDArray[np.int64]:
     """Labels (F,) after faces with two neighbours of one other label have taken it, again and again."""
     across = neighbours(faces)
@@ -127,7 +161,7 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
     border = np.where(across >= 0, labels[across] != labels[:, None], True)
     start, end = mesh.faces[border], np.roll(mesh.faces, -1, axis=1)[border]
     start, end = np.concatenate([start, end]), np.concatenate([end, start])
-    moving, degree = np.unique(start, return_inverse=False), np.bincount(start, minlength=len(mesh.vertices_mm))
+    moving, degree = np.unique(start), np.bincount(start, minlength=len(mesh.vertices_mm))
     vertices = mesh.vertices_mm.copy()
     for _ in range(rounds):
         total = np.stack([np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1)
@@ -157,7 +191,7 @@ def _components(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> N
 
 
 def _largest(number: NDArray[np.int64], weight: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return number == np.bincount(number, weights=weight).argmax()
+    return np.asarray(number == np.bincount(number, weights=weight).argmax())
 
 
 def _first_of_equals(faces: Faces) -> NDArray[np.bool_]:
@@ -190,4 +224,4 @@ def _largest_fans(faces: Faces) -> NDArray[np.bool_]:
     order = np.lexsort((size, vertex_of_fan))
     best = np.zeros(len(size), dtype=bool)
     best[order[np.append(np.diff(vertex_of_fan[order]) > 0, True)]] = True
-    return best[fan].reshape(-1, 3).all(axis=1)
+    return np.asarray(best[fan].reshape(-1, 3).all(axis=1))

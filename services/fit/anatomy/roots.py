@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, manifold_piece, neighbours, vector_area_mm2
+from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, harmonic_rows, manifold_piece, neighbours, ring_faces, vector_area_mm2
 
 STUB_MM = 4.0
 """How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""
@@ -45,15 +45,9 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     loop = boundary_loops(crown.faces)[0]
     first, around = len(crown.vertices_mm), len(loop)
     ring = np.concatenate([loop[None], first + np.arange(len(rows) * around).reshape(len(rows), around)])
-    a, b = ring[:-1], np.roll(ring[:-1], -1, axis=1)
-    c, d = ring[1:], np.roll(ring[1:], -1, axis=1)
     vertices = np.concatenate([crown.vertices_mm, rows.reshape(-1, 3), pole[None]])
-    # Each quad is split along its shorter diagonal.
-    short = (np.linalg.norm(vertices[b] - vertices[c], axis=-1) <= np.linalg.norm(vertices[a] - vertices[d], axis=-1))[..., None]
-    one = np.where(short, np.stack([b, a, c], -1), np.stack([b, a, d], -1))
-    two = np.where(short, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
     cap = np.stack([np.roll(ring[-1], -1), ring[-1], np.full(around, len(vertices) - 1)], axis=-1)
-    solid = Mesh(vertices, np.concatenate([crown.faces, one.reshape(-1, 3), two.reshape(-1, 3), cap]).astype(np.int32))
+    solid = Mesh(vertices, np.concatenate([crown.faces, ring_faces(ring, vertices), cap]).astype(np.int32))
     solid.require_solid(f"of {name}, closed by a root,")
     return solid
 
@@ -126,24 +120,10 @@ def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub
     end_height = height.min() - stub_mm + ROUNDING_MM
 
     steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
-    wall = _harmonic_rows(loop_mm, end + end_height * occlusal, steps)
+    wall = harmonic_rows(loop_mm, end + end_height * occlusal, steps)
     bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
     lid = np.stack([centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal for bend in bends])
     return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
-
-
-def _harmonic_rows(first: NDArray[np.float64], last: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
-    # Rings of N points after the first one up to the last one, each point the mean of its four neighbours. Around the ring that is a Fourier series, whose
-    # wave k falls off over the rows as a hyperbolic sine with 2 cosh(rate) = 4 - 2 cos(2 pi k / N): what is ragged ends within a few rows.
-    count = len(first)
-    rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(count) / count))
-    row = np.arange(1, steps + 1)[:, None]
-    with np.errstate(invalid="ignore"):
-        from_last = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
-        from_first = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
-    from_last[:, 0], from_first[:, 0] = row[:, 0] / steps, 1 - row[:, 0] / steps
-    waves = from_first[..., None] * np.fft.fft(first, axis=0) + from_last[..., None] * np.fft.fft(last, axis=0)
-    return np.asarray(np.fft.ifft(waves, axis=1).real)
 
 
 def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
