@@ -156,12 +156,12 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
     """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly vanish."""
     from services.fit.anatomy.distance import SurfaceDistance
 
-    # Edges between labels, and the outer boundary: each of their vertices moves towards the mean of its two or three neighbours along them.
+    # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line ends at the scan's rim.
     across = neighbours(mesh.faces)
-    border = np.where(across >= 0, labels[across] != labels[:, None], True)
+    border = (across >= 0) & (labels[across] != labels[:, None])
     start, end = mesh.faces[border], np.roll(mesh.faces, -1, axis=1)[border]
-    start, end = np.concatenate([start, end]), np.concatenate([end, start])
-    moving, degree = np.unique(start), np.bincount(start, minlength=len(mesh.vertices_mm))
+    degree = np.bincount(start, minlength=len(mesh.vertices_mm))
+    moving = np.flatnonzero(degree > 1)
     vertices = mesh.vertices_mm.copy()
     for _ in range(rounds):
         total = np.stack([np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1)
@@ -195,17 +195,23 @@ def _largest(number: NDArray[np.int64], weight: NDArray[np.float64]) -> NDArray[
 
 
 def _first_of_equals(faces: Faces) -> NDArray[np.bool_]:
+    ordered = np.sort(faces, axis=1)
+    order = np.lexsort(ordered.T)
     first = np.zeros(len(faces), dtype=bool)
-    first[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = True
+    first[order[np.append(True, (np.diff(ordered[order], axis=0) != 0).any(axis=1))]] = True
     return first
 
 
 def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
     # Not three faces at an edge, and not two that run along it in the same direction.
-    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    several = [np.unique(e, axis=0, return_inverse=True, return_counts=True)[1:] for e in (np.sort(edges, axis=1), edges)]
-    counts = [count[index.reshape(-1)].reshape(-1, 3).max(axis=1) for index, count in several]
-    return (counts[0] <= 2) & (counts[1] == 1)
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    count = int(faces.max()) + 1
+
+    def shared_by(key: NDArray[np.int64]) -> NDArray[np.int64]:
+        _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
+        return np.asarray(counts[index.reshape(-1, 3)].max(axis=1))
+
+    return (shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2) & (shared_by(start * count + end) == 1)
 
 
 def _largest_fans(faces: Faces) -> NDArray[np.bool_]:
