@@ -14,8 +14,10 @@ STUB_MM = 4.0
 TAPER = 0.72
 """Width of the root's end to that of the cervical line."""
 ROUNDING_MM = 1.2
+"""Height of the root's rounded end, part of ``STUB_MM``."""
 ROW_MM = 0.45
 WIDEST_BRIDGE_MM = 3.5
+"""Between the two sides of a contact; wider, they are a tooth's front and back."""
 STEEP_NOTCH = 0.5
 """Depth to width above which the cervical line's rise between two teeth is taken for a contact."""
 HARMONICS = 3
@@ -41,8 +43,8 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
         raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
 
     crown = _bridge_contacts(crown, occlusal)
-    rows, pole = _stub_rows(crown.vertices_mm[boundary_loops(crown.faces)[0]], occlusal, stub_mm)
     loop = boundary_loops(crown.faces)[0]
+    rows, pole = _stub_rows(crown.vertices_mm[loop], occlusal, stub_mm)
     first, around = len(crown.vertices_mm), len(loop)
     ring = np.concatenate([loop[None], first + np.arange(len(rows) * around).reshape(len(rows), around)])
     vertices = np.concatenate([crown.vertices_mm, rows.reshape(-1, 3), pole[None]])
@@ -69,10 +71,10 @@ def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
     # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two sides of each such notch.
     for apex in _notches(crown, occlusal):
         loop = boundary_loops(crown.faces)[0]
-        position = np.roll(crown.vertices_mm[loop], -int(np.argmin(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1))), axis=0)
-        loop = np.roll(loop, -int(np.argmin(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1))))
-        edges = set(map(tuple, np.sort(crown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()))
+        loop = np.roll(loop, -int(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1).argmin()))
+        position = crown.vertices_mm[loop]
         height = position @ occlusal
+        edges = set(map(tuple, np.sort(crown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()))
         before, after, strip, whole = 0, 0, [], 0
         while after - before < len(loop) // 2:
             # The shorter of the two next chords.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, InputError
 from services.core.geometry import Mesh
-from services.core.vtk_polydata import read_polydata
+from services.core.meshfiles import read_labelled_mesh
 
 Numbering = Literal["universal", "fdi"]
 
@@ -55,15 +55,14 @@ def read_scan(path: Path, numbering: Numbering = "universal", array: str = "Labe
     Raises:
         CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one jaw. MeshError: not in millimetres.
     """
-    vertices, faces, arrays = _surface(path)
+    mesh, arrays = read_labelled_mesh(path)
     found = next((values for name, values in arrays.items() if name.lower() == array.lower()), None)
     if found is None:
         held = ", ".join(sorted(arrays)) or "none"
         raise CaptureInputError(f"Scan {path} has no label per triangle named {array} (it has: {held}); export it with its segmentation.")
     values = np.asarray(found, dtype=np.float64)
-    if values.shape != (len(faces),):
-        raise CaptureInputError(f"Scan {path} has labels {array} of shape {values.shape} for {len(faces)} triangles; export one label per triangle.")
-    mesh = Mesh(vertices, faces)
+    if values.shape != (len(mesh.faces),):
+        raise CaptureInputError(f"Scan {path} has labels {array} of shape {values.shape} for {len(mesh.faces)} triangles; export one label per triangle.")
     mesh.require_surface(f"of scan {path}", EXTENT_MM)
     scan = LabelledScan(mesh, _fdi_numbers(values, numbering, path))
     if not (scan.fdi == GINGIVA).any():
@@ -73,26 +72,6 @@ def read_scan(path: Path, numbering: Numbering = "universal", array: str = "Labe
     if len({number // 10 in (1, 2) for number in scan.teeth}) > 1:
         raise CaptureInputError(f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend the labels.")
     return scan
-
-
-def _surface(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], dict[str, NDArray[Any]]]:
-    if path.suffix.lower() == ".vtp":
-        data = read_polydata(path)
-        return data.points, data.triangles, data.cell_arrays
-    if path.suffix.lower() != ".ply":
-        raise CaptureInputError(f"Scan {path} is neither .vtp nor .ply; export it as labelled VTK PolyData or PLY.")
-    if not path.is_file():
-        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
-    import trimesh
-
-    try:
-        loaded = trimesh.load_mesh(path, process=False)
-        properties = loaded.metadata["_ply_raw"]["face"]["data"]
-        names = properties.dtype.names if isinstance(properties, np.ndarray) else tuple(properties)
-        arrays = {name: np.asarray(properties[name]).reshape(-1) for name in names if name not in ("vertex_indices", "vertex_index")}
-        return np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32), arrays
-    except Exception as problem:
-        raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
 
 
 def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) -> NDArray[np.int64]:
