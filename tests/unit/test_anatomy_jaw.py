@@ -278,8 +278,9 @@ def test_real_teeth_show_their_outside(jaw: ScannedJaw) -> None:
         seen += np.count_nonzero(hits.hit)
         inverted += np.count_nonzero(hits.hit & (hits.normals @ direction > 0))
     assert seen > 50_000
-    # Where the borders of two touching teeth cross over, a root's wall may begin folded: 2e-4 was measured.
-    assert inverted < 1e-3 * seen
+    # Where the borders of two touching teeth cross over, a root's wall may begin folded: 7 rays were measured, and several times as many without
+    # the strips at contacts.
+    assert inverted < 20
 
 
 def test_a_manifold_piece_has_one_fan_at_each_vertex() -> None:
