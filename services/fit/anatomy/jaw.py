@@ -57,7 +57,7 @@ def build_jaw(scan: LabelledScan) -> ScannedJaw:
     surface, labels = _clean(scan)
     crowns = {number: compact(Mesh(surface.vertices_mm, surface.faces[labels == number])) for number in scan.teeth}
     middles = np.array([np.average(crown.vertices_mm[crown.faces].mean(axis=1), axis=0, weights=areas_mm2(crown)) for crown in crowns.values()])
-    rotation = _arch_axes(scan.teeth, crowns, middles)
+    rotation = _arch_axes(scan.teeth, surface, middles)
     turned = surface.vertices_mm @ rotation.T
     shift = -(turned.min(axis=0) + turned.max(axis=0)) / 2
 
@@ -98,13 +98,13 @@ def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:
     return smooth_borders(surface, labels), labels
 
 
-def _arch_axes(teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArray[np.float64]) -> NDArray[np.float64]:
-    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it to their own openings.
-    openings = np.sum([vector_area_mm2(crown) for crown in crowns.values()], axis=0)
+def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float64]) -> NDArray[np.float64]:
+    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it to the normal of the scan's rim.
+    opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
     plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
-    occlusal = principal[2] if plane else openings - (openings @ principal[0]) * principal[0]
-    occlusal = _unit(occlusal * np.sign(occlusal @ openings))
+    occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
+    occlusal = _unit(occlusal * np.sign(occlusal @ opening))
 
     # The turn about it that brings the crowns nearest to an average arch's; to a mirrored one they must not be nearer by far.
     side = np.linalg.svd(occlusal[None])[2][1]
