@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
 from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.gums import gums_solid
+from services.fit.anatomy.scanned_gums import gums_solid
 from services.fit.anatomy.patches import (
     areas_mm2,
     compact,
@@ -47,7 +47,7 @@ class ScannedJaw:
     """Rigid transform (4, 4)."""
 
 
-def build_jaw(scan: LabelledScan) -> ScannedJaw:
+def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
     """Close every crown and the gums of a scan.
 
     Raises:

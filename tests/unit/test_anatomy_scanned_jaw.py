@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh
 from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.gums import fill_outline
-from services.fit.anatomy.jaw import STEEPEST_TILT_DEG, ScannedJaw, build_jaw
+from services.fit.anatomy.scanned_gums import fill_outline
+from services.fit.anatomy.scanned_jaw import STEEPEST_TILT_DEG, ScannedJaw, jaw_from_scan
 from services.fit.anatomy.patches import areas_mm2, boundary_loops, harmonic_rows, manifold_piece, touching_pieces
 from services.fit.anatomy.rays import RayScene
 from services.fit.anatomy.roots import STUB_MM, close_crown
@@ -28,7 +28,7 @@ FOUR = bumps({12: (-12.5, -6.0), 11: (-4.5, 0.0), 21: (4.5, 0.0), 22: (12.5, -6.
 
 @pytest.fixture(scope="module")
 def pair() -> ScannedJaw:
-    return build_jaw(PAIR)
+    return jaw_from_scan(PAIR)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def arch() -> LabelledScan:
 
 @pytest.fixture(scope="module")
 def jaw(arch: LabelledScan) -> ScannedJaw:
-    return build_jaw(arch)
+    return jaw_from_scan(arch)
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +103,13 @@ def test_axes_follow_the_arch(pair: ScannedJaw) -> None:
 
 
 def test_lower_teeth_have_x_to_the_patients_right() -> None:
-    lower = build_jaw(replace(PAIR, fdi=np.select([PAIR.fdi == 11, PAIR.fdi == 21], [31, 41], 0)))
+    lower = jaw_from_scan(replace(PAIR, fdi=np.select([PAIR.fdi == 11, PAIR.fdi == 21], [31, 41], 0)))
     assert [tooth.fdi for tooth in lower.teeth] == [31, 41]
     np.testing.assert_allclose(lower.arch_from_scan[:3, :3], np.eye(3), atol=2e-3)
 
 
 def test_neighbours_bend_the_arch() -> None:
-    jaw = build_jaw(FOUR)
+    jaw = jaw_from_scan(FOUR)
     middles = {tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
     buccal = {tooth.fdi: frame.axes[1] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
     assert middles[12][0] < middles[11][0] < middles[21][0] < middles[22][0]
@@ -121,9 +121,9 @@ def test_neighbours_bend_the_arch() -> None:
 def test_a_moved_scan_gives_the_same_jaw() -> None:
     # Uneven points, so that no choice hangs on rounding, such as that of the shorter of two equal diagonals.
     points = PAIR.mesh.vertices_mm + np.random.default_rng(3).normal(scale=0.02, size=PAIR.mesh.vertices_mm.shape)
-    pair = build_jaw(replace(PAIR, mesh=Mesh(points, PAIR.mesh.faces)))
+    pair = jaw_from_scan(replace(PAIR, mesh=Mesh(points, PAIR.mesh.faces)))
     turn, shift = Rotation.from_rotvec([0.7, -1.9, 0.4]).as_matrix(), np.array([150.0, -80.0, 420.0])
-    moved = build_jaw(LabelledScan(Mesh(points @ turn.T + shift, PAIR.mesh.faces), PAIR.fdi))
+    moved = jaw_from_scan(LabelledScan(Mesh(points @ turn.T + shift, PAIR.mesh.faces), PAIR.fdi))
     for one, two in zip((*(tooth.outer for tooth in pair.teeth), pair.gums), (*(tooth.outer for tooth in moved.teeth), moved.gums), strict=True):
         assert SurfaceDistance(one, 0.2).closest(two.vertices_mm)[1].max() < 1e-6
     point = np.array([[1.0, 2.0, 3.0]])
@@ -142,7 +142,7 @@ def test_dirt_in_the_scan_does_not_show(pair: ScannedJaw) -> None:
     fin, island = [faces[top + 300, 0], faces[top + 300, 1], count], [count + 1, count + 2, count + 3]
     extra = np.array([fin, faces[40], island], dtype=np.int32)
     points = np.concatenate([PAIR.mesh.vertices_mm, PAIR.mesh.vertices_mm[faces[top + 300, 0]] + [[0, 0, 1]], np.eye(3) + 12.0])
-    dirty = build_jaw(LabelledScan(Mesh(points, np.concatenate([faces[kept], extra])), np.concatenate([fdi[kept], [0, 0, 11]])))
+    dirty = jaw_from_scan(LabelledScan(Mesh(points, np.concatenate([faces[kept], extra])), np.concatenate([fdi[kept], [0, 0, 11]])))
     for tooth, clean in zip(dirty.teeth, pair.teeth, strict=True):
         require_tidy(tooth.outer, "dirty")
         # Borders may move by a triangle, of a crown that is 12 mm across at most.
@@ -155,20 +155,20 @@ def test_a_tooth_in_pieces_is_refused() -> None:
     corner = (PAIR.mesh.vertices_mm[PAIR.mesh.faces].mean(axis=1)[:, :2] > 6.0).all(axis=1)
     labels = np.select([corner, PAIR.fdi == 21], [21, 11], PAIR.fdi)
     with pytest.raises(CaptureInputError, match=r"label of tooth 11 is in 2 pieces, the largest \d\d% of its area; relabel the scan"):
-        build_jaw(replace(PAIR, fdi=labels))
+        jaw_from_scan(replace(PAIR, fdi=labels))
 
 
 def test_a_tooth_apart_from_the_jaw_is_refused() -> None:
     keep = np.ones(len(PAIR.fdi), dtype=bool)
     keep[(PAIR.fdi == 0) & np.isin(PAIR.mesh.faces, np.unique(PAIR.mesh.faces[PAIR.fdi == 21])).any(axis=1)] = False
     with pytest.raises(CaptureInputError, match="tooth 21 hangs together with nothing else"):
-        build_jaw(LabelledScan(Mesh(PAIR.mesh.vertices_mm, PAIR.mesh.faces[keep]), PAIR.fdi[keep]))
+        jaw_from_scan(LabelledScan(Mesh(PAIR.mesh.vertices_mm, PAIR.mesh.faces[keep]), PAIR.fdi[keep]))
 
 
 def test_exchanged_sides_are_refused() -> None:
     other = {11: 21, 21: 11, 12: 22, 22: 12, 0: 0}
     with pytest.raises(CaptureInputError, match="wrong way around the arch; exchange left and right"):
-        build_jaw(replace(FOUR, fdi=np.array([other[int(number)] for number in FOUR.fdi])))
+        jaw_from_scan(replace(FOUR, fdi=np.array([other[int(number)] for number in FOUR.fdi])))
 
 
 def test_crowns_that_are_no_crowns_are_refused(pair: ScannedJaw) -> None:
