@@ -1,0 +1,233 @@
+"""Parts of a triangle surface by label: neighbours, connected pieces, boundary loops, and what makes them manifold."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+
+Faces = NDArray[np.int32]
+
+
+def neighbours(faces: Faces) -> NDArray[np.int64]:
+    """Face (F, 3) across each edge, which runs from corner k to corner k + 1; -1 at a boundary. Each edge has at most two faces."""
+    count = int(faces.max()) + 1
+    start, end = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
+    key, twin = start * count + end, end * count + start
+    order = np.argsort(key)
+    place = np.minimum(np.searchsorted(key[order], twin), len(key) - 1)
+    return np.where(key[order][place] == twin, order[place] // 3, -1).reshape(-1, 3)
+
+
+def pieces(faces: Faces) -> NDArray[np.int64]:
+    """Number (F,) of the connected piece that each face belongs to; pieces that touch at a vertex alone are two."""
+    across = neighbours(faces)
+    return _components(np.repeat(np.arange(len(faces)), 3)[across.reshape(-1) >= 0], across[across >= 0], len(faces))
+
+
+def touching_pieces(faces: Faces) -> NDArray[np.int64]:
+    """The same where a vertex in common connects, and edges may have any number of faces."""
+    vertices = np.unique(faces, return_inverse=True)[1].reshape(-1, 3)
+    number = _components(vertices.reshape(-1), np.roll(vertices, 1, axis=1).reshape(-1), int(vertices.max()) + 1)
+    return np.unique(number[vertices[:, 0]], return_inverse=True)[1]
+
+
+def areas_mm2(mesh: Mesh) -> NDArray[np.float64]:
+    """Area (F,) of each face."""
+    return np.linalg.norm(_crosses(mesh), axis=1) / 2
+
+
+def vector_area_mm2(mesh: Mesh) -> NDArray[np.float64]:
+    """Sum of the faces' normals times their areas (3,): for a cap, the normal of its boundary loop."""
+    return _crosses(mesh).sum(axis=0) / 2
+
+
+def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
+    """Faces (F,) of the largest piece without edges of three faces and without pieces that hang together at a vertex alone."""
+    area = areas_mm2(mesh)
+    kept = (area > 0) & _first_of_equals(mesh.faces)
+    while True:
+        before = np.count_nonzero(kept)
+        index = np.flatnonzero(kept)
+        index = index[_simple_edges(mesh.faces[index])]
+        index = index[_largest_fans(mesh.faces[index])]
+        index = index[_largest(pieces(mesh.faces[index]), area[index])]
+        kept = np.zeros(len(mesh.faces), dtype=bool)
+        kept[index] = True
+        if len(index) == before:
+            return kept
+
+
+def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
+    """Vertices of each boundary loop of a manifold piece in the direction of its faces' edges, the loop of most vertices first."""
+    open_edge = (neighbours(faces) < 0).reshape(-1)
+    following = dict(zip(faces.reshape(-1)[open_edge].tolist(), np.roll(faces, -1, axis=1).reshape(-1)[open_edge].tolist(), strict=True))
+    loops = []
+    while following:
+        first, vertex = following.popitem()
+        loop = [first]
+        while vertex != first:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        loops.append(np.array(loop))
+    return sorted(loops, key=len, reverse=True)
+
+
+def fill_holes(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
+    """Close every boundary loop but the longest by a fan about its middle; for the new faces, the old face (N,) across their outer edge."""
+    across, owner = neighbours(mesh.faces), {}
+    for face, corner in np.argwhere(across < 0):
+        owner[int(mesh.faces[face, corner])] = int(face)
+    vertices, faces, sources = [mesh.vertices_mm], [mesh.faces], []
+    for number, loop in enumerate(boundary_loops(mesh.faces)[1:]):
+        vertices.append(mesh.vertices_mm[loop].mean(axis=0, keepdims=True))
+        middle = np.full(len(loop), len(mesh.vertices_mm) + number)
+        faces.append(np.stack([np.roll(loop, -1), loop, middle], axis=1).astype(np.int32))
+        sources += [owner[int(vertex)] for vertex in loop]
+    return Mesh(np.concatenate(vertices), np.concatenate(faces)), np.array(sources, dtype=np.int64)
+
+
+def compact(mesh: Mesh) -> Mesh:
+    """The same faces without vertices that none of them uses."""
+    used, index = np.unique(mesh.faces, return_inverse=True)
+    return Mesh(mesh.vertices_mm[used], index.reshape(-1, 3).astype(np.int32))
+
+
+def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    """Rings (steps, N, 3) that lead from one ring of points (N, 3), left out, to another, each point the mean of its four neighbours.
+
+    Around the ring that is a Fourier series, whose wave k falls off over the rows as a hyperbolic sine of the rate with cosh(rate) = 2 - cos(2 pi k / N):
+    what is ragged in a ring ends within a few rows.
+    """
+    count = len(first_mm)
+    rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(1, count) / count))
+    row = np.arange(1, steps + 1)[:, None]
+    from_first, from_last = 1 - np.broadcast_to(row, (steps, count)) / steps, np.broadcast_to(row, (steps, count)) / steps
+    # sinh(rate n) / sinh(rate steps) without overflow.
+    from_first[:, 1:] = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
+    from_last[:, 1:] = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
+    waves = from_first[..., None] * np.fft.fft(first_mm, axis=0) + from_last[..., None] * np.fft.fft(last_mm, axis=0)
+    return np.asarray(np.fft.ifft(waves, axis=1).real)
+
+
+def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads split along their shorter diagonal."""
+    a, b = rings[:-1], np.roll(rings[:-1], -1, axis=1)
+    c, d = rings[1:], np.roll(rings[1:], -1, axis=1)
+    falling = (np.linalg.norm(vertices_mm[b] - vertices_mm[c], axis=-1) <= np.linalg.norm(vertices_mm[a] - vertices_mm[d], axis=-1))[..., None]
+    one = np.where(falling, np.stack([b, a, c], -1), np.stack([b, a, d], -1))
+    two = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
+    return np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
+
+
+def smooth_labels(faces: Faces, labels: NDArray[np.int64], rounds: int = 10) -> NDArray[np.int64]:
+    """Labels (F,) after faces with two neighbours of one other label have taken it, again and again."""
+    across = neighbours(faces)
+    for _ in range(rounds):
+        around = np.where(across >= 0, labels[across], labels[:, None])
+        for k in range(3):
+            one, two = around[:, k], around[:, (k + 1) % 3]
+            labels = np.where((one == two) & (one != labels), one, labels)
+    return labels
+
+
+def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -> NDArray[np.int64]:
+    """Labels (F,) after pieces that hold less than ``share`` of their label's area have taken a neighbour's."""
+    across, area = neighbours(mesh.faces), areas_mm2(mesh)
+    speck = np.zeros(len(labels), dtype=bool)
+    for label in np.unique(labels):
+        own = np.flatnonzero(labels == label)
+        number = pieces(mesh.faces[own])
+        size = np.bincount(number, weights=area[own])
+        speck[own] = size[number] < share * size.sum()
+    labels = labels.copy()
+    while speck.any():
+        beside = (across >= 0) & ~speck[across] & speck[:, None]
+        reached = np.flatnonzero(beside.any(axis=1))
+        if len(reached) == 0:
+            break
+        labels[reached] = labels[across[reached, beside[reached].argmax(axis=1)]]
+        speck[reached] = False
+    return labels
+
+
+def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Mesh:
+    """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly vanish."""
+    from services.fit.anatomy.distance import SurfaceDistance
+
+    # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line ends at the scan's rim.
+    across = neighbours(mesh.faces)
+    border = (across >= 0) & (labels[across] != labels[:, None])
+    start, end = mesh.faces[border], np.roll(mesh.faces, -1, axis=1)[border]
+    degree = np.bincount(start, minlength=len(mesh.vertices_mm))
+    moving = np.flatnonzero(degree > 1)
+    vertices = mesh.vertices_mm.copy()
+    for _ in range(rounds):
+        total = np.stack([np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1)
+        vertices[moving] = (vertices[moving] + total[moving] / degree[moving, None]) / 2
+    vertices[moving] = SurfaceDistance(mesh).closest(vertices[moving])[0]
+
+    normals, area = _crosses(mesh), 2 * areas_mm2(mesh)
+    for _ in range(20):
+        moved = _crosses(Mesh(vertices, mesh.faces))
+        bad = np.einsum("ij,ij->i", normals, moved) < np.maximum(0.5 * area * np.linalg.norm(moved, axis=1), 0.1 * area**2)
+        if not bad.any() or np.array_equal(vertices[mesh.faces[bad]], mesh.vertices_mm[mesh.faces[bad]]):
+            break
+        vertices[mesh.faces[bad]] = mesh.vertices_mm[mesh.faces[bad]]
+    return Mesh(vertices, mesh.faces)
+
+
+def _crosses(mesh: Mesh) -> NDArray[np.float64]:
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _components(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    return np.asarray(connected_components(coo_matrix((np.ones(len(one)), (one, two)), shape=(count, count)), directed=False)[1], dtype=np.int64)
+
+
+def _largest(number: NDArray[np.int64], weight: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(number == np.bincount(number, weights=weight).argmax())
+
+
+def _first_of_equals(faces: Faces) -> NDArray[np.bool_]:
+    ordered = np.sort(faces, axis=1)
+    order = np.lexsort(ordered.T)
+    first = np.zeros(len(faces), dtype=bool)
+    first[order[np.append(True, (np.diff(ordered[order], axis=0) != 0).any(axis=1))]] = True
+    return first
+
+
+def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
+    # Not three faces at an edge, and not two that run along it in the same direction.
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    count = int(faces.max()) + 1
+
+    def shared_by(key: NDArray[np.int64]) -> NDArray[np.int64]:
+        _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
+        return np.asarray(counts[index.reshape(-1, 3)].max(axis=1))
+
+    return (shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2) & (shared_by(start * count + end) == 1)
+
+
+def _largest_fans(faces: Faces) -> NDArray[np.bool_]:
+    # Corners of one vertex are joined across the edges that end there; of several fans about a vertex, the one of most faces stays.
+    across = neighbours(faces)
+    face, k = np.nonzero(across >= 0)
+    other = across[face, k]
+    joined = []
+    for corner in (k, (k + 1) % 3):
+        vertex = faces[face, corner]
+        joined.append((3 * face + corner, 3 * other + (faces[other] == vertex[:, None]).argmax(axis=1)))
+    fan = _components(np.concatenate([a for a, _ in joined]), np.concatenate([b for _, b in joined]), 3 * len(faces))
+    size = np.bincount(fan)
+    vertex_of_fan = np.zeros(len(size), dtype=np.int64)
+    vertex_of_fan[fan] = faces.reshape(-1)
+    order = np.lexsort((size, vertex_of_fan))
+    best = np.zeros(len(size), dtype=bool)
+    best[order[np.append(np.diff(vertex_of_fan[order]) > 0, True)]] = True
+    return np.asarray(best[fan].reshape(-1, 3).all(axis=1))

@@ -1,0 +1,144 @@
+"""Roots for scanned crowns: an open crown becomes a solid by a tapering stub along the tooth's axis from its cervical line."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import MeshError
+from services.core.geometry import Mesh
+from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, harmonic_rows, manifold_piece, neighbours, ring_faces, vector_area_mm2
+
+STUB_MM = 4.0
+"""How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""
+TAPER = 0.72
+"""Width of the root's end to that of the cervical line."""
+ROUNDING_MM = 1.2
+"""Height of the root's rounded end, part of ``STUB_MM``."""
+ROW_MM = 0.45
+WIDEST_BRIDGE_MM = 3.5
+"""Between the two sides of a contact; wider, they are a tooth's front and back."""
+STEEP_NOTCH = 0.5
+"""Depth to width above which the cervical line's rise between two teeth is taken for a contact."""
+HARMONICS = 3
+"""Of the closed curve that the root's cross-section ends in."""
+
+
+def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: float = STUB_MM) -> Mesh:
+    """A watertight solid whose surface outside the gums is the crown's own triangles.
+
+    Args:
+        crown: open surface, one piece but for what is thrown away: specks, and faces at edges of more than two.
+        occlusal: unit vector along the tooth's axis, out of the mouth's gums.
+        name: of the tooth, for errors.
+
+    Raises:
+        MeshError: the crown is closed, or not cut off by its cervical line across the axis.
+    """
+    crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
+    if not boundary_loops(crown.faces):
+        raise MeshError(f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is.")
+    crown, _ = fill_holes(_without_spikes(crown))
+    if vector_area_mm2(crown) @ occlusal <= 0:
+        raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
+
+    crown = _bridge_contacts(crown, occlusal)
+    loop = boundary_loops(crown.faces)[0]
+    rows, pole = _stub_rows(crown.vertices_mm[loop], occlusal, stub_mm)
+    first, around = len(crown.vertices_mm), len(loop)
+    ring = np.concatenate([loop[None], first + np.arange(len(rows) * around).reshape(len(rows), around)])
+    vertices = np.concatenate([crown.vertices_mm, rows.reshape(-1, 3), pole[None]])
+    cap = np.stack([np.roll(ring[-1], -1), ring[-1], np.full(around, len(vertices) - 1)], axis=-1)
+    solid = Mesh(vertices, np.concatenate([crown.faces, ring_faces(ring, vertices), cap]).astype(np.int32))
+    solid.require_solid(f"of {name}, closed by a root,")
+    return solid
+
+
+def _without_spikes(crown: Mesh, rounds: int = 4) -> Mesh:
+    # Triangles that hang on by one edge, and the steps that are left in the boundary by them.
+    for _ in range(rounds):
+        spiked = np.count_nonzero(neighbours(crown.faces) < 0, axis=1) > 1
+        crown = Mesh(crown.vertices_mm, crown.faces[~spiked])
+        crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
+    vertices = crown.vertices_mm.copy()
+    for _ in range(rounds):
+        for loop in boundary_loops(crown.faces):
+            vertices[loop] = vertices[loop] / 2 + (vertices[np.roll(loop, 1)] + vertices[np.roll(loop, -1)]) / 4
+    return Mesh(vertices, crown.faces)
+
+
+def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
+    # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two sides of each such notch.
+    for apex in _notches(crown, occlusal):
+        loop = boundary_loops(crown.faces)[0]
+        loop = np.roll(loop, -int(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1).argmin()))
+        position = crown.vertices_mm[loop]
+        height = position @ occlusal
+        edges = set(map(tuple, np.sort(crown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()))
+        before, after, strip, whole = 0, 0, [], 0
+        while after - before < len(loop) // 2:
+            # The shorter of the two next chords.
+            steps = [(before - 1, after), (before, after + 1)] if before or after else [(-1, 1)]
+            steps = [(i, j) for i, j in steps if tuple(sorted((int(loop[i]), int(loop[j])))) not in edges]
+            chord, i, j = min(((float(np.linalg.norm(position[i] - position[j])), i, j) for i, j in steps), default=(np.inf, 0, 0))
+            if chord > WIDEST_BRIDGE_MM:
+                break
+            strip.append((loop[j], loop[after] if j > after else loop[before], loop[i]))
+            before, after = i, j
+            if height[0] - (height[i] + height[j]) / 2 > STEEP_NOTCH * chord:
+                whole = len(strip)
+        if whole:
+            crown = _with_strip(crown, np.array(strip[:whole]))
+    return crown
+
+
+def _notches(crown: Mesh, occlusal: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    # The cervical line's highest points on either side of the tooth.
+    loop = crown.vertices_mm[boundary_loops(crown.faces)[0]]
+    height = loop @ occlusal
+    first = int(height.argmax())
+    ahead = (np.arange(len(loop)) - first) % len(loop)
+    opposite = (ahead > len(loop) // 4) & (ahead < 3 * len(loop) // 4)
+    return [loop[first], loop[int(np.where(opposite, height, -np.inf).argmax())]]
+
+
+def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
+    # The last chord gets vertices as dense as the cervical line's.
+    j, k, i = strip[-1]
+    start, end = crown.vertices_mm[i], crown.vertices_mm[j]
+    pieces = max(1, round(float(np.linalg.norm(end - start)) / ROW_MM))
+    between = start + np.linspace(0, 1, pieces + 1)[1:-1, None] * (end - start)
+    chord = np.array([i, *(len(crown.vertices_mm) + np.arange(pieces - 1)), j])
+    fan = np.stack([chord[1:], np.full(pieces, k), chord[:-1]], axis=1)
+    return Mesh(np.concatenate([crown.vertices_mm, between]), np.concatenate([crown.faces, strip[:-1], fan]).astype(np.int32))
+
+
+def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Columns run from the cervical line to a smooth ring across the axis, and on over a rounded end to a pole.
+    height = loop_mm @ occlusal
+    flat = loop_mm - np.outer(height, occlusal)
+    centre = flat.mean(axis=0)
+    end = centre + TAPER * _smooth_ring(flat - centre, occlusal)
+    end_height = height.min() - stub_mm + ROUNDING_MM
+
+    steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
+    wall = harmonic_rows(loop_mm, end + end_height * occlusal, steps)
+    bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
+    lid = np.stack([centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal for bend in bends])
+    return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
+
+
+def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    # The curve's lowest Fourier descriptors; an ellipse where more of them cross over themselves.
+    across = np.linalg.svd(axis[None])[2][1:]
+    across[1] = np.cross(axis, across[0])
+    spectrum = np.fft.fft(offsets_mm @ across[0] + 1j * (offsets_mm @ across[1]))
+    order = np.abs(np.fft.fftfreq(len(spectrum), 1 / len(spectrum)))
+    for harmonics in (HARMONICS, 1):
+        ring = np.fft.ifft(np.where((order <= harmonics) & (order > 0), spectrum, 0))
+        edge = np.roll(ring, -1) - ring
+        turn = np.angle(np.roll(edge, -1) / edge)
+        # Convex, once around.
+        if (turn * np.sign(turn.sum()) > 0).all() and abs(abs(turn.sum()) - 2 * np.pi) < 1e-6:
+            break
+    return np.outer(ring.real, across[0]) + np.outer(ring.imag, across[1])

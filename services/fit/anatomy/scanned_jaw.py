@@ -1,0 +1,151 @@
+"""A jaw of solids from a labelled scan, in arch coordinates: x along the front teeth, y to the front, z occlusal, the origin in the arch's middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Mesh, Tooth
+from services.fit.anatomy.frame import ToothFrame
+from services.fit.anatomy.scanned_gums import gums_solid
+from services.fit.anatomy.patches import (
+    areas_mm2,
+    compact,
+    fill_holes,
+    manifold_piece,
+    smooth_borders,
+    smooth_labels,
+    touching_pieces,
+    vector_area_mm2,
+    without_specks,
+)
+from services.fit.anatomy.roots import close_crown
+from services.fit.anatomy.scan import GINGIVA, LabelledScan
+
+LARGEST_SHARE = 0.8
+"""Of a tooth's area that has to be in one piece; the rest is taken for specks."""
+STEEPEST_TILT_DEG = 25.0
+"""Of a tooth's axis off the arch's normal: upper front teeth lean about so far to the front."""
+FLAT = 0.2
+"""Spread of the crowns across their line, relative to that along it, above which their middles span the occlusal plane."""
+NOMINAL_MM = np.array([(4.2, 0.0), (11.6, -2.0), (18.0, -6.5), (22.0, -12.5), (24.5, -19.5), (27.0, -28.0), (29.5, -37.5), (31.0, -47.0)])
+"""Middles of the teeth 1 to 8 of a quadrant in an average arch; they serve to tell front from back and left from right."""
+
+
+@dataclass(frozen=True)
+class ScannedJaw:
+    """Solids in arch coordinates, mm. Teeth overlap the gums, which hold their roots; roots are made up, and so is the gums' base."""
+
+    teeth: tuple[Tooth, ...]
+    frames: tuple[ToothFrame, ...]
+    """Of each tooth: x = y × z, which is mesial in the quadrants 1 and 3 and distal in 2 and 4; y buccal, z occlusal."""
+    gums: Mesh
+    arch_from_scan: NDArray[np.float64]
+    """Rigid transform (4, 4)."""
+
+
+def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
+    """Close every crown and the gums of a scan.
+
+    Raises:
+        CaptureInputError: a label is in several pieces, or left and right are exchanged. MeshError: a part cannot be closed.
+    """
+    _require_whole_teeth(scan)
+    surface, labels = _clean(scan)
+    crowns = {number: compact(Mesh(surface.vertices_mm, surface.faces[labels == number])) for number in scan.teeth}
+    middles = np.array([np.average(crown.vertices_mm[crown.faces].mean(axis=1), axis=0, weights=areas_mm2(crown)) for crown in crowns.values()])
+    rotation = _arch_axes(scan.teeth, surface, middles)
+    turned = surface.vertices_mm @ rotation.T
+    shift = -(turned.min(axis=0) + turned.max(axis=0)) / 2
+
+    # From here on in arch coordinates.
+    surface = Mesh(turned + shift, surface.faces)
+    crowns = {number: Mesh(crown.vertices_mm @ rotation.T + shift, crown.faces) for number, crown in crowns.items()}
+    axes = _tooth_axes(scan.teeth, crowns, middles @ rotation.T + shift)
+    teeth = tuple(Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}")) for number in scan.teeth)
+    deepest = min(float(tooth.outer.vertices_mm[:, 2].min()) for tooth in teeth)
+    gums = gums_solid(surface, labels == GINGIVA, np.array([0.0, 0.0, 1.0]), deepest)
+    frames = tuple(_centred(axes[tooth.fdi], tooth.outer) for tooth in teeth)
+    return ScannedJaw(teeth, frames, gums, np.block([[rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
+
+
+def _require_whole_teeth(scan: LabelledScan) -> None:
+    area = areas_mm2(scan.mesh)
+    for number in scan.teeth:
+        own = scan.fdi == number
+        size = np.bincount(touching_pieces(scan.mesh.faces[own]), weights=area[own])
+        if size.max() < LARGEST_SHARE * size.sum():
+            raise CaptureInputError(
+                f"The label of tooth {number} is in {len(size)} pieces, the largest {size.max() / size.sum():.0%} of its area; "
+                "relabel the scan so that it is one."
+            )
+
+
+def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:
+    # One manifold surface with one rim, labels without specks and with smooth borders.
+    kept = manifold_piece(scan.mesh)
+    labels = scan.fdi[kept]
+    lost = set(scan.teeth) - set(labels.tolist())
+    if lost or not (labels == GINGIVA).any():
+        what = f"tooth {min(lost)}" if lost else "the gingiva"
+        raise CaptureInputError(f"In the scan {what} hangs together with nothing else; export one connected surface of the jaw.")
+    surface, sources = fill_holes(compact(Mesh(scan.mesh.vertices_mm, scan.mesh.faces[kept])))
+    labels = np.concatenate([labels, labels[sources]])
+    labels = without_specks(surface, smooth_labels(surface.faces, labels))
+    return smooth_borders(surface, labels), labels
+
+
+def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float64]) -> NDArray[np.float64]:
+    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it to the normal of the scan's rim.
+    opening = vector_area_mm2(surface)
+    _, spread, principal = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
+    plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
+    occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
+    occlusal = _unit(occlusal * np.sign(occlusal @ opening))
+
+    # The turn about it that brings the crowns nearest to an average arch's; to a mirrored one they must not be nearer by far.
+    side = np.linalg.svd(occlusal[None])[2][1]
+    across = np.stack([side, np.cross(occlusal, side)])
+    seen = (middles - middles.mean(axis=0)) @ across.T
+    nominal = np.array([NOMINAL_MM[number % 10 - 1] * (_right_of_front(number), 1) for number in teeth])
+    nominal -= nominal.mean(axis=0)
+    seen_plane, nominal_plane = seen @ (1, 1j), nominal @ (1, 1j)
+    match, mirrored = np.vdot(nominal_plane, seen_plane), np.vdot(nominal_plane.conj(), seen_plane)
+    if abs(mirrored) > abs(match) * (1 + 1e-3) and len(teeth) > 2 and plane:
+        raise CaptureInputError("The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the scan back.")
+    front = match / abs(match)
+    x = front.real * across[0] + front.imag * across[1]
+    return np.stack([x, np.cross(occlusal, x), occlusal])
+
+
+def _right_of_front(number: int) -> int:
+    # Sign of x = y × z: upper teeth point down and lower ones up, so x is the patient's left in one jaw and right in the other.
+    return 1 if number // 10 in (2, 4) else -1
+
+
+def _tooth_axes(teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArray[np.float64]) -> dict[int, NDArray[np.float64]]:
+    order = sorted(range(len(teeth)), key=lambda k: _right_of_front(teeth[k]) * (teeth[k] % 10))
+    tangents = np.gradient(middles[order], axis=0)
+    upward, axes = np.array([0.0, 0.0, 1.0]), {}
+    for k, tangent in zip(order, tangents, strict=True):
+        # A cervical line rises between teeth and lies deepest in front, so its normal leans about twice as far as the tooth does.
+        occlusal = _unit(_unit(vector_area_mm2(crowns[teeth[k]])) + upward)
+        tilt = np.arccos(occlusal @ upward)
+        if tilt > np.radians(STEEPEST_TILT_DEG):
+            lean = _unit(occlusal - (occlusal @ upward) * upward)
+            occlusal = np.cos(np.radians(STEEPEST_TILT_DEG)) * upward + np.sin(np.radians(STEEPEST_TILT_DEG)) * lean
+        buccal = _unit(np.cross(occlusal, tangent))
+        axes[teeth[k]] = np.stack([np.cross(buccal, occlusal), buccal, occlusal])
+    return axes
+
+
+def _centred(axes: NDArray[np.float64], mesh: Mesh) -> ToothFrame:
+    centre = (mesh.vertices_mm.min(axis=0) + mesh.vertices_mm.max(axis=0)) / 2
+    return ToothFrame(axes, -axes @ centre)
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vector / np.linalg.norm(vector))
