@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
 from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.scanned_gums import gums_solid
 from services.fit.anatomy.patches import (
     areas_mm2,
     compact,
@@ -24,6 +23,7 @@ from services.fit.anatomy.patches import (
 )
 from services.fit.anatomy.roots import close_crown
 from services.fit.anatomy.scan import GINGIVA, LabelledScan
+from services.fit.anatomy.scanned_gums import gums_solid
 
 LARGEST_SHARE = 0.8
 """Of a tooth's area that has to be in one piece; the rest is taken for specks."""
