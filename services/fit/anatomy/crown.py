@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Mesh
 from services.fit.anatomy.dimensions import ToothDimensions
-from services.fit.anatomy.sections import close_rings, superellipse
+from services.fit.anatomy.sections import cover_rings, superellipse
 
 Profile = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]
 """Half axes along x and y and the centre's y at heights above the cervical line, mm."""
@@ -30,7 +30,7 @@ DENTIN_EDGE_MM = 0.2
 """Half the labiolingual thickness at which dentin ends below a thin incisal edge."""
 DENTIN_ROUNDING = 0.35
 """Of the dentin's upper rim, relative to the enamel's."""
-CROWN_STEP_MM, ROOT_STEP_MM, LID_STEP_MM = 0.36, 0.8, 0.5
+CROWN_STEP_MM, ROOT_STEP_MM, LID_STEP_MM = 0.36, 0.8, 0.45
 CUSP_RADIUS_MM = 0.6
 CUSP_BLEND_MM = 0.25
 CUSP_START = 0.35
@@ -80,7 +80,7 @@ CANINE = CrownForm(
     heights=(0.28, 0.55, 0.8, 1.0),
     mesiodistal=(0.9, 1.0, 0.97, 0.86),
     labiolingual=(1.0, 0.84, 0.54, 0.27),
-    labial=(0.5, 0.46, 0.34, 0.17),
+    labial=(0.5, 0.445, 0.325, 0.17),
     cusps=((0.05, 0.0, 0.0),),
     cusp_slope=0.75,
     fossa_mm=2.4,
@@ -206,29 +206,26 @@ def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, sca
 
 
 def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], form: CrownForm) -> Mesh:
-    # Rows (height, inset, scale): a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
-    rows = []
+    # Rows (height, inset): a rounded rim, the wall, and the other rim; a flat lid closes either end.
+    rims = []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
-        half_x, half_y, _ = (float(value[0]) for value in profile(np.array([end])))
-        lid = 3 if sign < 0 else max(3, round((half_x + half_y - 2 * rounding) / 2 / LID_STEP_MM))
-        rim = max(3, round(np.pi / 2 * rounding / CROWN_STEP_MM))
-        angle = np.linspace(np.pi / 2, 0, rim + 1)[:-1]
-        part = [(end, rounding, k / lid) for k in range(1, lid)]
-        part += [(end - sign * rounding * (1 - float(np.sin(a))), rounding * (1 - float(np.cos(a))), 1.0) for a in angle]
-        rows.append(part if sign < 0 else part[::-1])
+        angle = np.linspace(np.pi / 2, 0, max(3, round(np.pi / 2 * rounding / CROWN_STEP_MM)) + 1)[:-1]
+        rim = [(end - sign * rounding * (1 - float(np.sin(a))), rounding * (1 - float(np.cos(a)))) for a in angle]
+        rims.append(rim if sign < 0 else rim[::-1])
     low, high = ends_mm[0] + rounding_mm[0], ends_mm[1] - rounding_mm[1]
     root = np.linspace(low, 0.0, round(-low / ROOT_STEP_MM) + 1)[:-1]
     crown = np.linspace(0.0, high, round(high / CROWN_STEP_MM) + 1)
-    sections = rows[0] + [(float(z), 0.0, 1.0) for z in (*root, *crown)] + rows[1]
+    sections = rims[0] + [(float(z), 0.0) for z in (*root, *crown)] + rims[1]
 
     rings = []
-    for height, inset, scale in sections:
+    for height, inset in sections:
         half_x, half_y, centre = (float(value[0]) for value in profile(np.array([height])))
         cut = min(inset, 0.85 * min(half_x, half_y))
-        x, y = superellipse(scale * (half_x - cut), scale * (half_y - cut), form.columns, form.exponent)
+        x, y = superellipse(half_x - cut, half_y - cut, form.columns, form.exponent)
         rings.append(np.stack([x, y + centre, np.full(form.columns, height)], axis=-1))
-    poles = [np.array([[0.0, float(profile(np.array([end]))[2][0]), end]]) for end in ends_mm]
-    return close_rings(np.concatenate([*rings, *poles]), len(rings), form.columns)
+    depths = [float(np.ptp(ring[:, 1])) for ring in (rings[0], rings[-1])]
+    strips = max(2, round(depths[0] / ROOT_STEP_MM)), max(2, round(depths[1] / LID_STEP_MM))
+    return cover_rings(np.concatenate(rings), len(rings), form.columns, strips)
 
 
 def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ MARGIN_MM = 0.7
 """Height of the gums' crest above the cervical line at a tooth's middle; the margin on the tooth is lower, where the crest rounds off."""
 PAPILLA_MM = 0.8
 """Height of the crest between teeth above what the cervical lines' curvature gives."""
-BELOW_ROOT_MM = 2.0
+BELOW_ROOT_MM = 3.5
 COVER_MM = 1.4
 """Thickness of gums over the root, labially and towards the tongue."""
 EMBRASURE_MM = 0.5
@@ -26,7 +26,10 @@ END_ROUNDING_MM = 4.0
 EXPONENT = 3.6
 STEP_MM = 0.6
 COLUMNS = 44
-VAULT_MM = 11.0
+FINE_MM = 0.05
+CREST_ROUNDING_MM, RIDGE_ROUNDING_MM = 0.5, 1.6
+"""Standard deviations of the smoothing of the crest's height and of the ridge's depth along the arch."""
+VAULT_MM = 10.0
 """Height of the palate over its rim."""
 WALL_BELOW_MM = 5.0
 """How far the back wall reaches beyond the occlusal plane."""
@@ -86,8 +89,9 @@ def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
 
 
 def _outline(sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours, monotone in between.
+    # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours, monotone in between, then rounded off.
     from scipy.interpolate import PchipInterpolator
+    from scipy.ndimage import gaussian_filter1d
 
     ends = [(s, sign * (s.width_mm / 2 + BEHIND_MM)) for s, sign in ((sockets[0], -1.0), (sockets[-1], 1.0))]
     nodes = [(s.arc_mm + step, s.cervix_z_mm + MARGIN_MM, s.cervix_z_mm, s.half_depth_mm + COVER_MM) for s, step in ends]
@@ -103,7 +107,12 @@ def _outline(sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]) -> t
         depth = (one.half_depth_mm + other.half_depth_mm) / 2 + COVER_MM - EMBRASURE_MM
         nodes.append(((one.arc_mm + one.width_mm / 2 + other.arc_mm - other.width_mm / 2) / 2, papilla, cervix, depth))
     arc, crest, cervix, depth = np.array(sorted(nodes)).T
-    crest_mm, cervix_mm, depth_mm = (PchipInterpolator(arc, values)(stations_mm) for values in (crest, cervix, depth))
+    fine = np.arange(arc[0], arc[-1], FINE_MM)
+    curves = [
+        gaussian_filter1d(PchipInterpolator(arc, values)(fine), width / FINE_MM, mode="nearest")
+        for values, width in ((crest, CREST_ROUNDING_MM), (cervix, RIDGE_ROUNDING_MM), (depth, RIDGE_ROUNDING_MM))
+    ]
+    crest_mm, cervix_mm, depth_mm = (np.interp(stations_mm, fine, values) for values in curves)
     return crest_mm, cervix_mm - ROOT_STUB_MM - BELOW_ROOT_MM, depth_mm
 
 
