@@ -26,11 +26,14 @@ ROOT_ENAMEL_MM = 0.08
 ROOT_ROUNDING_MM = 0.8
 ROOT_TAPER = 0.92
 """Diameter of the stub's end relative to the cervix."""
-DENTIN_EDGE_MM = 0.2
+DENTIN_EDGE_MM = 0.3
 """Half the labiolingual thickness at which dentin ends below a thin incisal edge."""
 DENTIN_ROUNDING = 0.35
 """Of the dentin's upper rim, relative to the enamel's."""
-CROWN_STEP_MM, ROOT_STEP_MM, LID_STEP_MM = 0.36, 0.8, 0.45
+CROWN_STEP_MM, ROOT_STEP_MM = 0.36, 0.8
+LID_STEP_MM, ROOT_LID_STEP_MM = 0.45, 1.0
+THIN_LID_MM = 0.8
+"""Half width of a flat lid below which it is bridged in one step."""
 CUSP_RADIUS_MM = 0.6
 CUSP_BLEND_MM = 0.25
 CUSP_START = 0.35
@@ -206,26 +209,28 @@ def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, sca
 
 
 def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], form: CrownForm) -> Mesh:
-    # Rows (height, inset): a rounded rim, the wall, and the other rim; a flat lid closes either end.
-    rims = []
+    # Rows (height, inset, scale): a rounded rim, the wall, and the other rim. Either end has a flat lid; a wide one has rings of its own.
+    rims, thin = [], []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
+        half_x, half_y, _ = (float(value[0]) for value in profile(np.array([end])))
+        thin.append(half_y - rounding < THIN_LID_MM)
+        rings_of_lid = 1 if thin[-1] else round((half_x + half_y - 2 * rounding) / 2 / (ROOT_LID_STEP_MM if sign < 0 else LID_STEP_MM))
+        rim = [(end, rounding, k / rings_of_lid) for k in range(1, rings_of_lid)]
         angle = np.linspace(np.pi / 2, 0, max(3, round(np.pi / 2 * rounding / CROWN_STEP_MM)) + 1)[:-1]
-        rim = [(end - sign * rounding * (1 - float(np.sin(a))), rounding * (1 - float(np.cos(a)))) for a in angle]
+        rim += [(end - sign * rounding * (1 - float(np.sin(a))), rounding * (1 - float(np.cos(a))), 1.0) for a in angle]
         rims.append(rim if sign < 0 else rim[::-1])
     low, high = ends_mm[0] + rounding_mm[0], ends_mm[1] - rounding_mm[1]
     root = np.linspace(low, 0.0, round(-low / ROOT_STEP_MM) + 1)[:-1]
     crown = np.linspace(0.0, high, round(high / CROWN_STEP_MM) + 1)
-    sections = rims[0] + [(float(z), 0.0) for z in (*root, *crown)] + rims[1]
+    sections = rims[0] + [(float(z), 0.0, 1.0) for z in (*root, *crown)] + rims[1]
 
     rings = []
-    for height, inset in sections:
+    for height, inset, scale in sections:
         half_x, half_y, centre = (float(value[0]) for value in profile(np.array([height])))
         cut = min(inset, 0.85 * min(half_x, half_y))
-        x, y = superellipse(half_x - cut, half_y - cut, form.columns, form.exponent)
+        x, y = superellipse(scale * (half_x - cut), scale * (half_y - cut), form.columns, form.exponent)
         rings.append(np.stack([x, y + centre, np.full(form.columns, height)], axis=-1))
-    depths = [float(np.ptp(ring[:, 1])) for ring in (rings[0], rings[-1])]
-    strips = max(2, round(depths[0] / ROOT_STEP_MM)), max(2, round(depths[1] / LID_STEP_MM))
-    return cover_rings(np.concatenate(rings), len(rings), form.columns, strips)
+    return cover_rings(np.concatenate(rings), len(rings), form.columns, (thin[0], thin[1]))
 
 
 def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions) -> NDArray[np.float64]:

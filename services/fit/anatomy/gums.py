@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ EXPONENT = 3.6
 STEP_MM = 0.6
 COLUMNS = 44
 FINE_MM = 0.05
-CREST_ROUNDING_MM, RIDGE_ROUNDING_MM = 0.5, 1.6
+CREST_ROUNDING_MM, RIDGE_ROUNDING_MM = 0.8, 1.6
 """Standard deviations of the smoothing of the crest's height and of the ridge's depth along the arch."""
 VAULT_MM = 10.0
 """Height of the palate over its rim."""
@@ -101,7 +102,7 @@ def _outline(sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]) -> t
         nodes += [
             (socket.arc_mm + side * 0.3 * socket.width_mm, crest + 0.3 * (socket.curvature_mm + PAPILLA_MM), socket.cervix_z_mm, depth) for side in (-1, 1)
         ]
-    for one, other in zip(sockets, sockets[1:], strict=False):
+    for one, other in pairwise(sockets):
         cervix = (one.cervix_z_mm + other.cervix_z_mm) / 2
         papilla = cervix + MARGIN_MM + PAPILLA_MM + (one.curvature_mm + other.curvature_mm) / 2
         depth = (one.half_depth_mm + other.half_depth_mm) / 2 + COVER_MM - EMBRASURE_MM

@@ -28,41 +28,37 @@ def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Me
 
     It faces outward where rings run counter-clockwise seen from the last pole.
     """
-    ring = np.arange(columns)
-    after = (ring + 1) % columns
-    last = (rows - 1) * columns
-    bottom = np.stack([np.full(columns, rows * columns), after, ring], -1)
-    lid = np.stack([np.full(columns, rows * columns + 1), last + ring, last + after], -1)
-    return Mesh(vertices_mm, np.concatenate([_wall(rows, columns), bottom, lid]).astype(np.int32))
+    first, last = np.arange(columns), (rows - 1) * columns + np.arange(columns)
+    lids = _fan(first, rows * columns)[:, ::-1], _fan(last, rows * columns + 1)
+    return Mesh(vertices_mm, np.concatenate([_wall(rows, columns), *lids]).astype(np.int32))
 
 
-def cover_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int, strips: tuple[int, int]) -> Mesh:
-    """Join rings (rows x columns vertices) to a closed surface, with strips along x over the first and the last.
+def cover_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int, thin: tuple[bool, bool]) -> Mesh:
+    """Join rings (rows x columns vertices) to a closed surface whose first and last ring are flat.
 
-    Unlike a fan, strips make even triangles over a long and thin ring, and over a wide one.
+    A thin ring is bridged straight across, where a fan's long triangles would make its edge rough; others get a fan at their middle.
 
     Args:
         columns: even; vertices k and columns - k lie opposite each other, as ``superellipse`` puts them.
-        strips: number over the first and over the last ring.
+        thin: whether the first and the last ring are.
     """
-    half, last = columns // 2, (rows - 1) * columns
-    vertices, faces = [vertices_mm], [_wall(rows, columns)]
-    used = len(vertices_mm)
-    for start, count, upward in ((0, strips[0], False), (last, strips[1], True)):
-        # Grid of places: one line of vertices from each k to its opposite; at both ends of the ring a line is a single vertex.
-        k, share = np.arange(half + 1), np.arange(count + 1) / count
-        near, far = vertices_mm[start + k], vertices_mm[start + (columns - k) % columns]
-        inner = near[1:-1, None] + share[1:-1, None] * (far - near)[1:-1, None]
-        place = np.empty((half + 1, count + 1), dtype=np.int64)
-        place[:, 0], place[:, -1] = start + k, start + (columns - k) % columns
-        place[[0, -1], 1:-1] = place[[0, -1], :1]
-        place[1:-1, 1:-1] = used + np.arange(inner.shape[0] * inner.shape[1]).reshape(inner.shape[:2])
-        used += inner.shape[0] * inner.shape[1]
-        vertices.append(inner.reshape(-1, 3))
-        lid = _split_quads(place[:-1, :-1], place[1:, :-1], place[:-1, 1:], place[1:, 1:])
-        lid = lid[(lid != np.roll(lid, 1, axis=1)).all(axis=1)]
+    faces, poles = [_wall(rows, columns)], [np.empty((0, 3))]
+    for start, bridged, upward in ((0, thin[0], False), ((rows - 1) * columns, thin[1], True)):
+        ring = start + np.arange(columns)
+        if bridged:
+            k = np.arange(columns // 2 + 1)
+            near, far = ring[k], ring[-k]
+            lid = _split_quads(near[:-1, None], near[1:, None], far[:-1, None], far[1:, None])
+            lid = lid[(lid != np.roll(lid, 1, axis=1)).all(axis=1)]
+        else:
+            lid = _fan(ring, rows * columns + len(poles) - 1)
+            poles.append(vertices_mm[ring].mean(axis=0, keepdims=True))
         faces.append(lid if upward else lid[:, ::-1])
-    return Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32))
+    return Mesh(np.concatenate([vertices_mm, *poles]), np.concatenate(faces).astype(np.int32))
+
+
+def _fan(ring: NDArray[np.int64], pole: int) -> NDArray[np.int64]:
+    return np.stack([np.full(len(ring), pole), ring, np.roll(ring, -1)], axis=-1)
 
 
 def _wall(rows: int, columns: int) -> NDArray[np.int64]:
