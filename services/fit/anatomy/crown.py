@@ -54,6 +54,8 @@ class CrownForm:
     cusps: tuple[tuple[float, float, float], ...]
     """x and y relative to the crown's half diameters, and how much lower than the highest, mm."""
     cusp_slope: float
+    cusp_roundness: float
+    """1 for a cusp that falls off all around, 0 for a ridge that falls off mesially and distally only."""
     fossa_mm: float
     """How far below the highest cusp the occlusal table sinks at most."""
     exponent: float
@@ -72,6 +74,7 @@ INCISOR = CrownForm(
     labial=(0.486, 0.421, 0.25, 0.136),
     cusps=((0.35, 0.0, 0.0), (-0.15, 0.0, 0.0)),
     cusp_slope=0.2,
+    cusp_roundness=0.0,
     fossa_mm=1.5,
     exponent=2.4,
     lingual_taper=0.15,
@@ -86,6 +89,7 @@ CANINE = CrownForm(
     labial=(0.5, 0.445, 0.325, 0.17),
     cusps=((0.05, 0.0, 0.0),),
     cusp_slope=0.75,
+    cusp_roundness=0.4,
     fossa_mm=2.4,
     exponent=2.3,
     lingual_taper=0.18,
@@ -100,6 +104,7 @@ PREMOLAR = CrownForm(
     labial=(0.5, 0.48, 0.42, 0.35),
     cusps=((0.0, 0.5, 0.0), (0.06, -0.52, 0.5)),
     cusp_slope=0.6,
+    cusp_roundness=1.0,
     fossa_mm=1.7,
     exponent=2.4,
     lingual_taper=0.1,
@@ -114,6 +119,7 @@ MOLAR = CrownForm(
     labial=(0.5, 0.48, 0.42, 0.36),
     cusps=((0.44, 0.5, 0.0), (-0.44, 0.48, 0.2), (0.36, -0.48, 0.0), (-0.48, -0.52, 0.6)),
     cusp_slope=0.55,
+    cusp_roundness=1.0,
     fossa_mm=1.6,
     exponent=2.8,
     lingual_taper=0.05,
@@ -242,12 +248,16 @@ def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimension
 
 
 def _relief_mm(x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions) -> NDArray[np.float64]:
-    # Soft maximum of cones with rounded tips and of the fossa's floor.
-    heights = [np.full_like(x_mm, -form.fossa_mm)]
-    for cusp_x, cusp_y, lower in form.cusps:
-        radius = np.hypot(x_mm - cusp_x * d.md_crown_mm / 2, y_mm - cusp_y * d.ll_crown_mm / 2)
+    # Soft maximum of cones with rounded tips and of the fossa's floor; 0 at the highest cusp.
+    cusps = np.array(form.cusps)
+    tips = cusps[:, :2] * [d.md_crown_mm / 2, d.ll_crown_mm / 2]
+    x, y = np.append(x_mm, tips[:, 0]), np.append(y_mm, tips[:, 1])
+    heights = [np.full_like(x, -form.fossa_mm)]
+    for (tip_x, tip_y), lower in zip(tips, cusps[:, 2], strict=True):
+        radius = np.hypot(x - tip_x, form.cusp_roundness * (y - tip_y))
         heights.append(-lower - form.cusp_slope * (np.hypot(radius, CUSP_RADIUS_MM) - CUSP_RADIUS_MM))
-    return np.asarray(CUSP_BLEND_MM * np.logaddexp.reduce(np.stack(heights) / CUSP_BLEND_MM, axis=0))
+    relief = CUSP_BLEND_MM * np.logaddexp.reduce(np.stack(heights) / CUSP_BLEND_MM, axis=0)
+    return np.asarray(relief[: len(x_mm)] - relief[len(x_mm) :].max())
 
 
 def _stretched_above_cervix(mesh: Mesh, factors: NDArray[np.float64]) -> Mesh:

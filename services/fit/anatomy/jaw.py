@@ -115,23 +115,22 @@ def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
 def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -> list[tuple[JawTooth, Socket]]:
     # From the midline back, each tooth is moved along the arch until it all but touches the one before; the first, where there is none, the midline's plane.
     placed: list[tuple[JawTooth, Socket]] = []
-    neighbour = None if first is None else SurfaceDistance(first.outer)
+    neighbour = None if first is None else SurfaceDistance(_far_half(first))
     arc_mm = 0.0
     for place, stance in zip(PLACES, stances, strict=True):
         d = upper_tooth(place)
         solid = build_tooth(d, stance.enamel_scale)
         arc_mm -= d.md_crown_mm / 2 + SEPARATION_MM
-        facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > 0]
-        while True:
-            frame = _standing(arch, arc_mm, solid, d, stance)
+        facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > d.md_crown_mm / 4]
+        frame, spare_mm = _standing(arch, arc_mm, solid, d, stance), SEPARATION_MM
+        while abs(spare_mm) >= GAP_ERROR_MM:
             points = frame.world_from_canonical(facing)
-            spare = -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM
-            if abs(spare) < GAP_ERROR_MM:
-                break
+            spare_mm = float(-points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM)
             # Turning with the arch may bring a corner nearer than the move itself: so a little less at a time.
-            arc_mm += 0.85 * spare
+            arc_mm += 0.85 * spare_mm
+            frame = _standing(arch, arc_mm, solid, d, stance)
         tooth = _stood(solid, frame, RIGHT + place)
-        neighbour = SurfaceDistance(tooth.outer)
+        neighbour = SurfaceDistance(_far_half(tooth))
         cervix_z_mm = float(frame.world_from_canonical(np.array([[0.0, 0.0, solid.cervix_mm]]))[0, 2])
         curvature_mm = (d.curvature_mesial_mm + d.curvature_distal_mm) / 2
         placed.append((tooth, Socket(arc_mm, d.md_crown_mm, cervix_z_mm, d.ll_cervix_mm / 2, curvature_mm)))
@@ -156,6 +155,13 @@ def _standing(arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, 
 def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
     outer, dentin = (Mesh(frame.world_from_canonical(mesh.vertices_mm), mesh.faces) for mesh in (solid.outer, solid.dentin))
     return JawTooth(fdi, outer, dentin, frame, solid.cervix_mm)
+
+
+def _far_half(tooth: JawTooth) -> Mesh:
+    # Of the crown, the side that the next tooth of the right meets: a right tooth's distal side, or the mesial one across the midline.
+    canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
+    kept = (canonical[:, 0] < 0) & (canonical[:, 2] > tooth.cervix_mm)
+    return Mesh(tooth.outer.vertices_mm, tooth.outer.faces[kept[tooth.outer.faces].all(axis=1)])
 
 
 def _mirrored(tooth: JawTooth) -> JawTooth:
