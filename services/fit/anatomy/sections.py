@@ -29,7 +29,7 @@ def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Me
     It faces outward where rings run counter-clockwise seen from the last pole.
     """
     first, last = np.arange(columns), (rows - 1) * columns + np.arange(columns)
-    lids = _fan(first, rows * columns)[:, ::-1], _fan(last, rows * columns + 1)
+    lids = _fan(first, rows * columns)[:, [0, 2, 1]], _fan(last, rows * columns + 1)
     return Mesh(vertices_mm, np.concatenate([_wall(rows, columns), *lids]).astype(np.int32))
 
 
