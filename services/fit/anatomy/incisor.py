@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Mesh
+from services.fit.anatomy.sections import close_rings, superellipse
 
 Profile = tuple[NDArray[np.float64], ...]
 
@@ -109,38 +110,10 @@ def _stack(profile: Callable[[NDArray[np.float64]], Profile], ends_mm: tuple[flo
     for row_height, row_inset, scale in sections:
         half_x, half_y, centre = (float(value[0]) for value in profile(np.array([row_height])))
         cut = min(row_inset, 0.85 * min(half_x, half_y))
-        x, y = _superellipse(scale * (half_x - cut), scale * (half_y - cut), columns)
+        x, y = superellipse(scale * (half_x - cut), scale * (half_y - cut), columns, EXPONENT)
         rings.append(np.stack([x, y + centre, np.full(columns, row_height)], axis=-1))
     poles = [np.array([[0.0, float(profile(np.array([end]))[2][0]), end]]) for end in ends_mm]
-    return _close(np.concatenate([*rings, *poles]), len(rings), columns)
-
-
-def _superellipse(half_x: float, half_y: float, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    # Vertices at equal steps of arc length plus turning, counter-clockwise from +x: neighbouring rows stay aligned and tight bends stay round.
-    angle = np.linspace(0, 2 * np.pi, 64 * columns + 1)
-    radius = (np.abs(np.cos(angle) / half_x) ** EXPONENT + np.abs(np.sin(angle) / half_y) ** EXPONENT) ** (-1 / EXPONENT)
-    x, y = radius * np.cos(angle), radius * np.sin(angle)
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    measure = arc / arc[-1] + 0.5 * (heading - heading[0]) / (heading[-1] - heading[0])
-    at = np.linspace(measure[0], measure[-1], columns, endpoint=False)
-    return np.interp(at, measure, x), np.interp(at, measure, y)
-
-
-def _close(vertices: NDArray[np.float64], rows: int, columns: int) -> Mesh:
-    # Quads between rows split alternately, fans at the two poles.
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
-    a, b = row * columns + column, row * columns + (column + 1) % columns
-    c, d = a + columns, b + columns
-    even = ((row + column) % 2 == 0)[..., None]
-    first = np.where(even, np.stack([a, b, d], -1), np.stack([a, b, c], -1)).reshape(-1, 3)
-    second = np.where(even, np.stack([a, d, c], -1), np.stack([b, d, c], -1)).reshape(-1, 3)
-    ring = np.arange(columns)
-    after = (ring + 1) % columns
-    last = (rows - 1) * columns
-    bottom = np.stack([np.full(columns, rows * columns), after, ring], -1)
-    lid = np.stack([np.full(columns, rows * columns + 1), last + ring, last + after], -1)
-    return Mesh(vertices, np.concatenate([first, second, bottom, lid]).astype(np.int32))
+    return close_rings(np.concatenate([*rings, *poles]), len(rings), columns)
 
 
 def _gum_collar(columns: int) -> Mesh:

@@ -1,0 +1,47 @@
+"""Average dimensions of the upper teeth: Wheeler's averages, some recalled, all recorded in steps of 0.5 mm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Status = Literal["Wheeler", "from memory"]
+"""``Wheeler``: Wheeler's table of averages (Wheeler's Dental Anatomy, Physiology and Occlusion); ``from memory``: the same table, recalled."""
+
+
+@dataclass(frozen=True)
+class ToothDimensions:
+    """One kind of upper tooth."""
+
+    name: str
+    position: int
+    """From the midline: the second digit of its FDI number."""
+    crown_length_mm: float
+    """Cervical line to incisal edge or highest cusp."""
+    md_crown_mm: float
+    """Mesiodistal diameter of the crown, at its widest."""
+    md_cervix_mm: float
+    ll_crown_mm: float
+    """Labio- or buccolingual diameter of the crown, at its widest."""
+    ll_cervix_mm: float
+    curvature_mesial_mm: float
+    """How far the cervical line rises towards the edge on the mesial side."""
+    curvature_distal_mm: float
+    status: Status
+
+
+UPPER_TEETH = (
+    ToothDimensions("central incisor", 1, 10.5, 8.5, 7.0, 7.0, 6.0, 3.5, 2.5, "Wheeler"),
+    ToothDimensions("lateral incisor", 2, 9.0, 6.5, 5.0, 6.0, 5.0, 3.0, 2.0, "Wheeler"),
+    ToothDimensions("canine", 3, 10.0, 7.5, 5.5, 8.0, 7.0, 2.5, 1.5, "from memory"),
+    ToothDimensions("first premolar", 4, 8.5, 7.0, 5.0, 9.0, 8.0, 1.0, 0.0, "from memory"),
+    ToothDimensions("second premolar", 5, 8.5, 7.0, 5.0, 9.0, 8.0, 1.0, 0.0, "from memory"),
+    ToothDimensions("first molar", 6, 7.5, 10.0, 8.0, 11.0, 10.0, 1.0, 0.0, "from memory"),
+    ToothDimensions("second molar", 7, 7.0, 9.0, 7.0, 11.0, 10.0, 1.0, 0.0, "from memory"),
+    ToothDimensions("third molar", 8, 6.5, 8.5, 6.5, 10.0, 9.5, 1.0, 0.0, "from memory"),
+)
+
+
+def upper_tooth(position: int) -> ToothDimensions:
+    """Dimensions of the tooth at a place 1 to 8 from the midline."""
+    return UPPER_TEETH[position - 1]

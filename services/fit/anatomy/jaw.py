@@ -1,0 +1,180 @@
+"""A phantom upper jaw: fourteen teeth of average dimensions along an arch, their gums, and the wall of the mouth.
+
+Jaw frame as in ``arch``: x to the patient's left, y forward, z occlusal. Each tooth's canonical frame has y buccal, z occlusal and x = y × z, which is
+mesial for the patient's right (11 to 17) and distal for the left (21 to 27), so that all transforms are rotations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+from services.fit.anatomy.arch import Arch
+from services.fit.anatomy.crown import ToothSolid, build_tooth
+from services.fit.anatomy.dimensions import ToothDimensions, upper_tooth
+from services.fit.anatomy.distance import SurfaceDistance
+from services.fit.anatomy.frame import ToothFrame
+from services.fit.anatomy.gums import Socket, build_cavity, build_gums
+
+RIGHT, LEFT = 10, 20
+"""FDI numbers of the upper quadrants, before the place."""
+PLACES = range(1, 8)
+GAP_MM = 0.07
+"""Between neighbours, at their nearest."""
+GAP_ERROR_MM = 0.005
+SEPARATION_MM = 1.0
+"""By how much more than their half widths two teeth are apart before they are moved together."""
+SHORT_OF_PLANE_MM = {2: 0.6, 7: 0.3}
+"""Teeth that end above the occlusal plane."""
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+
+SIZE_SPREAD = 0.05
+ENAMEL_SPREAD = 0.10
+TURN_SPREAD_DEG = 4.0
+TILT_SPREAD_DEG = 2.5
+SHIFT_SPREAD_MM = 0.25
+
+
+@dataclass(frozen=True)
+class JawTooth:
+    """One tooth in jaw coordinates."""
+
+    fdi: int
+    outer: Mesh
+    """Enamel with a stub of root."""
+    dentin: Mesh
+    frame: ToothFrame
+    """Its canonical frame; the world is the jaw's."""
+    cervix_mm: float
+    """Height of the cervical line in the canonical frame."""
+
+    @property
+    def jaw_from_tooth(self) -> NDArray[np.float64]:
+        """Rigid transform (4, 4) from the canonical frame."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.frame.rotation.T
+        pose[:3, 3] = -self.frame.rotation.T @ self.frame.translation_mm
+        return pose
+
+
+@dataclass(frozen=True)
+class Jaw:
+    """Teeth from 17 to 27 as they stand, from the patient's right to the left, and what surrounds them."""
+
+    teeth: tuple[JawTooth, ...]
+    gums: Mesh
+    cavity: Mesh
+    """Open."""
+
+    def tooth(self, fdi: int) -> JawTooth:
+        """The tooth of an FDI number."""
+        return next(tooth for tooth in self.teeth if tooth.fdi == fdi)
+
+
+@dataclass(frozen=True)
+class Stance:
+    """How one tooth differs from the average."""
+
+    enamel_scale: float = 1.0
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """About x (torque), y (tip) and z, canonical axes."""
+    forward_mm: float = 0.0
+    longer_mm: float = 0.0
+
+
+def build_jaw(seed: int | None = None) -> Jaw:
+    """Build a subject's upper jaw.
+
+    Args:
+        seed: None for the average, which is symmetric; a number for a subject whose size varies by 5 %, enamel by 10 %, and whose teeth stand a little askew.
+    """
+    arch = Arch()
+    random = None if seed is None else np.random.default_rng(seed)
+    size = 1.0 if random is None else 1 + SIZE_SPREAD * float(random.uniform(-1, 1))
+    right = _quadrant(arch, _stances(random), None)
+    # The left is built as a right one, in the mirror, where it meets the right central incisor.
+    left = right if random is None else _quadrant(arch, _stances(random), _mirrored(right[0][0]))
+
+    sockets = tuple(socket for _, socket in reversed(right)) + tuple(replace(socket, arc_mm=-socket.arc_mm) for _, socket in left)
+    teeth = tuple(tooth for tooth, _ in reversed(right)) + tuple(_mirrored(tooth) for tooth, _ in left)
+    gums, cavity = build_gums(arch, sockets), build_cavity(arch, sockets)
+    return Jaw(tuple(_grown(tooth, size) for tooth in teeth), _scaled(gums, size), _scaled(cavity, size))
+
+
+def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
+    if random is None:
+        return tuple(Stance() for _ in PLACES)
+    tilt, turn = TILT_SPREAD_DEG, TURN_SPREAD_DEG
+    draws = random.uniform(-1, 1, (len(PLACES), 6)) * [ENAMEL_SPREAD, tilt, tilt, turn, SHIFT_SPREAD_MM, SHIFT_SPREAD_MM]
+    return tuple(Stance(1 + enamel, (x, y, z), forward, longer) for enamel, x, y, z, forward, longer in draws.tolist())
+
+
+def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -> list[tuple[JawTooth, Socket]]:
+    # From the midline back, each tooth is moved along the arch until it all but touches the one before; the first, where there is none, the midline's plane.
+    placed: list[tuple[JawTooth, Socket]] = []
+    neighbour = None if first is None else SurfaceDistance(_far_half(first))
+    arc_mm = 0.0
+    for place, stance in zip(PLACES, stances, strict=True):
+        d = upper_tooth(place)
+        solid = build_tooth(d, stance.enamel_scale)
+        arc_mm -= d.md_crown_mm / 2 + SEPARATION_MM
+        facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > d.md_crown_mm / 4]
+        frame, spare_mm = _standing(arch, arc_mm, solid, d, stance), SEPARATION_MM
+        while abs(spare_mm) >= GAP_ERROR_MM:
+            points = frame.world_from_canonical(facing)
+            spare_mm = float(-points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM)
+            # Turning with the arch may bring a corner nearer than the move itself: so a little less at a time.
+            arc_mm += 0.85 * spare_mm
+            frame = _standing(arch, arc_mm, solid, d, stance)
+        tooth = _stood(solid, frame, RIGHT + place)
+        neighbour = SurfaceDistance(_far_half(tooth))
+        cervix_z_mm = float(frame.world_from_canonical(np.array([[0.0, 0.0, solid.cervix_mm]]))[0, 2])
+        curvature_mm = (d.curvature_mesial_mm + d.curvature_distal_mm) / 2
+        placed.append((tooth, Socket(arc_mm, d.md_crown_mm, cervix_z_mm, d.ll_cervix_mm / 2, curvature_mm)))
+        arc_mm -= d.md_crown_mm / 2
+    return placed
+
+
+def _standing(arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, stance: Stance) -> ToothFrame:
+    # Upright on the arch with its tip on the occlusal plane, then turned about its own middle.
+    from scipy.spatial.transform import Rotation
+
+    at = np.array([arc_mm])
+    point, outward, mesial = arch.points_mm(at)[0], arch.outward(at)[0], arch.tangents(at)[0]
+    upright = np.array([[*mesial, 0.0], [*outward, 0.0], [0.0, 0.0, 1.0]])
+    rotation = Rotation.from_euler("xyz", stance.turn_deg, degrees=True).as_matrix().T @ upright
+    tip_mm = float(solid.outer.vertices_mm[:, 2].max())
+    height = stance.longer_mm - SHORT_OF_PLANE_MM.get(d.position, 0.0) - tip_mm
+    origin = np.append(point + stance.forward_mm * outward, height)
+    return ToothFrame(rotation, -rotation @ origin)
+
+
+def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
+    outer, dentin = (Mesh(frame.world_from_canonical(mesh.vertices_mm), mesh.faces) for mesh in (solid.outer, solid.dentin))
+    return JawTooth(fdi, outer, dentin, frame, solid.cervix_mm)
+
+
+def _far_half(tooth: JawTooth) -> Mesh:
+    # Of the crown, the side that the next tooth of the right meets: a right tooth's distal side, or the mesial one across the midline.
+    canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
+    kept = (canonical[:, 0] < 0) & (canonical[:, 2] > tooth.cervix_mm)
+    return Mesh(tooth.outer.vertices_mm, tooth.outer.faces[kept[tooth.outer.faces].all(axis=1)])
+
+
+def _mirrored(tooth: JawTooth) -> JawTooth:
+    # The patient's other side; the frame's x axis turns from mesial to distal, so that it stays right-handed.
+    outer, dentin = (Mesh(mesh.vertices_mm @ MIRROR, mesh.faces[:, ::-1].copy()) for mesh in (tooth.outer, tooth.dentin))
+    frame = ToothFrame(MIRROR @ tooth.frame.rotation @ MIRROR, MIRROR @ tooth.frame.translation_mm)
+    return JawTooth(tooth.fdi - RIGHT + LEFT, outer, dentin, frame, tooth.cervix_mm)
+
+
+def _grown(tooth: JawTooth, size: float) -> JawTooth:
+    frame = replace(tooth.frame, translation_mm=size * tooth.frame.translation_mm)
+    return JawTooth(tooth.fdi, _scaled(tooth.outer, size), _scaled(tooth.dentin, size), frame, size * tooth.cervix_mm)
+
+
+def _scaled(mesh: Mesh, size: float) -> Mesh:
+    return Mesh(size * mesh.vertices_mm, mesh.faces)
