@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.errors import MeshError
 from services.core.geometry import Mesh
 from services.fit.anatomy.arch import Arch
 from services.fit.anatomy.crown import ToothSolid, build_tooth
@@ -24,6 +25,7 @@ RIGHT, LEFT = 10, 20
 PLACES = range(1, 8)
 GAP_MM = 0.07
 """Between neighbours, at their nearest."""
+MOST_MOVES = 60
 GAP_ERROR_MM = 0.005
 SEPARATION_MM = 1.0
 """By how much more than their half widths two teeth are apart before they are moved together."""
@@ -123,12 +125,16 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
         arc_mm -= d.md_crown_mm / 2 + SEPARATION_MM
         facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > d.md_crown_mm / 4]
         frame, spare_mm = _standing(arch, arc_mm, solid, d, stance), SEPARATION_MM
-        while abs(spare_mm) >= GAP_ERROR_MM:
+        for _ in range(MOST_MOVES):
+            if abs(spare_mm) < GAP_ERROR_MM:
+                break
             points = frame.world_from_canonical(facing)
             spare_mm = float(-points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM)
             # Turning with the arch may bring a corner nearer than the move itself: so a little less at a time.
             arc_mm += 0.85 * spare_mm
             frame = _standing(arch, arc_mm, solid, d, stance)
+        else:
+            raise MeshError(f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller variation.")
         tooth = _stood(solid, frame, RIGHT + place)
         neighbour = SurfaceDistance(_far_half(tooth))
         cervix_z_mm = float(frame.world_from_canonical(np.array([[0.0, 0.0, solid.cervix_mm]]))[0, 2])
