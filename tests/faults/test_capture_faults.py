@@ -225,10 +225,11 @@ def test_a_dome_larger_than_the_register_map_is_refused() -> None:
         serve_dome("127.0.0.1", 0, lights=156, watchdog_s=1.0)
 
 
-# What a shell starts in the background ignores interrupts, and so would this.
+# What a shell starts in the background ignores interrupts, and under nohup hang-ups too; so would this.
 SIGNALLED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import ModbusDome
 with ModbusDome("127.0.0.1", int(sys.argv[1]), ExposureBudget(1e3, 1e3), watchdog_s=60.0) as dome:
