@@ -6,6 +6,8 @@ its one direction instead. No path connects to a light or to another path, so bo
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -52,7 +54,7 @@ class Texels:
         dr.eval(self.of_face)
 
 
-class BorderWalk(Walk):
+class BorderWalk(Walk, ABC):
     """The walk without connections, which instead counts its crossings of the border."""
 
     def __init__(self, geometry: MeshGeometry, media: Media, start: CameraStart | LightStart, texels: Texels, order: int, ior: float | None) -> None:
@@ -75,8 +77,9 @@ class BorderWalk(Walk):
         dr.if_stmt((walker.lane, flight.hit, walker.omega, strength, fresh, crosses), crosses, count, lambda lane, *_: lane, label="border")
         super()._move(walker, flight, carried)
 
+    @abstractmethod
     def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
-        raise NotImplementedError
+        """Count crossings of a lane's path at ``strength``, its weight over the cosine; ``fresh`` ones have not collided."""
 
     def _texel(self, hit: Hit, active: mi.Bool) -> mi.UInt32:
         return dr.gather(mi.UInt32, self.texels.of_face, hit.primitive - self.mesh.first_dentin_face(self.texels.tooth), active)

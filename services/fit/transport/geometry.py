@@ -150,13 +150,13 @@ class SlabGeometry:
         """No stains."""
         return mi.Bool(False)
 
-    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
-        """Layers do not mix."""
-        raise NotImplementedError
+    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:  # noqa: ARG002 - borders are sharp everywhere
+        """The layer alone."""
+        return Mixed(self.medium(place), self.medium(place), mi.Float(1), mi.Float(0))
 
-    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Layers do not mix."""
-        raise NotImplementedError
+    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - borders are sharp everywhere
+        """Nothing mixes, so nothing changes."""
+        return [mi.Float(0) for _ in range(self.modes_of[tooth])]
 
     def depths(self, z: mi.Float, sigma: Sequence[mi.Float]) -> tuple[mi.Float, mi.Float]:
         """Optical depths from ``z`` inside straight to the lit and to the far face."""
