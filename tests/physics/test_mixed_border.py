@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
 from services.core.errors import InputError
 from services.core.geometry import Mesh
@@ -24,7 +25,9 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.mixed_border import MixedBorder
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scores import Scores
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
+from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view
 
 WIDTH_MM = 2.0
@@ -114,6 +117,43 @@ def test_the_distance_moves_as_the_surface_does() -> None:
 def test_borders_of_no_possible_width_are_refused(width_mm: float) -> None:
     with pytest.raises(InputError, match="border_width_mm"):
         Engine(replace(recipe("matched"), border_width_mm=width_mm))
+
+
+def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
+    # Gums do not mix, but what mixes reads lobes alone.
+    engine = Engine(replace(mouth_recipe("matched"), border_width_mm=1.0))
+    tabulated = replace(MOUTH, gums=Medium(1, 0.9, table=PhaseTable((0.0, np.pi), (1.0, 1.0))))
+    with pytest.raises(InputError, match="phase table; make the border sharp"):
+        engine.images(tabulated, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Albedos far apart and extinctions near: nearly all of the derivative of the images' sum is what the mixture's albedo does, and without it the test fails.
+    if not whole:
+        monkeypatch.setattr(Scores, "mixed_albedo_motion", lambda *_: mi_zero())
+    tissue = Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4))
+    engine, view = Engine(replace(recipe(), border_width_mm=1.2)), whole_view(camera_at((0.2, 1, 0.1)), 1)
+    scores = np.array([engine.jacobian(tissue, view, ("shape.0",), samples=1024, seed=seed).jacobian.sum() for seed in range(8)])
+
+    def totals(c: float) -> NDArray[np.float64]:
+        moved = tissue.with_values({"shape.0": c})
+        return np.array([engine.images(moved, view, samples=2048, seed=100 + seed).mean.sum() for seed in range(8)])
+
+    wide, narrow = (totals(0.5 + h) - totals(0.5 - h) for h in (0.2, 0.1))
+    differences = (4 * narrow / 0.2 - wide / 0.4) / 3
+    gap = scores - differences
+    error = gap.std(ddof=1) / np.sqrt(len(gap))
+    assert error <= 0.05 * abs(differences.mean())
+    # Both grids of distances are off by a hundredth on average (the test above).
+    allowed = stats.t.isf(5e-4, len(gap) - 1) * error + 0.01 * abs(differences.mean())
+    assert (abs(gap.mean()) <= allowed) == whole
+
+
+def mi_zero() -> Any:
+    import mitsuba as mi
+
+    return mi.Float(0)
 
 
 def test_a_gradual_border_mixes_lobes_not_tables() -> None:

@@ -99,6 +99,17 @@ def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneR
         )
 
 
+def require_finite_gradient(what: str, view: View, *arrays: NDArray[np.float64]) -> None:
+    """Refuse the gradient of a view's images that holds NaN or infinity.
+
+    Raises:
+        NonFiniteError: gives the count.
+    """
+    bad = sum(int((~np.isfinite(array)).sum()) for array in arrays)
+    if bad:
+        raise NonFiniteError(f"{bad} numbers of the gradient to {what} by camera {view.camera.name} came out non-finite; report the parameters.")
+
+
 def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
     """Refuse results (batches, N, slots) that hold NaN or infinity, whatever the slot.
 

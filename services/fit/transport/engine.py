@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import InputError, NonFiniteError
+from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.checks import require_cotangent, require_finite, require_lights, require_surfaces, require_view
+from services.fit.transport.checks import require_cotangent, require_finite, require_finite_gradient, require_lights, require_surfaces, require_view
 from services.fit.transport.names import media_of, parameter_names, whitened
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, StainGradient, View
@@ -193,8 +193,7 @@ class Engine:
         lights = len(view.lights or self.recipe.light_positions_mm)
         photons = photons or -(-samples * len(view) // lights)
         found = self._shape_gradients[tooth](moved, media, view, cotangent, seed=seed, samples=samples, photons=photons, order=order)
-        if not np.isfinite([found.gradient, found.variance]).all():
-            raise NonFiniteError(f"The shape gradient of camera {view.camera.name} came out non-finite; report the parameters.")
+        require_finite_gradient("the dentin's shape", view, found.gradient, found.variance)
         return found
 
     def order_images(
@@ -239,7 +238,7 @@ class Engine:
         tally = StainTally(textures, seen / (largest or 1.0), batches)
         start = CameraStart(view, batches, seed, self._radius_mm)
         (sums, _) = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
-        require_finite([sums.reshape(batches, 1, -1)], view)
+        require_finite_gradient("the stains", view, sums)
         means = sums * (largest / count)
         gradient, variance = means.mean(axis=0), means.var(axis=0, ddof=1) / batches if batches > 1 else np.full(textures.count, np.nan)
         return StainGradient(textures.cut(gradient), textures.cut(variance), batches * count)

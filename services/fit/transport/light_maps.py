@@ -10,7 +10,6 @@ Stamminger 2003, here as a control variate).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -89,6 +88,27 @@ class MapRay:
     limit: mi.Float
     """Where following it ended."""
     alive: mi.Bool
+
+
+@dataclass
+class MapCell:
+    """Where a vertex lies in a light's map: the four grid points around it, and the light itself."""
+
+    direction: mi.Vector3f
+    falloff: mi.Float
+    depth: mi.Float
+    """Of the vertex along the light's ray, mm."""
+    corners: list[list[mi.UInt32]]
+    """Words of each grid point."""
+    u: mi.Float
+    v: mi.Float
+    inside: mi.Bool
+    """Whether it is on the map."""
+
+    def between(self, word: int, shift: int) -> mi.Float:
+        """Bilinear interpolation of the half of a word from a bit on."""
+        values = [mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift) for corner in self.corners]
+        return dr.lerp(dr.lerp(*values[:2], self.u), dr.lerp(*values[2:], self.u), self.v)
 
 
 class LightMaps:
@@ -244,30 +264,16 @@ class LightMaps:
         cell = dr.minimum(cell, self.count * self.size**2 - self.size - 2)
         inside = (per_forward > 0) & (dr.minimum(column, row) >= 0) & (dr.maximum(column, row) < self.size - 1)
         corners = [[dr.gather(mi.UInt32, self._table, self.WORDS * (cell + k) + word) for word in range(self.WORDS)] for k in (0, 1, self.size, self.size + 1)]
-        u, v = x - column, y - row
+        found = MapCell(-from_light * inverse, frame.intensity * dr.square(inverse), depth, corners, x - column, y - row, active & inside)
+        return self._view(found, place)
 
-        def between(word: int, shift: int) -> mi.Float:
-            values = [mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift) for corner in corners]
-            return dr.lerp(dr.lerp(*values[:2], u), dr.lerp(*values[2:], u), v)
-
-        return self._view(-from_light * inverse, frame.intensity * dr.square(inverse), depth, corners, between, place, active & inside)
-
-    def _view(
-        self,
-        direction: mi.Vector3f,
-        falloff: mi.Float,
-        depth: mi.Float,
-        corners: list[list[mi.UInt32]],
-        between: Callable[[int, int], mi.Float],
-        place: mi.UInt32,  # noqa: ARG002 - scenes of several surfaces need it
-        inside: mi.Bool,
-    ) -> LightView:
-        """Read a cell; ``between`` interpolates the half of a word from a bit on."""
-        entry, dentin_entry, dentin_exit = (dr.fma(between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0)))
-        dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
-        enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
-        certain = inside & ((corners[0][1] & 0x10000) != 0)
-        return LightView(direction, falloff, (ENAMEL, DENTIN), (enamel_mm, dentin_mm), between(1, 16) * (1 / 65535), certain)
+    def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the place
+        """Read a cell."""
+        entry, dentin_entry, dentin_exit = (dr.fma(cell.between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0)))
+        dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
+        enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
+        certain = cell.inside & ((cell.corners[0][1] & 0x10000) != 0)
+        return LightView(cell.direction, cell.falloff, (ENAMEL, DENTIN), (enamel_mm, dentin_mm), cell.between(1, 16) * (1 / 65535), certain)
 
 
 def aligned(values: mi.Float) -> mi.Float:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Mesh
+from services.fit.anatomy.patches import areas_mm2
 from services.fit.optics.parameters import Stain
 from services.fit.transport.clearance import Clearance
 from services.fit.transport.geometry import RAY_EPSILON, Hit
@@ -157,8 +158,7 @@ class MeshGeometry:
         """Areas of the triangles of a tooth's dentin at its present shape."""
         assert self._shapes is not None
         dentin = self._dentins[tooth]
-        corners = dentin.vertices_mm(self._shapes[tooth])[dentin.base.faces]
-        return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2)
+        return areas_mm2(Mesh(dentin.vertices_mm(self._shapes[tooth]), dentin.base.faces))
 
     def _displacement_tables(self) -> list[mi.Float]:
         """B_m - B0 at the corners of every dentin face, a table per mode; zero where a tooth has fewer modes."""

@@ -6,13 +6,11 @@ nothing yet the map knows that too: what lies on a wall in front of all surfaces
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import drjit as dr
 import mitsuba as mi
 
 from services.fit.transport.geometry import Hit
-from services.fit.transport.light_maps import LightMaps, LightView, MapRay
+from services.fit.transport.light_maps import LightMaps, LightView, MapCell, MapRay
 from services.fit.transport.mesh_geometry import MeshGeometry
 
 FIRST = 31
@@ -61,33 +59,24 @@ class MouthMaps(LightMaps):
         limit = mi.UInt32(self._depth_code(ray.limit)) | (first << 16)
         self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, kinds, (limit,))
 
-    def _view(
-        self,
-        direction: mi.Vector3f,
-        falloff: mi.Float,
-        depth: mi.Float,
-        corners: list[list[mi.UInt32]],
-        between: Callable[[int, int], mi.Float],
-        place: mi.UInt32,
-        inside: mi.Bool,
-    ) -> LightView:
+    def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:
         halves = ((0, 0), (0, 16), (1, 0), (2, 0))
-        entry, dentin_entry, dentin_exit, limit = (dr.fma(between(*half), self._depth_step, -self._near) for half in halves)
+        entry, dentin_entry, dentin_exit, limit = (dr.fma(cell.between(*half), self._depth_step, -self._near) for half in halves)
         thing = self._geometry.inside(place)
         outside = thing > self._geometry.teeth
-        followed = ((corners[0][1] & 0x10000) != 0) & ((corners[0][2] >> 16) == thing + 1) & (depth < limit)
-        nearest = corners[0][0] & 0xFFFF
-        for corner in corners[1:]:
+        followed = ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == thing + 1) & (cell.depth < limit)
+        nearest = cell.corners[0][0] & 0xFFFF
+        for corner in cell.corners[1:]:
             nearest = dr.minimum(nearest, corner[0] & 0xFFFF)
         # On a wall the first thing is the wall itself, as far as the grid can tell.
-        free = outside & (depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm)
+        free = outside & (cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm)
 
-        dentin_mm = dr.maximum(dr.minimum(depth, dentin_exit) - dentin_entry, 0)
-        enamel_mm = dr.maximum(depth - entry - dentin_mm, 0)
+        dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
+        enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
         lengths_mm = [dr.select(outside, 0, enamel_mm), dr.select(outside, 0, dentin_mm)]
         numbers = self._geometry.numbers
         medium = dr.select(outside, mi.UInt32(1), thing * (1 + numbers.dentin) + 1)
         media = [medium, dr.select(thing < self._geometry.teeth, medium + 1, mi.UInt32(1))]
-        surface = dr.select(outside, 1, between(1, 16) * (1 / 65535))
-        known = inside & (followed | free)
-        return LightView(direction, falloff, tuple(media[: 1 + numbers.dentin]), tuple(lengths_mm[: 1 + numbers.dentin]), surface, known)
+        surface = dr.select(outside, 1, cell.between(1, 16) * (1 / 65535))
+        known = cell.inside & (followed | free)
+        return LightView(cell.direction, cell.falloff, tuple(media[: 1 + numbers.dentin]), tuple(lengths_mm[: 1 + numbers.dentin]), surface, known)

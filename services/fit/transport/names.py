@@ -92,8 +92,6 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
             raise InputError(f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it.")
         require_stain(f"{prefix}stain", tissue.stain, tooth)
-    if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
-        raise InputError(f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes.")
     if (mouth.gums is None) == numbers.gums:
         raise InputError(f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither.")
     if mouth.gums is not None:
@@ -107,6 +105,8 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         if not 0 <= mouth.reflectance <= 1:
             raise InputError(f"cavity.reflectance = {mouth.reflectance:.10g} must lie in 0 to 1; correct it.")
         media.append(Medium(1.0, mouth.reflectance))
+    if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
+        raise InputError(f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes.")
     return media
 
 
@@ -134,6 +134,10 @@ def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
 def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:
     """The same without absorption."""
     if isinstance(tissue, Tissue):
-        return replace(tissue, enamel=replace(tissue.enamel, alpha=1.0), dentin=replace(tissue.dentin, alpha=1.0))
-    teeth = tuple(replace(t, enamel=replace(t.enamel, alpha=1.0), dentin=replace(t.dentin, alpha=1.0)) for t in tissue.teeth)
-    return Mouth(teeth, None if tissue.gums is None else replace(tissue.gums, alpha=1.0), None if tissue.reflectance is None else 1.0)
+        return _white(tissue)
+    gums = None if tissue.gums is None else replace(tissue.gums, alpha=1.0)
+    return Mouth(tuple(map(_white, tissue.teeth)), gums, None if tissue.reflectance is None else 1.0)
+
+
+def _white(tissue: Tissue) -> Tissue:
+    return replace(tissue, enamel=replace(tissue.enamel, alpha=1.0), dentin=replace(tissue.dentin, alpha=1.0))

@@ -129,7 +129,7 @@ class Scores:
         ]
 
     def mixed_motion(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
-        """D ln / dq of the mixture's phase function: differences of the two media times ``terms``, all fields of its lobes (Eq. 19, corrected)."""
+        """Change of ln(phase function) with q, per mm: differences of the two media times ``terms``, all fields of the lobes (Eq. 19, corrected)."""
         total = mi.Float(0)
         for field, term in terms.items():
             column = {"beta": self.media.beta, "g1": self.media.g1, "g2": self.media.g2}[field]
@@ -137,7 +137,7 @@ class Scores:
         return total * medium.slope
 
     def mixed_albedo_motion(self, medium: Mixed) -> mi.Float:
-        """D ln / dq of the mixture's albedo (Eq. 21)."""
+        """Change of ln(albedo) with q, per mm (Eq. 21)."""
         absorbed = self.media.absorbed
         less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
         return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
