@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import IntFlag
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -77,6 +78,10 @@ class RigSpec(Record):
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
 
+HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)})
+"""Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
+
+
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
@@ -86,6 +91,7 @@ class JobSpec(Record):
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(default="fit", description="dentin surface: given by the capture, fitted as blend shape, or absent")
+    held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
     held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
     channels: tuple[str, ...] | None = Field(default=None, description="channels to fit; default: all")
@@ -106,6 +112,13 @@ class JobSpec(Record):
             raise ValueError("give exactly one of 'capture' (a folder) and '[rig]'")
         if self.max_samples_per_pixel < self.samples_per_pixel:
             raise ValueError("max_samples_per_pixel must be at least samples_per_pixel")
+        for name, value in self.held.items():
+            part, _, leaf = name.partition(".")
+            if part not in {"enamel", "dentin"} or leaf not in HELD_RANGES:
+                raise ValueError(f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as enamel.sigma")
+            low, high = HELD_RANGES[leaf]
+            if not low < value < high:
+                raise ValueError(f"held {name} = {value:g} must lie between {low:g} and {high:g}")
         return self
 
 

@@ -79,7 +79,7 @@ class FitDriver:
         self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]
     ) -> ChannelSchedule:
         seeds = Seeds(self.spec.seed, files.channel)
-        passes = Passes(run_on, files.blocks, files.recipe, seeds, self.trace.extend)
+        passes = Passes(run_on, files.coarse.blocks, files.recipe, seeds, self.trace.extend)
 
         def tell(step: StepReport, evaluation: Evaluation) -> None:
             expected = self.spec.max_steps + 10
@@ -146,10 +146,11 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
         return DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
     if spec.dentin == "fit":
         from services.fit.anatomy.blend import dentin_blend_shape
+        from services.fit.anatomy.dimensions import upper_tooth
         from services.fit.anatomy.frame import estimate_frame
 
         centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
-        return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm))
+        return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm), crown=upper_tooth(tooth.fdi % 10))
     return None
 
 

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 LEAST_BLOCKS = 4
 LEAST_BLOCK_PIXELS = 128
+COARSE_PIXELS = 600
+"""Most pixels of a view in all stages but the last, and while the fit is watched."""
 SEARCH_PIXELS = 210
 """Pixels over all views that the table search compares."""
 
@@ -59,24 +61,40 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class Level:
+    """One resolution of a channel's images."""
+
+    blocks: tuple[StoredFile, ...]
+    """Fitted lights only."""
+    evaluation_blocks: tuple[StoredFile, ...]
+    """All lights."""
+    pixels: int
+    """Fitted pixels of all views."""
+    signal: float
+    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
+
+
+@dataclass(frozen=True)
 class ChannelFiles:
     """One channel's blocks and scenes on disk."""
 
     channel: str
     recipe: StoredFile
-    blocks: tuple[StoredFile, ...]
-    """Fitted lights only."""
+    coarse: Level
+    """Every n-th pixel in x and y, so that no view has more than about COARSE_PIXELS."""
+    full: Level
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
     evaluation_recipe: StoredFile
-    evaluation_blocks: tuple[StoredFile, ...]
-    """All lights."""
     weight: float
     """Weight of every fitted measurement: 1 / mean variance."""
-    signal: float
-    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
+
+    @property
+    def blocks(self) -> tuple[StoredFile, ...]:
+        """All that is fitted or compared at full resolution."""
+        return self.full.blocks + self.full.evaluation_blocks
 
 
 def read_observations(root: Path, spec: JobSpec) -> Observations:
@@ -179,23 +197,37 @@ def write_channel(
         positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
         return write_recipe(folder, single_tooth(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device))
 
-    def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
-        files = []
-        for v in views:
-            valid, held = v.valid[lights], v.held_out[lights][:, None]
-            relevant = np.flatnonzero((valid & ~held).any(axis=0) if lights is used else valid.any(axis=0))
-            for part in _split(relevant, int(lights.sum()), len(views)) if most is None else [_spread(relevant, most // len(views))]:
-                if len(part):
-                    cut = np.ix_(np.flatnonzero(lights), part)
-                    chosen = v.valid[cut]
-                    block = Block(View(v.camera, v.pixels[part]), v.reference[cut], v.variance[cut], np.where(chosen & ~held, weight, 0.0), chosen & held)
-                    files.append(write_block(folder, block))
-        return tuple(files)
+    def block(view: ViewStack, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
+        cut = np.ix_(np.flatnonzero(lights), pixels)
+        chosen, held = view.valid[cut], view.held_out[lights][:, None]
+        measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
+        return write_block(folder, Block(*measured, np.where(chosen & ~held, weight, 0.0), chosen & held))
 
+    def level(most: int | None) -> Level:
+        fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
+        for view, fit in zip(views, fitted, strict=True):
+            counted = np.asarray(fit.any(axis=0))
+            kept = np.ones(len(view.pixels), dtype=bool) if most is None else on_coarse_grid(view.pixels, counted, most)
+            relevant = np.flatnonzero(counted & kept)
+            pixels, signal = pixels + len(relevant), signal + weight * float((view.reference[:, kept][fit[:, kept]] ** 2).sum())
+            fits += [block(view, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)]
+            seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
+            compares += [block(view, seen, part) for part in _split(seen_pixels, int(seen.sum()), len(views)) if len(part)]
+        return Level(tuple(fits), tuple(compares), pixels, signal)
+
+    search = [(view, _spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views))) for view, fit in zip(views, fitted, strict=True)]
     return ChannelFiles(
-        channel, recipe(used), blocks(used), blocks(used, SEARCH_PIXELS), recipe(seen), blocks(seen), weight, float(weight * values @ values),
-        float(values @ values / noise.sum()),
+        channel, recipe(used), level(COARSE_PIXELS), level(None), tuple(block(view, used, pixels) for view, pixels in search if len(pixels)), recipe(seen),
+        weight, float(values @ values / noise.sum()),
     )  # fmt: skip
+
+
+def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
+    """Which pixels (N, 2) are every n-th in x and y, n the least that leaves no more than ``most`` of the counted ones."""
+    every = 1
+    while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
+        every += 1
+    return np.asarray(kept)
 
 
 def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:

@@ -26,13 +26,16 @@ from numpy.typing import NDArray
 from services.fit.blocks import Block, StoredFile, read_block
 from services.fit.engine_host import EngineHost
 from services.fit.executors import Executor
-from services.fit.optics.domain import Domain, similar_tissue
+from services.fit.optics.domain import BOUNDS, Domain, kind_of, similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.seeds import Seeds
 from services.fit.solve.normal_equations import LossChange, NormalEquations, loss_change, normal_equations
-from services.fit.transport.recipe import JacobianEstimate, StackEstimate
+from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
 
 Array = NDArray[np.float64]
+
+SHAPE_STEP = 0.2
+"""Half the step of the differences that give derivatives to blend weights; of their scale in a fit."""
 
 
 @dataclass(frozen=True)
@@ -243,13 +246,24 @@ def _similar_parameters(name: str) -> tuple[str, ...]:
 
 def _render_jacobians(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> tuple[Array, Array]:
     view = read_block(task.block).fitted_view
+    scored = tuple(name for name in parameters if kind_of(name) != "shape")
 
     def render(seed: int) -> Array:
-        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, parameters, samples=task.samples, seed=seed)
-        natural = np.asarray(estimate.jacobian, dtype=np.float64)
+        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, scored, samples=task.samples, seed=seed)
+        scores = dict(zip(scored, estimate.jacobian, strict=True))
+        natural = np.stack([scores[name] if name in scores else _secant(host, task, view, name, seed) for name in parameters])
         return np.asarray(chain.T @ natural.reshape(len(natural), -1))
 
     return render(seeds[0]), render(seeds[1])
+
+
+def _secant(host: EngineHost, task: BlockTask, view: View, name: str, seed: int) -> Array:
+    """Derivative (L, N) to a blend weight by a difference of images with common random numbers; one-sided where a bound is near."""
+    low, high = BOUNDS["shape"]
+    value = task.tissue.value(name)
+    ends = max(value - SHAPE_STEP, low), min(value + SHAPE_STEP, high)
+    below, above = (host.call("images", task.recipe, task.tissue.with_values({name: end}), view, samples=task.samples, seed=seed).mean for end in ends)
+    return np.asarray((above - below) / (ends[1] - ends[0]))
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:

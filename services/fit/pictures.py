@@ -39,7 +39,7 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
 def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> tuple[Picture, ...]:
     """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
     # A fit of every n-th pixel is shown as the smaller picture it is, not as dots.
-    every = min((spacing(view.pixels) for stack in views.values() for view in stack), default=1)
+    every = min((spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1)
     channels = list(evaluations)
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
@@ -52,9 +52,10 @@ def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifes
                 width, height = (-(-size // every) for size in view.camera.size)
                 blank = np.zeros((height, width, len(channels)))
                 images[key] = Picture(*key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool))
-            x, y = view.pixels.T // every
-            images[key].photo[y, x, index] = view.reference[number]
-            images[key].valid[y, x] |= view.valid[number]
+            shown = (view.pixels % every == 0).all(axis=1)
+            x, y = view.pixels[shown].T // every
+            images[key].photo[y, x, index] = view.reference[number, shown]
+            images[key].valid[y, x] |= view.valid[number, shown]
             images[key].render[pixels[:, 1] // every, pixels[:, 0] // every, index] = values
     return tuple(images[key] for key in sorted(images))
 
