@@ -16,7 +16,7 @@ from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
 from services.fit.observations import ViewStack
-from services.fit.schedule import StepReport
+from services.fit.stages import StepReport
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"

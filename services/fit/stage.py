@@ -30,12 +30,15 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     Raises:
         CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError: between two steps.
     """
+    from services.fit.attempt import Attempt
     from services.fit.driver import FitDriver
+    from services.fit.jaw_driver import JawDriver
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
     writer = StageWriter(context.root, "fit", context.attempt)
-    driver = FitDriver(spec, context, writer, engine)
+    attempt = Attempt(spec, context, writer, engine)
+    driver = FitDriver(attempt) if spec.kind == "tooth" else JawDriver(attempt)
     report = driver.run(time.time())
     writer.publish(report)
     context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=summary(report)))
