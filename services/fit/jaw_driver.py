@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from services.core.geometry import Tooth
-from services.core.records import FitReport
+from services.core.geometry import Camera, Mesh, Tooth
+from services.core.records import FitReport, JobSpec
 from services.fit.attempt import Attempt
 from services.fit.blocks import GUMS
 from services.fit.driver import dentin_shape
@@ -58,7 +58,8 @@ class JawDriver:
         """Fit all channels; files land in the stage's folder, the report is returned."""
         attempt, spec = self.attempt, self.attempt.spec
         observations = read_observations(attempt.context.root, spec)
-        dentins = [self._dentin(tooth, observations) for tooth in observations.teeth]
+        observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
+        dentins = [known_dentin(tooth) for tooth in observations.teeth]
         channels = []
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
@@ -71,13 +72,24 @@ class JawDriver:
         attempt.write_records(journal, observations, evaluations, {channel.name: channel.views for channel in channels})
         return report(fits, [dentin is not None for dentin in dentins], time.time() - begun)
 
-    def _dentin(self, tooth: Tooth, observations: Observations) -> DentinShape | None:
-        # Of a jaw the dentin's shape is not fitted: where it is not given, it is the blend shape that a tooth's fit starts from.
-        shape = dentin_shape(tooth, observations.manifest.cameras, self.attempt.spec)
-        if shape is None or len(shape.modes_mm) == 0:
-            return shape
-        base = replace(shape.base, vertices_mm=shape.vertices_mm((START_SHAPE,) * len(shape.modes_mm)))
-        return DentinShape(base, np.zeros((0, len(base.vertices_mm), 3)))
+
+def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> Tooth:
+    """A jaw's tooth with its dentin: the given one, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
+
+    A tooth whose mesh allows none is homogeneous.
+    """
+    try:
+        shape = dentin_shape(tooth, cameras, spec)
+    except TOOTH_FAULTS:
+        shape = None
+    if shape is None:
+        return replace(tooth, dentin=None)
+    return replace(tooth, dentin=Mesh(shape.vertices_mm((START_SHAPE,) * len(shape.modes_mm)), shape.base.faces))
+
+
+def known_dentin(tooth: Tooth) -> DentinShape | None:
+    """Its dentin as a surface that does not move."""
+    return None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
 
 
 @dataclass

@@ -52,7 +52,7 @@ def recipe(fdi: tuple[int, ...] = FDI) -> SceneRecipe:
         return ToothSurfaces(revolved((3.0, 4.0), centre), DentinShape(core, np.zeros((0, len(core.vertices_mm), 3))))
 
     box = trimesh.creation.box((28.0, 9.0, 5.0)).subdivide_to_size(4.0)
-    gums = Mesh(np.asarray(box.vertices) + [0, 0, -5.0], np.asarray(box.faces, dtype=np.int32))
+    gums = Mesh(np.asarray(box.vertices) + np.array([0, 0, -5.0]), np.asarray(box.faces, dtype=np.int32))
     corners = np.array([[-14.0, -5.0, -5], [14, -5.0, -5], [14, -5.0, 5], [-14, -5.0, 5]])
     wall = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     lights = np.array(LIGHTS_MM)
@@ -95,9 +95,7 @@ def write_prepared_jaw(
     writer = StageWriter(root, "prepared", 1)
     shape = (2, len(LIGHTS_MM), SIZE, SIZE)
     store, axes = writer.folder / "prepared.zarr", ("camera", "light", "y", "x")
-    radiance, variance = (
-        create_array(store, name, (*shape, 1), (1, 1, SIZE, SIZE, 1), "float32", (*axes, "channel")) for name in ("radiance", "variance")
-    )
+    radiance, variance = (create_array(store, name, (*shape, 1), (1, 1, SIZE, SIZE, 1), "float32", (*axes, "channel")) for name in ("radiance", "variance"))
     valid = create_array(store, "valid", shape, (1, 1, SIZE, SIZE), "uint16", axes)
     module, name = engine.split(":")
     renderer = getattr(importlib.import_module(module), name)(scene)
