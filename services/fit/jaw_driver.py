@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from services.core.errors import SettingsError
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import FitReport, JobSpec
 from services.fit.attempt import Attempt
@@ -35,7 +36,7 @@ from services.fit.pictures import shown_images
 from services.fit.schedule import START_SHAPE, ChannelSchedule
 from services.fit.transport.recipe import DentinShape
 
-START_STEPS = 10
+START_STEPS = 4
 """About so many steps start one tooth, for the progress shown."""
 
 
@@ -55,8 +56,14 @@ class JawDriver:
     attempt: Attempt
 
     def run(self, started_s: float) -> FitReport:
-        """Fit all channels; files land in the stage's folder, the report is returned."""
+        """Fit all channels; files land in the stage's folder, the report is returned.
+
+        Raises:
+            SettingsError: more than one lobe was asked for. CaptureInputError, StoreError: what was prepared is no jaw that can be fitted.
+        """
         attempt, spec = self.attempt, self.attempt.spec
+        if spec.lobes != 1:
+            raise SettingsError("A jaw is fitted with one lobe per medium; set lobes to 1, or fit its teeth one by one with kind 'tooth'.")
         observations = read_observations(attempt.context.root, spec)
         observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
         dentins = [known_dentin(tooth) for tooth in observations.teeth]
@@ -116,13 +123,13 @@ class _ChannelRun:
                 self.attempt.log(f"{self.channel.name}: {starts[-1].sentence}")
         mouth = start_mouth(starts, self._gums(), has_cavity=observations.cavity is not None)
 
-        # Pixels of a tooth that no medium could be fitted to would mislead its neighbours.
+        # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so the jaw's does not hold it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
         files = self.channel.files
         if failed:
             scene = channel_scene(observations, self.channel.name, self.dentins, self.attempt.spec)
-            kept = write_channel(self.attempt.inputs, scene, self.channel.name, without(views, failed))
-            files = replace(kept, evaluation_blocks=files.evaluation_blocks, evaluation_recipe=files.evaluation_recipe)
+            views = without(views, failed)
+            files = write_channel(self.attempt.inputs, scene, self.channel.name, views)
         self.attempt.log(f"{self.channel.name}: all {len(starts)} teeth together.")
         schedule = JawSchedule(
             files=files,

@@ -3,10 +3,14 @@
 =========  ==============================================================  =======  ===========================
 stage      free                                                            media    ends
 =========  ==============================================================  =======  ===========================
-joint      sigma, alpha of enamel and dentin of each tooth and of gums,    similar  converged, or max_steps
-           the wall's reflectance
+start.k    sigma, alpha of enamel and dentin of each tooth and of gums,    similar  two steps each; for each tooth
+           the wall's reflectance, from several ratios of the media                 the least loss of its own
+joint      the same                                                        similar  converged, or max_steps
 exact      the same                                                        exact    converged, or max_steps
 =========  ==============================================================  =======  ===========================
+
+Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is asked with everything around it in
+place: alone, gums and wall are missing, and what they reflect is taken for the tooth's own.
 
 Teeth of which too little is seen, or whose own fit failed, have coordinates like all others, but with a Gaussian prior about the median of the front
 teeth, taken anew before each stage. So what little is seen of them still counts, and where nothing is, they follow.
@@ -16,13 +20,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
-from services.core.errors import SettingsError
+import numpy as np
+
 from services.fit.jaw_starts import ToothStart, typical
-from services.fit.optics.domain import Coordinate, Domain, to_dual
+from services.fit.optics.domain import Coordinate, Domain, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.passes import Near, StackProblem
-from services.fit.schedule import EXACT_SAMPLES, PRIORS, SIMILAR_G
+from services.fit.schedule import EXACT_SAMPLES, PRIORS, SIMILAR_G, START_RATIOS, START_STEPS
 from services.fit.solve.gauss_newton import Options
 from services.fit.stages import ChannelFit, Stages
 
@@ -44,22 +50,38 @@ class JawSchedule(Stages[Mouth]):
     """Which teeth have dentin."""
 
     def run(self) -> ChannelFit[Mouth]:
-        """Fit the channel.
-
-        Raises:
-            SettingsError: more than one lobe was asked for.
-        """
+        """Fit the channel."""
         spec, samples = self.spec, self.spec.samples_per_pixel
-        if spec.lobes != 1:
-            raise SettingsError("A jaw is fitted with one lobe per medium; set lobes to 1, or fit its teeth one by one with kind 'tooth'.")
         options = Options(max_steps=spec.max_steps, max_samples=spec.max_samples_per_pixel, tolerance=self.tolerance, parts=len(self.teeth))
-        mouth, near = self.start, nearby([start.fdi for start in self.teeth], self._domain(self.start))
-        similar = StackProblem(self.passes, self._domain(mouth), mouth, "joint", jacobian_g=SIMILAR_G, image_g=SIMILAR_G, near=near)
-        mouth, solution = self._iterate(similar, options, 2 * samples)
-        mouth = self._retied(mouth)
-        exact = StackProblem(self.passes, self._domain(mouth), mouth, "exact", jacobian_g=SIMILAR_G, near=near)
+        mouth = self._best_starts() if any(self.dentin) else self.start
+        mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
+        exact = self._problem(self._retied(mouth), "exact", None)
         mouth, solution = self._iterate(exact, options, min(solution.samples, EXACT_SAMPLES * samples))
         return self._finish(replace(exact, base=mouth, stage="final"), solution)
+
+    def _problem(self, mouth: Mouth, stage: str, image_g: float | None) -> StackProblem[Mouth]:
+        domain = self._domain(mouth)
+        near = nearby([start.fdi for start in self.teeth], domain)
+        return StackProblem(self.passes, domain, mouth, stage, jacobian_g=SIMILAR_G, image_g=image_g, near=near)
+
+    def _best_starts(self) -> Mouth:
+        # Every ratio for all teeth at once; their losses are compared tooth by tooth, with the same seeds.
+        ends = []
+        for k, ratio in enumerate(START_RATIOS):
+            start = replace(self.start, teeth=tuple(map(partial(_layered, ratio), self.start.teeth, self.dentin)))
+            limits = replace(self.short(START_STEPS), parts=len(self.teeth))
+            ends.append(self._iterate(self._problem(start, f"start.{k}", SIMILAR_G), limits, self.spec.samples_per_pixel)[0])
+        samples = min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
+
+        def compute() -> list[list[float]]:
+            found = [self._evaluate("starts", similar_tissue(end, SIMILAR_G), samples) for end in ends]
+            whole = [each.fitted.product for each in found]
+            return [[each.parts[k][0].product if k in each.parts else total for each, total in zip(found, whole, strict=True)] for k in range(len(self.teeth))]
+
+        self.pause()
+        losses, _ = self.journal.once(f"{self.scope}/starts", compute)
+        best = [ends[int(np.argmin(own))].teeth[k] for k, own in enumerate(losses)]
+        return replace(ends[int(np.argmin(np.sum(losses, axis=0)))], teeth=tuple(best))
 
     @property
     def media(self) -> tuple[str, ...]:
@@ -95,6 +117,15 @@ class JawSchedule(Stages[Mouth]):
 
     def _typical(self, mouth: Mouth) -> Tissue:
         return typical(self.teeth, mouth.teeth)
+
+
+def _layered(ratio: tuple[float, float], tooth: Tissue, has_dentin: bool) -> Tissue:
+    # The homogeneous tooth with its density shared out to its two media.
+    return (
+        tooth.with_values({f"{part}.sigma": share * tooth.medium(part).sigma for part, share in zip(("enamel", "dentin"), ratio, strict=True)})
+        if has_dentin
+        else tooth
+    )
 
 
 def nearby(fdi: Sequence[int], domain: Domain) -> Near:

@@ -66,6 +66,8 @@ class ChannelSchedule(Stages[Tissue]):
         """Fit the channel."""
         spec, tissue, samples = self.spec, self.start(), self.spec.samples_per_pixel
         options = Options(max_steps=spec.max_steps, max_samples=spec.max_samples_per_pixel, tolerance=self.tolerance)
+        if self.has_dentin:
+            tissue = self._best_start(tissue, self.short(START_STEPS))
         domain = media_domain(self.media, ("sigma", "alpha"))
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
@@ -81,13 +83,11 @@ class ChannelSchedule(Stages[Tissue]):
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
 
     def start(self) -> Tissue:
-        """The first stages alone: the table's best point, and with dentin the best of several layered starts in similar media."""
-        spec, tissue, samples = self.spec, self._homogeneous_start(), self.spec.samples_per_pixel
+        """The first stages alone: the table's best point, and with dentin a few steps of the homogeneous tooth."""
+        tissue = self._homogeneous_start()
         if not self.has_dentin:
             return tissue
-        short = Options(max_steps=min(HOMOGENEOUS_STEPS, spec.max_steps), max_samples=min(2 * samples, spec.max_samples_per_pixel), tolerance=self.tolerance)
-        tissue, _ = self._solve("homogeneous", shared_domain(), tissue, short, samples, SIMILAR_G)
-        return self._best_start(tissue, replace(short, max_steps=min(START_STEPS, spec.max_steps)))
+        return self._solve("homogeneous", shared_domain(), tissue, self.short(HOMOGENEOUS_STEPS), self.spec.samples_per_pixel, SIMILAR_G)[0]
 
     @property
     def media(self) -> tuple[str, ...]:

@@ -93,6 +93,12 @@ class Stages(ABC, Generic[Optics]):
         """``IMAGE_TOLERANCE`` as a change of the loss."""
         return 0.5 * IMAGE_TOLERANCE**2 * self.files.signal
 
+    def short(self, steps: int) -> Options:
+        """Limits of a stage that only prepares the next: so many steps, few samples."""
+        spec = self.spec
+        samples = min(2 * spec.samples_per_pixel, spec.max_samples_per_pixel)
+        return Options(max_steps=min(steps, spec.max_steps), max_samples=samples, tolerance=self.tolerance)
+
     def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int) -> tuple[Optics, Solution]:
         # The solver's loop; each step is one journal entry.
         domain, solver = problem.domain, GaussNewton(problem.domain, options)

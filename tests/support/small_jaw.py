@@ -106,11 +106,11 @@ def write_prepared_jaw(
         estimate = renderer.images(true_mouth(fdi), View(camera, pixels), samples=samples, seed=seed + c)
         images = np.zeros(shape[1:])
         images[:, pixels[:, 1], pixels[:, 0]] = estimate.mean
-        images[:, black] = 0.0
         spread = np.maximum(noise * images, 1e-3 * images.max())
         monte_carlo = np.zeros_like(images)
         monte_carlo[:, pixels[:, 1], pixels[:, 0]] = estimate.variance
-        radiance[c] = (images + spread * rng.standard_normal(images.shape))[..., None].astype(np.float32)
+        photographs = np.where(black, 0.0, images + spread * rng.standard_normal(images.shape))
+        radiance[c] = photographs[..., None].astype(np.float32)
         variance[c] = (spread**2 + monte_carlo)[..., None].astype(np.float32)
         valid[c] = np.broadcast_to(np.where((shown < 0) | masked, MaskBit.OUTSIDE, 0).astype(np.uint16), shape[1:])
     for number, tooth in zip(fdi, scene.teeth, strict=True):
