@@ -85,12 +85,14 @@ HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "be
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
-    kind: Literal["tooth"] = Field(default="tooth", description="what is fitted")
+    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with gums and the wall of the mouth")
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
-    dentin: Literal["known", "fit", "none"] = Field(default="fit", description="dentin surface: given by the capture, fitted as blend shape, or absent")
+    dentin: Literal["known", "fit", "none"] = Field(
+        default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
+    )
     held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
     held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
@@ -169,6 +171,17 @@ class Estimate(Record):
     determined: bool = Field(description="whether the data fixes this number")
 
 
+class ToothReport(Record):
+    """One tooth of a jaw."""
+
+    state: Literal["fitted", "tied", "failed"] = Field(description="from its own pixels; held near other teeth for lack of them; or its own fit raised")
+    sentence: str = Field(description="why it is tied or failed, or what is wrong with it; may be empty")
+    pixels: int = Field(description="pixels that show it and enter the fit, over all views")
+    parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
+    fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
+    held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
+
+
 class FitReport(Record):
     """Published by the fit stage, and as parameters.json and errors.json by export."""
 
@@ -179,6 +192,7 @@ class FitReport(Record):
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
+    teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
     seconds: float
 
 

@@ -16,7 +16,7 @@ from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
 from services.fit.observations import ViewStack
-from services.fit.schedule import StepReport
+from services.fit.stages import StepReport
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"
@@ -105,14 +105,14 @@ def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest
     np.savez_compressed(folder / PICTURES, allow_pickle=False, **arrays)
 
 
-def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth, cameras: tuple[Camera, ...]) -> ReportPictures:
-    """What the report shows."""
+def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth | None, cameras: tuple[Camera, ...]) -> ReportPictures:
+    """What the report shows; the thickness of enamel where it is about one tooth with dentin."""
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)
         pictures = []
         for k in range(count):
             camera, light = (str(part) for part in stored[f"{k}.name"])
             pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
-    if tooth.dentin is None:
+    if tooth is None or tooth.dentin is None:
         return ReportPictures(channels, tuple(pictures))
     return ReportPictures(channels, tuple(pictures), thickness_image(tooth.outer, tooth.dentin, cameras[0]), cameras[0].name)

@@ -23,20 +23,15 @@ is nearly invisible, so its exponent carries a prior two decades wide.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 from services.core.errors import SettingsError
-from services.core.records import JobSpec
-from services.fit.evaluate import Evaluation, evaluate
-from services.fit.journal import Journal
-from services.fit.observations import ChannelFiles, Level
-from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
+from services.fit.optics.domain import Coordinate, Domain, similar_medium, to_dual
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.passes import Passes, StackProblem, orders_task
+from services.fit.passes import StackProblem, orders_task
 from services.fit.solve import table_search
-from services.fit.solve.gauss_newton import GaussNewton, Options, Solution, State, state_from, state_record
-from services.fit.solve.normal_equations import NormalEquations
+from services.fit.solve.gauss_newton import Options
+from services.fit.stages import ChannelFit, Stages
 
 PRIORS = {
     "g1": (to_dual("g1", 0.8), 0.35),
@@ -54,109 +49,63 @@ START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
-LEAST_SAMPLES = 4
-"""Paths per pixel, however many pixels there are."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
 START_STEPS = 2
-IMAGE_TOLERANCE = 0.004
-"""A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 
 
-@dataclass(frozen=True)
-class StepReport:
-    """One step, for whoever watches."""
+@dataclass(kw_only=True)
+class ChannelSchedule(Stages[Tissue]):
+    """The stages of one channel of a tooth."""
 
-    channel: str
-    stage: str
-    step: int
-    stage_step: int
-    loss: float
-    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below what the step's samples resolve."""
-    fit_error: float | None
-    held_out_error: float | None
-    held_out_se: float | None
-    """Monte Carlo standard error of ``held_out_error``."""
-    parameters: dict[str, float]
-    samples: int
-    verdict: str
-
-
-@dataclass(frozen=True)
-class ChannelFit:
-    """A channel's result."""
-
-    tissue: Tissue
-    domain: Domain
-    solution: Solution
-    equations: NormalEquations
-    fit_error: float
-    held_out_error: float | None
-    steps: int
-    evaluation: Evaluation
-
-
-@dataclass
-class ChannelSchedule:
-    """Runs the stages of one channel; everything costly goes through the journal."""
-
-    files: ChannelFiles
-    passes: Passes
-    spec: JobSpec
-    journal: Journal
     has_dentin: bool
     modes: int
     """Blend weights to fit; 0 where the dentin's shape is known."""
-    report: Callable[[StepReport, Evaluation], None]
-    pause: Callable[[], None]
-    """Called between steps; raises when the job is cancelled."""
-    shown: tuple[tuple[str, int], ...] = ()
     shape: tuple[float, ...] = ()
     """Known blend weights."""
-    steps: int = 0
 
-    def run(self) -> ChannelFit:
+    def run(self) -> ChannelFit[Tissue]:
         """Fit the channel."""
-        spec, samples, options = self.spec, self.spec.samples_per_pixel, self._options(self.files.coarse)
-        parts = ("enamel", "dentin") if self.has_dentin else ("enamel",)
-        domain = self._free(media_domain(parts, ("sigma", "alpha")))
+        spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
+        domain = self._free(media_domain(self.media, ("sigma", "alpha")))
         if not domain.coordinates and not self.modes:
             raise SettingsError(f"held = {sorted(spec.held)} leaves nothing to fit; hold fewer parameters.")
-        tissue = self._homogeneous_start()
+        tissue = self.start()
         if self.has_dentin:
-            short = replace(options, max_steps=min(HOMOGENEOUS_STEPS, spec.max_steps), max_samples=2 * samples)
-            tissue, _ = self._solve("homogeneous", shared_domain(), tissue, short, samples, SIMILAR_G)
-            tissue = self._best_start(tissue, replace(options, max_steps=min(START_STEPS, spec.max_steps), max_samples=2 * samples))
+            tissue = self._best_start(tissue, self.short(START_STEPS))
         tissue = tissue.with_values(spec.held)
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
         if self.modes:
             domain = Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",), *PRIORS["shape"]) for k in range(self.modes)))
             tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
-        self.passes, options = replace(self.passes, blocks=self.files.full.blocks), self._options(self.files.full)
-        exact_samples = self._fewer(min(solution.samples, EXACT_SAMPLES * samples))
+        options = self.at_full_resolution()
+        exact_samples = self.fewer(min(solution.samples, EXACT_SAMPLES * samples))
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         tissue, solution = self._iterate(problem, options, exact_samples)
         if spec.lobes == 2:
-            domain = self._free(media_domain(parts, ("sigma", "alpha", "g1", "beta", "g2")))
+            domain = self._free(media_domain(self.media, ("sigma", "alpha", "g1", "beta", "g2")))
             problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
 
-    def _options(self, level: Level) -> Options:
-        most = self.spec.max_samples_per_pixel
-        return Options(
-            max_steps=self.spec.max_steps,
-            max_samples=self._fewer(most) if level is self.files.full else most,
-            tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal,
-        )
-
-    def _fewer(self, samples: int) -> int:
-        # Of full images each pixel gets so many paths fewer that a pass has as many in all as one of coarse images.
-        return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
-
     def _free(self, domain: Domain) -> Domain:
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
+
+    def start(self) -> Tissue:
+        """The first stages alone: the table's best point, and with dentin a few steps of the homogeneous tooth."""
+        tissue = self._homogeneous_start()
+        if not self.has_dentin:
+            return tissue
+        return self._solve("homogeneous", shared_domain(), tissue, self.short(HOMOGENEOUS_STEPS), self.spec.samples_per_pixel, SIMILAR_G)[0]
+
+    @property
+    def media(self) -> tuple[str, ...]:
+        """See Stages."""
+        return ("enamel", "dentin") if self.has_dentin else ("enamel",)
+
+    def _others(self, tissue: Tissue) -> dict[str, float]:
+        return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
 
     def _homogeneous_start(self) -> Tissue:
         # The table's best point, seen as a medium of the mean cosine that is held.
@@ -176,7 +125,7 @@ class ChannelSchedule:
             for n, node in enumerate(nodes):
                 medium = Medium(node.sigma, 1.0, g1=node.g)
                 tissue = Tissue(medium, medium, (PRIORS["shape"][0],) * self.modes if self.modes else self.shape)
-                label = f"{self.files.channel}-search-{n}"
+                label = f"{self.scope}-search-{n}"
                 for task in passes.tasks(label, tissue, max(self.spec.samples_per_pixel, SEARCH_SAMPLES)):
                     for k in (1, 2):
                         seed = passes.seeds("search", n, k)
@@ -191,28 +140,8 @@ class ChannelSchedule:
             return [asdict(candidate) for candidate in table_search.best(found)]
 
         self.pause()
-        best, _ = self.journal.once(f"{self.files.channel}/search", compute)
+        best, _ = self.journal.once(f"{self.scope}/search", compute)
         return table_search.Candidate(**best[0])
-
-    def _solve(self, stage: str, domain: Domain, tissue: Tissue, options: Options, samples: int, similar_g: float) -> tuple[Tissue, Solution]:
-        problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
-        return self._iterate(problem, options, samples)
-
-    def _iterate(self, problem: StackProblem, options: Options, samples: int) -> tuple[Tissue, Solution]:
-        # The solver's loop; each step is one journal entry.
-        domain, solver = problem.domain, GaussNewton(problem.domain, options)
-        state = solver.init(domain.x_of(problem.base), min(samples, options.max_samples))
-        while not solver.terminate(state):
-            self.pause()
-            before = state
-            key = f"{self.files.channel}/{problem.stage}/{state.step}"
-            entry, is_new = self.journal.once(key, lambda before=before: state_record(solver.step(problem, before)))  # type: ignore[misc]
-            state = state_from(entry)
-            self.steps += 1
-            if is_new:
-                self._tell(problem, state)
-        solution = solver.finish(state)
-        return domain.tissue_at(solution.x, problem.base), solution
 
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
         # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a single start may end with enamel
@@ -232,54 +161,8 @@ class ChannelSchedule:
             return best
 
         self.pause()
-        best, _ = self.journal.once(f"{self.files.channel}/starts", compute)
+        best, _ = self.journal.once(f"{self.scope}/starts", compute)
         return ends[best]
-
-    def _finish(self, problem: StackProblem, solution: Solution) -> ChannelFit:
-        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
-        samples = max(solution.samples, self._fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)))
-        equations = solution.equations
-        if equations is None:
-            self.pause()
-            stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
-            equations = NormalEquations.of(stored)
-        evaluation = self._evaluate("final", problem.base, self._fewer(self.spec.max_samples_per_pixel), self.files.full)
-        fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
-        return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
-
-    def _evaluate(self, label: str, tissue: Tissue, samples: int, level: Level) -> Evaluation:
-        passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
-        return evaluate(passes, label, tissue, samples, self.shown)
-
-    def _tell(self, problem: StackProblem, state: State) -> None:
-        stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
-        shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
-        evaluation = self._evaluate(f"{stage}-{state.step}", shown, self.spec.samples_per_pixel, self.files.coarse)
-        fitted, held_out = evaluation.fitted, evaluation.held_out
-        parts = ("enamel", "dentin") if self.has_dentin else ("enamel",)
-        values = {
-            f"{part}.{leaf}": float(getattr(getattr(tissue, part), leaf))
-            for part in parts
-            for leaf in ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
-        }
-        values |= {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
-        loss = fitted.loss or 0.0
-        self.report(
-            StepReport(
-                self.files.channel,
-                stage,
-                self.steps,
-                state.step,
-                loss,
-                fitted.resolved_error,
-                held_out.resolved_error,
-                held_out.error_se,
-                values,
-                state.samples,
-                state.verdict,
-            ),
-            evaluation,
-        )
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:
         # A second lobe starts at its prior's centre, the first keeps the mean cosine.
@@ -300,5 +183,5 @@ def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...]) -> Domain:
 
 
 def _coordinate(targets: tuple[str, ...]) -> Coordinate:
-    leaf = targets[0].split(".")[1]
+    leaf = targets[0].rpartition(".")[2]
     return Coordinate(targets, *PRIORS[leaf]) if leaf in PRIORS else Coordinate(targets)

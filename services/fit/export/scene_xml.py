@@ -17,6 +17,8 @@ TAGS = {
     "ply": "shape",
     "null": "bsdf",
     "thin_boundary": "bsdf",
+    "diffuse": "bsdf",
+    "twosided": "bsdf",
     "homogeneous": "medium",
     "hg": "phase",
     "blendphase": "phase",
