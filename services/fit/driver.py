@@ -16,6 +16,7 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
+from services.fit.anatomy.stain_uv import stain_layout, texel_edge_mm
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
 from services.fit.journal import Journal
@@ -52,7 +53,9 @@ class FitDriver:
         dentin = dentin_shape(observations.tooth, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
-        files = {channel: write_channel(folder / "inputs", observations, channel, views[channel], dentin, spec) for channel in channels}
+        layout = stain_layout(observations.tooth.outer, texel_edge_mm(pixel_edge_mm(observations, spec))) if spec.stains else None
+        uv = None if layout is None else layout.corners_uv
+        files = {channel: write_channel(folder / "inputs", observations, channel, views[channel], dentin, spec, uv) for channel in channels}
         journal = Journal(folder / "journal.json", fingerprint(spec, self.engine, files.values()), self.writer.require_lease)
         if journal.resumed:
             self.context.report(
@@ -71,6 +74,7 @@ class FitDriver:
                 self.context.report(StageEvent(stage="fit", kind="log", message=f"{channel}: renderers start, then the table is searched."))
                 schedule = self._schedule(observations, files[channel], views[channel], journal, run_on, (number, len(order)))
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
+                schedule.stain_layout = layout
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
         return self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
@@ -151,6 +155,13 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
         centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
         return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm))
     return None
+
+
+def pixel_edge_mm(observations: Observations, spec: JobSpec) -> float:
+    """Median over cameras of the spacing of fitted pixels at the tooth."""
+    centre_mm = observations.tooth.outer.vertices_mm.mean(axis=0, keepdims=True)
+    sizes = [camera.project(centre_mm)[1][0] / camera.K[0][0] for camera in observations.manifest.cameras]
+    return float(np.median(sizes)) * spec.pixel_step
 
 
 def fingerprint(spec: JobSpec, engine: str, files: Sequence[ChannelFiles] | Any) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from services.core.meshfiles import read_teeth
 from services.core.records import JobSpec, PreparedManifest
 from services.core.store import open_stage, reading
 from services.fit.blocks import Block, StoredFile, pixels_per_block, write_block, write_recipe
+from services.fit.solve.losses import first_weights
 from services.fit.transport.recipe import DentinShape, View, single_tooth
 
 Array = NDArray[np.float64]
@@ -71,8 +72,6 @@ class ChannelFiles:
     evaluation_recipe: StoredFile
     evaluation_blocks: tuple[StoredFile, ...]
     """All lights."""
-    weight: float
-    """Weight of every fitted measurement: 1 / mean variance."""
     signal: float
     """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
     quality: float
@@ -165,7 +164,13 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
 
 
 def write_channel(
-    folder: Path, observations: Observations, channel: str, views: tuple[ViewStack, ...], dentin: DentinShape | None, spec: JobSpec
+    folder: Path,
+    observations: Observations,
+    channel: str,
+    views: tuple[ViewStack, ...],
+    dentin: DentinShape | None,
+    spec: JobSpec,
+    stain_uv: Array | None = None,
 ) -> ChannelFiles:
     """Write one channel's blocks and scenes; the same input gives the same files."""
     fitted = [v.valid & ~v.held_out[:, None] for v in views]
@@ -173,27 +178,32 @@ def write_channel(
     seen = np.any([v.valid.any(axis=1) for v in views], axis=0)
     noise = np.concatenate([v.variance[f] for v, f in zip(views, fitted, strict=True)])
     values = np.concatenate([v.reference[f] for v, f in zip(views, fitted, strict=True)])
-    weight = 1.0 / float(noise.mean()) if noise.mean() > 0 else 1.0
+    weight = first_weights(spec.loss, values, noise)
+    by_view = np.split(weight, np.cumsum([f.sum() for f in fitted])[:-1])
+    weights = [np.zeros(v.reference.shape) for v in views]
+    for whole, f, part in zip(weights, fitted, by_view, strict=True):
+        whole[f] = part
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
-        return write_recipe(folder, single_tooth(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device))
+        scene = single_tooth(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device)
+        return write_recipe(folder, replace(scene, teeth=(replace(scene.teeth[0], stain_uv=stain_uv),)))
 
     def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
         files = []
-        for v in views:
+        for v, weight in zip(views, weights, strict=True):
             valid, held = v.valid[lights], v.held_out[lights][:, None]
             relevant = np.flatnonzero((valid & ~held).any(axis=0) if lights is used else valid.any(axis=0))
             for part in _split(relevant, int(lights.sum()), len(views)) if most is None else [_spread(relevant, most // len(views))]:
                 if len(part):
                     cut = np.ix_(np.flatnonzero(lights), part)
                     chosen = v.valid[cut]
-                    block = Block(View(v.camera, v.pixels[part]), v.reference[cut], v.variance[cut], np.where(chosen & ~held, weight, 0.0), chosen & held)
+                    block = Block(View(v.camera, v.pixels[part]), v.reference[cut], v.variance[cut], weight[cut], chosen & held)
                     files.append(write_block(folder, block))
         return tuple(files)
 
     return ChannelFiles(
-        channel, recipe(used), blocks(used), blocks(used, SEARCH_PIXELS), recipe(seen), blocks(seen), weight, float(weight * values @ values),
+        channel, recipe(used), blocks(used), blocks(used, SEARCH_PIXELS), recipe(seen), blocks(seen), float(weight @ values**2),
         float(values @ values / noise.sum()),
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ layered       the same                                         similar   converg
 shape         the same and the dentin's blend weights          similar   converged, or max_steps; only where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
+stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; only where stains are fitted
 ============  ===============================================  ========  =======================================================
 
 Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several times less for equal noise, and
@@ -25,26 +26,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from services.core.records import JobSpec
+from services.fit.anatomy.stain_uv import StainLayout
 from services.fit.evaluate import Evaluation, evaluate
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles
-from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
+from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue
 from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.priors import HELD_G, WEAK, Priors, priors_of
 from services.fit.passes import Passes, StackProblem, orders_task
-from services.fit.solve import table_search
-from services.fit.solve.gauss_newton import GaussNewton, Options, Solution, State, state_from, state_record
+from services.fit.reweighting import reweighted
+from services.fit.solve import adam, gauss_newton, table_search
+from services.fit.solve.gauss_newton import Options, Solution, State
+from services.fit.solve.losses import is_reweighted
 from services.fit.solve.normal_equations import NormalEquations
+from services.fit.stain_passes import StainStage
 
-PRIORS = {
-    "g1": (to_dual("g1", 0.8), 0.35),
-    "alpha": (2.3, 1.0),
-    "beta": (to_dual("beta", 0.9), 1.0),
-    "g2": (to_dual("g2", -0.1), 0.35),
-}
-"""Mean and standard deviation in the unbounded domain. g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
-HELD_G = 0.8
+ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
 SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature table."""
@@ -53,10 +53,20 @@ EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
+REWEIGHTINGS = 2
+"""Rounds of a loss that follows residuals, after the first exact stage."""
+STAIN_SAMPLES = 2
+"""Paths per pixel of a step of the stains, over those of the start."""
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
+
+
+TELL_EVERY = 10
+"""Steps of Adam between two reports; each costs an evaluation of all images."""
+
+Fitted = tuple[StackProblem, Tissue, Solution]
 
 
 @dataclass(frozen=True)
@@ -109,31 +119,90 @@ class ChannelSchedule:
     shown: tuple[tuple[str, int], ...] = ()
     shape: tuple[float, ...] = ()
     """Known blend weights."""
+    stain_layout: StainLayout | None = None
+    """Texels to fit; None where the surface counts as clean."""
     steps: int = 0
 
     def run(self) -> ChannelFit:
         """Fit the channel."""
-        spec, tissue, samples = self.spec, self._homogeneous_start(), self.spec.samples_per_pixel
         tolerance = 0.5 * IMAGE_TOLERANCE**2 * self.files.signal
-        options = Options(max_steps=spec.max_steps, max_samples=spec.max_samples_per_pixel, tolerance=tolerance)
-        parts = ("enamel", "dentin") if self.has_dentin else ("enamel",)
-        domain = media_domain(parts, ("sigma", "alpha"))
+        options = Options(max_steps=self.spec.max_steps, max_samples=self.spec.max_samples_per_pixel, tolerance=tolerance)
+        start = self._homogeneous_start()
+        problem, tissue, solution = self._paper_stages(start) if self.spec.solver == "adam" else self._stages(start, options)
+        if self.stain_layout is not None:
+            problem, tissue, solution = self._stained(self.stain_layout, problem, tissue, solution, options)
+        return self._finish(replace(problem, base=tissue, stage="final"), solution)
+
+    def _stages(self, tissue: Tissue, options: Options) -> Fitted:
+        # The media, and the dentin's shape, by Gauss-Newton.
+        spec, samples, parts = self.spec, self.spec.samples_per_pixel, self._parts
+        domain = media_domain(parts, ("sigma", "alpha"), self._priors)
         if self.has_dentin:
             short = replace(options, max_steps=min(HOMOGENEOUS_STEPS, spec.max_steps), max_samples=2 * samples)
-            tissue, _ = self._solve("homogeneous", shared_domain(), tissue, short, samples, SIMILAR_G)
+            tissue, _ = self._solve("homogeneous", shared_domain(self._priors), tissue, short, samples, SIMILAR_G)
             tissue = self._best_start(tissue, replace(options, max_steps=min(START_STEPS, spec.max_steps), max_samples=2 * samples))
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
         if self.modes:
-            domain = Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",)) for k in range(self.modes)))
+            domain = self._with_shape(domain)
             tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
+        self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         tissue, solution = self._iterate(problem, options, min(solution.samples, EXACT_SAMPLES * samples))
+        for again in range(1, REWEIGHTINGS + 1) if is_reweighted(spec.loss) else ():
+            self._reweight(f"exact.{again}", tissue)
+            problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
+            tissue, solution = self._iterate(problem, options, solution.samples)
         if spec.lobes == 2:
-            domain = media_domain(parts, ("sigma", "alpha", "g1", "beta", "g2"))
+            domain = media_domain(parts, ALL_LEAVES, self._priors)
             problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, EXACT_SAMPLES * samples))
-        return self._finish(replace(problem, base=tissue, stage="final"), solution)
+        return problem, tissue, solution
+
+    def _paper_stages(self, tissue: Tissue) -> Fitted:
+        # As in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
+        if self.has_dentin:
+            _, tissue, _ = self._descend("homogeneous", shared_domain(self._priors), tissue)
+        tissue = self._with_lobes(tissue) if self.spec.lobes == 2 else tissue
+        domain = media_domain(self._parts, ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha"), self._priors)
+        return self._descend("layered" if self.has_dentin else "homogeneous", self._with_shape(domain), tissue)
+
+    def _descend(self, stage: str, domain: Domain, tissue: Tissue) -> Fitted:
+        # The exact media and their own derivatives, at constant samples.
+        self._reweight(stage, tissue)
+        problem = StackProblem(self.passes, domain, tissue, stage)
+        options = adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps)
+        return problem, *self._run(adam.Adam(domain, options), adam, problem, self.spec.samples_per_pixel)
+
+    def _reweight(self, stage: str, tissue: Tissue) -> None:
+        # New weights where the loss follows residuals; all later stages have them.
+        if is_reweighted(self.spec.loss):
+            self.pause()
+            samples = self.spec.max_samples_per_pixel
+            self.passes = reweighted(self.passes, self.journal, self.spec.loss, tissue, samples=samples, stage=stage)
+
+    def _stained(self, layout: StainLayout, problem: StackProblem, tissue: Tissue, solution: Solution, options: Options) -> Fitted:
+        # The texture in turn with the media; what is returned is the plain fit where a texture gains nothing.
+        samples = min(STAIN_SAMPLES * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
+        last = problem, tissue, solution
+
+        def refit(stained: Tissue, turn: int, is_last: bool) -> Tissue:
+            nonlocal last
+            if self.spec.solver == "adam":
+                last = self._descend(f"stained.{turn}", problem.domain, stained)
+                return last[1]
+            limits = options if is_last else replace(options, max_steps=min(HOMOGENEOUS_STEPS, options.max_steps))
+            problem_now = replace(problem, base=stained, stage=f"stained.{turn}")
+            last = problem_now, *self._iterate(problem_now, limits, samples)
+            return last[1]
+
+        def tell(stage: str, step: int, stained: Tissue, verdict: str, is_new: bool) -> None:
+            self.steps += 1
+            if is_new:
+                self._announce(stage, step, stained, samples, verdict)
+
+        stage = StainStage(self.passes, self.journal, layout, samples, self.pause, tell)
+        return last if stage.run(tissue, refit) is not None else (problem, tissue, solution)
 
     def _homogeneous_start(self) -> Tissue:
         # The table's best point, seen as a medium of the mean cosine that is held.
@@ -176,25 +245,38 @@ class ChannelSchedule:
         return self._iterate(problem, options, samples)
 
     def _iterate(self, problem: StackProblem, options: Options, samples: int) -> tuple[Tissue, Solution]:
-        # The solver's loop; each step is one journal entry.
-        domain, solver = problem.domain, GaussNewton(problem.domain, options)
-        state = solver.init(domain.x_of(problem.base), min(samples, options.max_samples))
+        solver = gauss_newton.GaussNewton(problem.domain, options)
+        return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
+
+    def _run(self, solver: Any, kind: Any, problem: StackProblem, samples: int) -> tuple[Tissue, Solution]:
+        # A solver's loop; each step is one journal entry, written and read by the solver's module ``kind``.
+        state = solver.init(problem.domain.x_of(problem.base), samples)
         while not solver.terminate(state):
             self.pause()
-            before = state
             key = f"{self.files.channel}/{problem.stage}/{state.step}"
-            entry, is_new = self.journal.once(key, lambda before=before: state_record(solver.step(problem, before)))  # type: ignore[misc]
-            state = state_from(entry)
+            entry, is_new = self.journal.once(key, lambda before=state: kind.state_record(solver.step(problem, before)))  # type: ignore[misc]
+            state = kind.state_from(entry)
             self.steps += 1
-            if is_new:
+            if is_new and (kind is gauss_newton or state.step % TELL_EVERY == 1 or solver.terminate(state)):
                 self._tell(problem, state)
         solution = solver.finish(state)
-        return domain.tissue_at(solution.x, problem.base), solution
+        return problem.domain.tissue_at(solution.x, problem.base), solution
+
+    @property
+    def _parts(self) -> tuple[str, ...]:
+        return ("enamel", "dentin") if self.has_dentin else ("enamel",)
+
+    @property
+    def _priors(self) -> Priors:
+        return priors_of(self.spec.prior)
+
+    def _with_shape(self, domain: Domain) -> Domain:
+        return Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",)) for k in range(self.modes)))
 
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
         # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a single start may end with enamel
         # and dentin exchanged.
-        domain, ends = media_domain(("enamel", "dentin"), ("sigma", "alpha")), []
+        domain, ends = media_domain(("enamel", "dentin"), ("sigma", "alpha"), self._priors), []
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values({"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma})
             ends.append(self._solve(f"start.{k}", domain, start, options, self.spec.samples_per_pixel, SIMILAR_G)[0])
@@ -228,15 +310,18 @@ class ChannelSchedule:
         passes = replace(self.passes, blocks=self.files.evaluation_blocks, recipe=self.files.evaluation_recipe)
         return evaluate(passes, label, tissue, samples, self.shown)
 
-    def _tell(self, problem: StackProblem, state: State) -> None:
+    def _tell(self, problem: StackProblem, state: State | adam.State) -> None:
         stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
         shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
-        evaluation = self._evaluate(f"{stage}-{state.step}", shown, self.spec.samples_per_pixel)
+        self._announce(stage, state.step, tissue, state.samples, state.verdict, shown)
+
+    def _announce(self, stage: str, stage_step: int, tissue: Tissue, samples: int, verdict: str, shown: Tissue | None = None) -> None:
+        # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
+        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel)
         fitted, held_out = evaluation.fitted, evaluation.held_out
-        parts = ("enamel", "dentin") if self.has_dentin else ("enamel",)
         values = {
             f"{part}.{leaf}": float(getattr(getattr(tissue, part), leaf))
-            for part in parts
+            for part in self._parts
             for leaf in ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         }
         values |= {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
@@ -246,14 +331,14 @@ class ChannelSchedule:
                 self.files.channel,
                 stage,
                 self.steps,
-                state.step,
+                stage_step,
                 loss,
                 fitted.resolved_error,
                 held_out.resolved_error,
                 held_out.error_se,
                 values,
-                state.samples,
-                state.verdict,
+                samples,
+                verdict,
             ),
             evaluation,
         )
@@ -265,16 +350,17 @@ class ChannelSchedule:
         return tissue.with_values({f"{part}.{leaf}": v for part in ("enamel", "dentin") for leaf, v in (("beta", beta), ("g1", g1), ("g2", g2))})
 
 
-def shared_domain() -> Domain:
+def shared_domain(priors: Priors = WEAK) -> Domain:
     """Both media alike, sigma and alpha."""
-    return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}")) for leaf in ("sigma", "alpha")))
+    return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}"), priors) for leaf in ("sigma", "alpha")))
 
 
-def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...]) -> Domain:
+def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors = WEAK) -> Domain:
     """Each medium on its own."""
-    return Domain(tuple(_coordinate((f"{part}.{leaf}",)) for part in parts for leaf in leaves))
+    return Domain(tuple(_coordinate((f"{part}.{leaf}",), priors) for part in parts for leaf in leaves))
 
 
-def _coordinate(targets: tuple[str, ...]) -> Coordinate:
-    leaf = targets[0].split(".")[1]
-    return Coordinate(targets, *PRIORS[leaf]) if leaf in PRIORS else Coordinate(targets)
+def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
+    # What both media share has a prior only where theirs are one.
+    (prior, *others) = (priors.get(target) for target in targets)
+    return Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,5 +175,5 @@ def similar_medium(medium: Medium, g: float) -> Medium:
 
 
 def similar_tissue(tissue: Tissue, g: float) -> Tissue:
-    """Both media replaced by similar ones; the shape stays."""
-    return Tissue(similar_medium(tissue.enamel, g), similar_medium(tissue.dentin, g), tissue.shape)
+    """Both media replaced by similar ones; shape and stain stay."""
+    return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
