@@ -56,7 +56,7 @@ SEARCH_SAMPLES = 64
 REWEIGHTINGS = 2
 """Rounds of a loss that follows residuals, after the first exact stage."""
 STAIN_SAMPLES = 2
-"""Paths per pixel of a step of the stains, over those of the start."""
+"""Least paths per pixel of a step of the stains, over those of the start; as many as the media needed in the end."""
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
@@ -183,7 +183,7 @@ class ChannelSchedule:
 
     def _stained(self, layout: StainLayout, problem: StackProblem, tissue: Tissue, solution: Solution, options: Options) -> Fitted:
         # The texture in turn with the media; what is returned is the plain fit where a texture gains nothing.
-        samples = min(STAIN_SAMPLES * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
+        samples = min(max(STAIN_SAMPLES * self.spec.samples_per_pixel, solution.samples), self.spec.max_samples_per_pixel)
         last = problem, tissue, solution
 
         def refit(stained: Tissue, turn: int, is_last: bool) -> Tissue:

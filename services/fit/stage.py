@@ -59,6 +59,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.core.records import PreparedManifest
     from services.fit.export.asset import write_asset
     from services.fit.export.report import write_report
+    from services.fit.export.stains import kept_stains
     from services.fit.pictures import read_pictures
 
     context.report(StageEvent(stage="export", kind="started"))
@@ -72,11 +73,12 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     lights = tuple(
         light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
     )
-    files = write_asset(writer.folder, report, (tooth,), prepared.cameras, lights, channels=channels, boundary=spec.boundary, ior=spec.ior)
+    stains = kept_stains(fit_folder)
+    files = write_asset(writer.folder, report, (tooth,), prepared.cameras, lights, channels=channels, boundary=spec.boundary, ior=spec.ior, stains=stains)
 
     history = json.loads((fit_folder / "history.json").read_text())
     facts = {"title": f"Tooth {tooth.fdi}", "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
-    write_report(context.root / "report.html", report, read_pictures(fit_folder, channels, tooth, prepared.cameras), history, facts)
+    write_report(context.root / "report.html", report, read_pictures(fit_folder, channels, tooth, prepared.cameras, stains), history, facts)
     errors = {"fit_error": report.fit_error, "held_out_error": report.held_out_error, "unit": "1", "converged": report.converged, "advice": report.advice}
     parameters = {channel: {name: e.model_dump() for name, e in table.items()} for channel, table in report.parameters.items()}
     write_atomic(context.root / "parameters.json", _json(parameters))

@@ -4,7 +4,7 @@
 
     images(block), seed 1 ── cotangents w C and w ref ── stain_gradient(block), seed 2, of both ── sum in block order ── step
 
-The common factor of a texture and the absorption of the media are nearly one parameter, so ratio steps find the texture up to a factor, media take that
+The common factor of a texture and the absorption of the media are nearly one parameter, so the first steps find the pattern up to a factor, media take that
 factor, and exact steps and media then end together.
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,9 @@ from services.fit.solve.normal_equations import LossChange
 from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
 from services.fit.transport.recipe import StackEstimate, StainGradient
 
-RATIO_STEPS = 2
-EXACT_STEPS = (4, 3)
+RATIO_STEPS, PATTERN_STEPS = 2, 3
+"""Before the media's first turn."""
+EXACT_STEPS = (3, 2)
 """Before the media's second and third turn."""
 GRADIENT_G = 0.0
 """Mean cosine of the similar media in which gradients are rendered, as Jacobians are."""
@@ -76,14 +78,15 @@ class StainStage:
         """
         solver = StainSolver(self.layout.neighbours, len(self.layout.points_mm))
         state, stained = clean(solver.texels), tissue
-        for step in range(RATIO_STEPS):
-            state = self._step("stain.ratio", step, stained, state, solver.ratio_step)
+        for step, solve in enumerate((solver.ratio_step,) * RATIO_STEPS + (solver.pattern_step,) * PATTERN_STEPS):
+            state = self._step("stain.0", step, stained, state, solve)
             stained = self._with(stained, state)
         stained = refit(stained, 0, False)
+        done = 0
         for turn, steps in enumerate(EXACT_STEPS, 1):
             for step in range(steps):
-                state = self._step(f"stain.{turn}", step, stained, state, solver.exact_step)
-                stained = self._with(stained, state)
+                state = self._step(f"stain.{turn}", step, stained, state, partial(solver.exact_step, number=done))
+                stained, done = self._with(stained, state), done + 1
             stained = refit(stained, turn, turn == len(EXACT_STEPS))
         return stained if self._is_better(tissue, stained, state) else None
 

@@ -63,9 +63,8 @@ def test_converges_under_noise() -> None:
     # Noise of a gradient here is as large as the gradient 0.1 to 0.6 step scales from the optimum, and a constant rate leaves x wandering. From 1.4 to 2.5
     # step scales away 8 seeds ended within 0.15; twice that is the bound.
     for seed in range(8):
-        state = solve(
-            NoisyQuadratic(np.diag([40.0, 10.0, 90.0, 20.0]), noise=20.0, seed=seed), Options(rate=0.03, max_steps=600), BEST + [1.0, -0.8, -1.0, 0.7]
-        )
+        problem = NoisyQuadratic(np.diag([40.0, 10.0, 90.0, 20.0]), noise=20.0, seed=seed)
+        state = solve(problem, Options(rate=0.03, max_steps=600), BEST + np.array([1.0, -0.8, -1.0, 0.7]))
         assert state.result is Result.CONVERGED
         assert (np.abs(state.x - BEST) < 0.3 * DOMAIN.scale).all()
 

@@ -83,10 +83,11 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
         sums = [np.bincount(texels.reshape(-1), carried * np.repeat(values[:, k], 4), height * width)[touched] for k in range(3)]
         return np.asarray(np.stack(sums, axis=-1) / area[touched, None])
 
-    points, normals = mean(place), mean(_normals(outer)[faces])
+    normals = mean(_normals(outer)[faces])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    points = mean(place)
     index = np.where(touched, np.cumsum(touched) - 1, -1).reshape(height, width)
-    return StainLayout(corners_uv, index, points, area[touched], _neighbours(points, normals, REACH * texel_mm))
+    return StainLayout(corners_uv, index, points, np.asarray(area[touched], dtype=np.float64), _neighbours(points, normals, REACH * texel_mm))
 
 
 def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:

@@ -4,6 +4,7 @@
 
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
+    teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer surface's u, v
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined
     errors.json                fitted and held-out image error
@@ -17,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from services.core.geometry import Camera, Light, Tooth, teeth_folder
-from services.core.meshfiles import write_mesh
+from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
 from services.fit.export.mitsuba_scene import nested_scene
 from services.fit.export.scene_xml import SceneParameter, write_scene
+from services.fit.export.stains import FittedStains, write_textures
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
@@ -37,12 +39,14 @@ def write_asset(
     channels: tuple[str, ...],
     boundary: Boundary,
     ior: float,
+    stains: FittedStains | None = None,
 ) -> tuple[str, ...]:
     """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative to ``folder``.
 
     Args:
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
         lights: ``intensity`` in the order of ``channels``.
+        stains: of a single tooth.
 
     Raises:
         CaptureInputError: a camera that Mitsuba cannot render.
@@ -52,16 +56,25 @@ def write_asset(
     for tooth in teeth:
         place = teeth_folder(Path(), tooth.fdi)
         files[str(tooth.fdi)] = (place / "outer.ply", place / "dentin.ply" if tooth.dentin is not None else None)
-        write_mesh(folder / place / "outer.ply", tooth.outer)
+        if stains is None:
+            write_mesh(folder / place / "outer.ply", tooth.outer)
+        else:
+            write_mapped_mesh(folder / place / "outer.ply", tooth.outer, stains.corners_uv)
         if tooth.dentin is not None:
             write_mesh(folder / place / "dentin.ply", tooth.dentin)
+
+    textures = {}
+    if stains is not None:
+        (tooth,) = teeth
+        textures = {channel: path.relative_to(folder) for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()}
 
     first = lights[0]
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
         tissue = tissue_of(report.parameters[channel])
-        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256))
+        stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
+        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), stains=stained)
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {

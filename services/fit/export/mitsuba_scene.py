@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -67,9 +68,18 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
     }
 
 
-def boundary_dict(boundary: Boundary, ior: float) -> SceneDict:
-    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset."""
-    return {"type": "null"} if boundary == "matched" else {"type": "thin_boundary", "ior": ior}
+def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:
+    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset.
+
+    Args:
+        stain: picture of what the surface takes of light that passes, 1 - a_t; over nothing it is a mask before black.
+    """
+    texture = None if stain is None else {"type": "bitmap", "filename": stain.as_posix(), "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    if boundary == "thin":
+        return {"type": "thin_boundary", "ior": ior} | ({} if texture is None else {"stain": texture})
+    if texture is None:
+        return {"type": "null"}
+    return {"type": "mask", "opacity": texture, "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 
 
 TeethFiles = Mapping[str, tuple[Path, Path | None]]
@@ -86,10 +96,14 @@ def nested_scene(
     boundary: Boundary = "matched",
     ior: float = 1.631,
     samples: Any = 64,
+    stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
     """Scene of teeth of one tissue under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
 
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
+
+    Args:
+        stains: by name of the tooth, as in ``boundary_dict``; its outer PLY then has texture coordinates.
     """
     scene: SceneDict = {
         "type": "scene",
@@ -101,7 +115,7 @@ def nested_scene(
         scene["medium_dentin"] = medium_dict(tissue.dentin)
     enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        scene[f"outer_{name}"] = _surface(outer, boundary_dict(boundary, ior)) | {"interior": enamel}
+        scene[f"outer_{name}"] = _surface(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
         if dentin is not None:
             scene[f"dentin_{name}"] = _surface(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}

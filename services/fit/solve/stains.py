@@ -8,6 +8,9 @@ A ratio step sets d to d - ln(explained / carried) / 2: photograph over render, 
 crossings per path sum_t S_t = 2, so 2 diag(carried) bounds the curvature from above (Lange 2013, separable majorisation) and a ratio step lowers F
 however uneven the texture. It is slow where neighbours differ, because that bound counts the way in, which all texels share. Momentum steps (Polyak 1964) with
 diag(carried) finish; their factors are optimal for curvatures between a quarter of it, seen on the way out only, and twice it.
+
+A common factor of all images is nearly what the media's absorption does, and d cannot fall below 0. So the first steps find the pattern at a free factor, with
+the cleanest part of the surface at d = 0; media then take the factor, and the last steps leave it to the images.
 """
 
 from __future__ import annotations
@@ -27,10 +30,12 @@ CLEAN_SD = 0.5
 NEIGHBOUR_SD = 0.2
 """Standard deviation of the difference between neighbouring texels."""
 MOMENTUM = 0.25
+SLOWER_AFTER = 3
+"""Exact steps after which they are half as long."""
 LONGEST_STEP = 0.7
 """Largest change of a texel's depth in one step: a factor of two."""
 CLEAN_SHARE = 0.2
-"""Share of the seen surface that counts as clean after ratio steps, which know depths only relative to each other."""
+"""Share of the seen surface that counts as clean while depths are known only relative to each other."""
 
 
 @dataclass(frozen=True)
@@ -80,20 +85,34 @@ class StainSolver:
     texels: int
 
     def ratio_step(self, state: StainState, sums: StainSums) -> StainState:
-        """The damped ratio update, with depths above that of the cleanest part of what is seen; media take the common factor."""
+        """The damped ratio update, at a free common factor."""
         carried = np.maximum(sums.carried, 0.0)
         ratio = sums.explained / np.where(carried > 0, carried, 1.0)
         slope = np.where(carried > 0, carried * np.log(np.maximum(ratio, 1e-3)), 0.0)
-        moved = self._moved(state, sums, slope, 2.0, 0.0, -DEEPEST)
+        return self._relative(state, self._moved(state, sums, slope, 2.0, 0.0, -DEEPEST))
+
+    def pattern_step(self, state: StainState, sums: StainSums) -> StainState:
+        """A step with momentum along the gradient at that common factor of all images which fits best."""
+        total = float(np.maximum(sums.carried, 0.0).sum())
+        factor = float(np.clip(sums.explained.sum() / total, 0.1, 10.0)) if total > 0 else 1.0
+        scaled = StainSums(sums.explained * factor, sums.carried * factor**2, sums.squares)
+        return self._relative(state, self._moved(state, scaled, scaled.explained - scaled.carried, 1.0, MOMENTUM, -DEEPEST))
+
+    def exact_step(self, state: StainState, sums: StainSums, number: int) -> StainState:
+        """A step with momentum along the exact gradient; later ones are shorter, so that noise averages out (Robbins and Monro 1951).
+
+        Args:
+            number: of exact steps before this one.
+        """
+        return self._moved(state, sums, sums.explained - sums.carried, 1 + number / SLOWER_AFTER, MOMENTUM, 0.0)
+
+    def _relative(self, before: StainState, moved: StainState) -> StainState:
+        # Depths above that of the cleanest part of what is seen; media take the common factor.
         if not moved.seen.any():
-            return state
+            return before
         floor = float(np.quantile(moved.depth[moved.seen], CLEAN_SHARE))
         depth = np.where(moved.seen, np.clip(moved.depth - floor, 0.0, DEEPEST), 0.0)
-        return StainState(depth, np.zeros(self.texels), moved.seen, moved.squares)
-
-    def exact_step(self, state: StainState, sums: StainSums) -> StainState:
-        """A step along the exact gradient, scaled by ``carried``, with momentum."""
-        return self._moved(state, sums, sums.explained - sums.carried, 1.0, MOMENTUM, 0.0)
+        return StainState(depth, np.where(moved.seen, depth - before.depth, 0.0), moved.seen, moved.squares)
 
     def _prior(self) -> Any:
         # Precision matrix (T, T), sparse: towards clean, and neighbours towards each other.
