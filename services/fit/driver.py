@@ -16,10 +16,10 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
-from services.fit.anatomy.stain_uv import stain_layout, texel_edge_mm
+from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
-from services.fit.export.stains import FittedStains, keep_stains
+from services.fit.export.stains import keep_stains
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, read_channel, read_observations, write_channel
 from services.fit.passes import Passes, TraceRow
@@ -80,7 +80,7 @@ class FitDriver:
                 shape = fits[channel].tissue.shape
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if uv is not None and textures:
-            keep_stains(self.writer.folder, FittedStains(uv, textures))
+            keep_stains(self.writer.folder, ToothStains(uv, textures))
         return self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
 
     def _schedule(

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import PreparedManifest
 from services.core.store import write_atomic
+from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.anatomy.thickness import thickness_image
 from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
-from services.fit.export.stains import FittedStains, stain_image
+from services.fit.export.stains import stain_image
 from services.fit.observations import ViewStack
 from services.fit.schedule import StepReport
 
@@ -105,7 +106,7 @@ def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest
     np.savez_compressed(folder / PICTURES, allow_pickle=False, **arrays)
 
 
-def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth, cameras: tuple[Camera, ...], stains: FittedStains | None = None) -> ReportPictures:
+def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth, cameras: tuple[Camera, ...], stains: ToothStains | None = None) -> ReportPictures:
     """What the report shows."""
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 from services.core.records import JobSpec
@@ -63,8 +64,8 @@ IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 
 
-TELL_EVERY = 10
-"""Steps of Adam between two reports; each costs an evaluation of all images."""
+ADAM_BURST = 10
+"""Steps of Adam between two journal entries and reports, each of which costs an evaluation of all images."""
 
 Fitted = tuple[StackProblem, Tissue, Solution]
 
@@ -172,7 +173,7 @@ class ChannelSchedule:
         self._reweight(stage, tissue)
         problem = StackProblem(self.passes, domain, tissue, stage)
         options = adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps)
-        return problem, *self._run(adam.Adam(domain, options), adam, problem, self.spec.samples_per_pixel)
+        return problem, *self._run(adam.Adam(domain, options), adam, problem, self.spec.samples_per_pixel, ADAM_BURST)
 
     def _reweight(self, stage: str, tissue: Tissue) -> None:
         # New weights where the loss follows residuals; all later stages have them.
@@ -248,16 +249,21 @@ class ChannelSchedule:
         solver = gauss_newton.GaussNewton(problem.domain, options)
         return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
 
-    def _run(self, solver: Any, kind: Any, problem: StackProblem, samples: int) -> tuple[Tissue, Solution]:
-        # A solver's loop; each step is one journal entry, written and read by the solver's module ``kind``.
+    def _run(self, solver: Any, kind: Any, problem: StackProblem, samples: int, burst: int = 1) -> tuple[Tissue, Solution]:
+        # A solver's loop; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
+        def advance(state: Any) -> Any:
+            for _ in range(burst):
+                state = state if solver.terminate(state) else solver.step(problem, state)
+            return kind.state_record(state)
+
         state = solver.init(problem.domain.x_of(problem.base), samples)
         while not solver.terminate(state):
             self.pause()
-            key = f"{self.files.channel}/{problem.stage}/{state.step}"
-            entry, is_new = self.journal.once(key, lambda before=state: kind.state_record(solver.step(problem, before)))  # type: ignore[misc]
+            entry, is_new = self.journal.once(f"{self.files.channel}/{problem.stage}/{state.step}", partial(advance, state))
+            self.steps -= state.step
             state = kind.state_from(entry)
-            self.steps += 1
-            if is_new and (kind is gauss_newton or state.step % TELL_EVERY == 1 or solver.terminate(state)):
+            self.steps += state.step
+            if is_new:
                 self._tell(problem, state)
         solution = solver.finish(state)
         return problem.domain.tissue_at(solution.x, problem.base), solution

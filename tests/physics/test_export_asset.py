@@ -18,10 +18,9 @@ from services.core.records import Boundary, Estimate, FitReport
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.anatomy.stain_paint import painted_depth
-from services.fit.anatomy.stain_uv import stain_layout
+from services.fit.anatomy.stain_uv import ToothStains, stain_layout
 from services.fit.export.asset import tissue_of, write_asset
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
-from services.fit.export.stains import FittedStains
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
@@ -50,13 +49,13 @@ class Rig:
         self.cameras: tuple[Camera, ...] = dome_cameras(2, 1.2, (incisor.outer,))
         self.lights: tuple[Light, ...] = dome_lights(4, CHANNELS, seed=2)
 
-    def write(self, folder: Path, boundary: Boundary, stains: FittedStains | None = None) -> tuple[str, ...]:
+    def write(self, folder: Path, boundary: Boundary, stains: ToothStains | None = None) -> tuple[str, ...]:
         return write_asset(
             folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary, ior=1.631, stains=stains
         )  # fmt: skip
 
     def engine_image(
-        self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int, stains: FittedStains | None = None
+        self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int, stains: ToothStains | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         dentin = self.tooth.dentin
         assert dentin is not None
@@ -78,14 +77,14 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def stains(rig: Rig) -> FittedStains:
+def stains(rig: Rig) -> ToothStains:
     # Strong ones, and in one channel only.
     layout = stain_layout(rig.tooth.outer, 1.0)
-    return FittedStains(layout.corners_uv, {"green": layout.texture(painted_depth(layout, 3, strength=2.0))})
+    return ToothStains(layout.corners_uv, {"green": layout.texture(painted_depth(layout, 3, strength=2.0))})
 
 
 @pytest.mark.parametrize(("boundary", "stained"), [("matched", False), ("thin", False), ("matched", True), ("thin", True)])
-def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, stains: FittedStains, boundary: Boundary, stained: bool, tmp_path: Path) -> None:
+def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, stains: ToothStains, boundary: Boundary, stained: bool, tmp_path: Path) -> None:
     prepare_device()
     shown = stains if stained else None
     rig.write(tmp_path, boundary, shown)
@@ -123,7 +122,7 @@ def test_the_folder_is_complete_and_self_contained(rig: Rig, tmp_path: Path) -> 
     assert json.loads((tmp_path / "thin/errors.json").read_text())["held_out_error"] == {"red": 0.03, "green": 0.03}
 
 
-def test_textures_come_with_their_place_and_as_fitted(rig: Rig, stains: FittedStains, tmp_path: Path) -> None:
+def test_textures_come_with_their_place_and_as_fitted(rig: Rig, stains: ToothStains, tmp_path: Path) -> None:
     from PIL import Image
 
     assert {"teeth/11/stain_green.npy", "teeth/11/stain_green.png"} <= set(rig.write(tmp_path, "matched", stains))

@@ -48,12 +48,14 @@ def write_prepared(
     masked: bool = False,
     dark: bool = False,
     uneven: float = 0.0,
+    shadowed: float = 0.0,
     stain_uv: NDArray[np.float64] | None = None,
     seed: int = 5,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
     Args:
+        shadowed: share of every photograph that loses nine tenths of its light, which no medium explains either.
         stain_uv: texture coordinates of the outer surface, for a truth with stains.
         uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
     """
@@ -76,6 +78,7 @@ def write_prepared(
         image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
         image[::2] *= 1 + uneven
+        image = np.where(rng.uniform(size=(*image.shape[:-1], 1)) < shadowed, 0.1 * image, image) if shadowed else image
         spread = np.maximum(noise * image, 1e-4)
         radiance[c] = (image + spread * rng.standard_normal(image.shape)).astype(np.float32)
         variance[c] = (spread**2).astype(np.float32)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.anatomy.stain_uv import StainLayout
+from services.core.geometry import Mesh
+from services.fit.anatomy.stain_uv import StainLayout, ToothStains, stain_layout
+
+TEXEL_MM = 0.5
+STRENGTH = {"red": 0.6, "green": 1.0, "blue": 1.4}
+"""Stains are brown: they take more of blue."""
 
 NECK_DEPTH = 0.25
 """Optical depth at the neck's end of the surface, falling off over a quarter of its length."""
@@ -13,6 +18,12 @@ STREAK_DEPTH, STREAK_MM = 0.12, 1.6
 """Largest depth and width of vertical streaks."""
 SPOTS, SPOT_DEPTH, SPOT_MM = 6, 0.5, 0.9
 """Number, depth at the middle and radius of spots."""
+
+
+def painted_stains(outer: Mesh, channels: tuple[str, ...], seed: int) -> ToothStains:
+    """A texture for each channel, alike but in strength."""
+    layout = stain_layout(outer, TEXEL_MM)
+    return ToothStains(layout.corners_uv, {name: layout.texture(painted_depth(layout, seed, STRENGTH.get(name, 1.0))) for name in channels})
 
 
 def painted_depth(layout: StainLayout, seed: int, strength: float = 1.0) -> NDArray[np.float64]:

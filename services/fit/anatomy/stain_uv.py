@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,15 @@ class StainLayout:
     def depths(self, stain: Stain) -> Array:
         """Optical depths (T,) of a stain."""
         return np.asarray(-np.log(stain.transmittance[self.index >= 0]))
+
+
+@dataclass(frozen=True)
+class ToothStains:
+    """A tooth's textures by channel, where it has one, and where they lie on its outer faces."""
+
+    corners_uv: Array
+    """(F, 3, 2)"""
+    textures: Mapping[str, Stain]
 
 
 def texel_edge_mm(pixel_mm: float) -> float:

@@ -21,9 +21,10 @@ from services.core.geometry import Camera, Light, Tooth, teeth_folder
 from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
+from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.export.mitsuba_scene import nested_scene
 from services.fit.export.scene_xml import SceneParameter, write_scene
-from services.fit.export.stains import FittedStains, write_textures
+from services.fit.export.stains import write_textures
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
@@ -39,7 +40,7 @@ def write_asset(
     channels: tuple[str, ...],
     boundary: Boundary,
     ior: float,
-    stains: FittedStains | None = None,
+    stains: ToothStains | None = None,
 ) -> tuple[str, ...]:
     """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative to ``folder``.
 

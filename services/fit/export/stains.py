@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,38 +9,29 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
-from services.fit.anatomy.stain_uv import bilinear_texels
+from services.fit.anatomy.stain_uv import ToothStains, bilinear_texels
 from services.fit.export.pictures import png16_bytes
 from services.fit.optics.parameters import Stain
 
 STAINS = "stains.npz"
 
 
-@dataclass(frozen=True)
-class FittedStains:
-    """A tooth's textures by channel, where it has one, and where they lie on its outer faces."""
-
-    corners_uv: NDArray[np.float64]
-    """(F, 3, 2)"""
-    textures: Mapping[str, Stain]
-
-
-def keep_stains(folder: Path, stains: FittedStains) -> None:
+def keep_stains(folder: Path, stains: ToothStains) -> None:
     """Write them into a fit's folder."""
     arrays = {f"texture.{channel}": stain.transmittance for channel, stain in stains.textures.items()}
     np.savez_compressed(folder / STAINS, allow_pickle=False, corners_uv=stains.corners_uv, **arrays)
 
 
-def kept_stains(folder: Path) -> FittedStains | None:
+def kept_stains(folder: Path) -> ToothStains | None:
     """What ``keep_stains`` wrote; None where nothing was."""
     if not (folder / STAINS).is_file():
         return None
     with np.load(folder / STAINS, allow_pickle=False) as stored:
         textures = {name.removeprefix("texture."): Stain(stored[name].astype(float)) for name in stored.files if name.startswith("texture.")}
-        return FittedStains(stored["corners_uv"].astype(float), textures)
+        return ToothStains(stored["corners_uv"].astype(float), textures)
 
 
-def write_textures(folder: Path, stains: FittedStains) -> dict[str, Path]:
+def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
     """Write ``stain_<channel>.npy``, a_t as fitted, and ``stain_<channel>.png``, what it takes, 1 - a_t in 16 bits; returns the pictures by channel."""
     written = {}
     for channel, stain in stains.textures.items():
@@ -52,7 +41,7 @@ def write_textures(folder: Path, stains: FittedStains) -> dict[str, Path]:
     return written
 
 
-def stain_image(outer: Mesh, stains: FittedStains, camera: Camera) -> NDArray[np.float64]:
+def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.float64]:
     """a_t at the surface point that each pixel sees, (H, W, C) in the textures' order; NaN off the tooth."""
     from services.fit.anatomy.rays import RayScene, pixel_rays
 

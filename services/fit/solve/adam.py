@@ -2,8 +2,8 @@
 
 Each step takes one gradient J'W r in the unbounded domain, J and r from two independently seeded passes of the same number of paths per pixel (64 in the
 paper), and moves by Kingma and Ba's rule with their decay rates. Priors join the gradient; bounds are met by projection. The paper states neither its
-learning rate nor when it stops: here the rate is in units of the domain's step scale, constant, and a fit ends after ``max_steps``, or when over the
-last third of ``window`` steps the mean of x left that of the first third by less than ``tolerance`` step scales. Nothing here knows an error, so
+learning rate nor when it stops: here the rate is in units of the domain's step scale, constant, and a fit ends after ``max_steps``, or when two running
+means of x, over the last ``window`` steps and over three times as many, differ by less than ``still`` rates. Nothing here knows an error, so
 the standard errors that are reported come from normal equations rendered at the end.
 """
 
@@ -53,8 +53,9 @@ class Options:
     epsilon: float = 1e-8
     """Relative to the largest gradient seen, because the loss has no natural unit."""
     max_steps: int = 300
-    window: int = 90
-    tolerance: float = 0.05
+    window: int = 20
+    still: float = 2.0
+    """Steady progress would part the two means by 2 ``window`` rates."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,10 @@ class State:
     samples: int
     mean: Array
     square: Array
-    recent: Array
-    """(K, F): x of the last K <= window steps."""
+    lately: Array
+    """Running mean of x over the last ``window`` steps, (F,)."""
+    before: Array
+    """Over three times as many."""
     step: int = 0
     loss: float = 0.0
     result: Result = Result.RUNNING
@@ -82,7 +85,7 @@ def state_record(state: State) -> dict[str, Any]:
 def state_from(record: dict[str, Any]) -> State:
     """The state of a record."""
     arrays = {name: np.array(value, dtype=np.float64) for name, value in record.items() if isinstance(value, list)}
-    return State(**(record | arrays | {"recent": arrays["recent"].reshape(-1, len(arrays["x"])), "result": Result(record["result"])}))
+    return State(**(record | arrays | {"result": Result(record["result"])}))
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,8 @@ class Adam:
     def init(self, x: Array, samples: int) -> State:
         """State at a start, moved inside the bounds."""
         low, high = self.domain.bounds
-        zero = np.zeros(len(x))
-        return State(np.clip(x, low, high), samples, zero, zero, np.zeros((0, len(x))))
+        start, zero = np.clip(x, low, high), np.zeros(len(x))
+        return State(start, samples, zero, zero, start, start)
 
     def terminate(self, state: State) -> bool:
         """Whether nothing is left to do."""
@@ -130,15 +133,11 @@ class Adam:
 
         low, high = self.domain.bounds
         new = np.clip(x - scale * move, low, high)
-        recent = np.concatenate([state.recent, new[None]])[-options.window :]
-        result = Result.CONVERGED if self._is_still(recent) else Result.MAX_STEPS if number >= options.max_steps else Result.RUNNING
-        verdict = f"moved by {float(np.linalg.norm((new - x) / scale)):.3f}"
-        return replace(state, x=new, mean=mean, square=square, recent=recent, step=number, loss=found.loss, result=result, verdict=verdict)
 
-    def _is_still(self, recent: Array) -> bool:
-        # Single iterates wander by about the rate for ever; their means over two thirds of the window tell drift from wandering.
-        if len(recent) < self.options.window:
-            return False
-        third = self.options.window // 3
-        drift = (recent[-third:].mean(axis=0) - recent[:third].mean(axis=0)) / self.domain.scale
-        return float(np.abs(drift).max()) < self.options.tolerance
+        # Single iterates wander by about the rate for ever; running means tell drift from wandering, once both have left the start behind.
+        lately, before = (old + (new - old) / span for old, span in ((state.lately, options.window), (state.before, 3 * options.window)))
+        is_still = number > 3 * options.window and float(np.abs((lately - before) / scale).max()) < options.still * options.rate
+        result = Result.CONVERGED if is_still else Result.MAX_STEPS if number >= options.max_steps else Result.RUNNING
+        verdict = f"moved by {float(np.linalg.norm((new - x) / scale)):.3f}"
+        state = replace(state, x=new, mean=mean, square=square, lately=lately, before=before)
+        return replace(state, step=number, loss=found.loss, result=result, verdict=verdict)
