@@ -191,6 +191,7 @@ def phantom(
     dentin: Annotated[Path | None, typer.Option(help="Dentin surface to use instead of the procedural one.")] = None,
     highlights: Annotated[bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")] = False,
     gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
+    stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
     from services.fit.anatomy.phantom import write_phantom
@@ -208,6 +209,7 @@ def phantom(
         dentin=dentin,
         highlights=highlights,
         gums=gums,
+        stains=stains,
     )
     print(f"phantom: {out}")
 

@@ -68,6 +68,18 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(path)
 
 
+def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -> None:
+    """Write a binary PLY with texture coordinates (F, 3, 2) as ``u`` and ``v``; vertices on a seam are written once for each side of it."""
+    corners = np.concatenate([mesh.vertices_mm[mesh.faces], corners_uv], axis=-1).astype("<f4").reshape(-1, 5)
+    vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, index.reshape(-1, 3)
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "u", "v"))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}element face {len(faces)}\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(f"{head}property list uchar int vertex_indices\nend_header\n".encode() + vertices.tobytes() + faces.tobytes())
+
+
 def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, ...]:
     """Read and check every tooth below ``root/teeth``.
 

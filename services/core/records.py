@@ -15,6 +15,7 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
+Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 
 
 class MaskBit(IntFlag):
@@ -94,6 +95,12 @@ class JobSpec(Record):
         default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
     )
     held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
+    loss: Loss = Field(default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders")
+    solver: Literal["gauss-newton", "adam"] = Field(default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples")
+    adam_steps: int = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
+    adam_rate: Positive = Field(default=0.05, description="learning rate of solver = adam, in lengths over which images are about linear")
+    prior: Literal["weak", "literature"] = Field(default="weak", description="literature: media are drawn towards measured teeth where the images say little")
+    stains: bool = Field(default=False, description="fit a texture of stains on the enamel after the media")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
     held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
     channels: tuple[str, ...] | None = Field(default=None, description="channels to fit; default: all")

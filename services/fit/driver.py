@@ -11,8 +11,10 @@ import numpy as np
 
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
+from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.attempt import Attempt, judge
 from services.fit.executors import Executor
+from services.fit.export.stains import keep_stains
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.optics.parameters import Tissue
@@ -37,8 +39,9 @@ class FitDriver:
         dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
-        scenes = {channel: channel_scene(observations, channel, (dentin,), spec) for channel in channels}
-        files = {channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel]) for channel in channels}
+        layout = stain_layout(tooth.outer, texel_edge_mm(pixel_edge_mm(tooth, observations.manifest.cameras, spec))) if spec.stains else None
+        scenes = {channel: channel_scene(observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv) for channel in channels}
+        files = {channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss) for channel in channels}
         journal = attempt.journal(files.values())
         begun, _ = journal.once("begun", lambda: started_s)
 
@@ -52,8 +55,12 @@ class FitDriver:
                 attempt.log(f"{channel}: renderers start, then the table is searched.")
                 schedule = self._schedule(observations, files[channel], views[channel], journal, run_on, (number, len(order)))
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
+                schedule.stain_layout = layout
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
+        textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
+        if layout is not None and textures:
+            keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
         return self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
 
     def _schedule(
@@ -117,3 +124,10 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
         centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
         return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm), crown=upper_tooth(tooth.fdi % 10))
     return None
+
+
+def pixel_edge_mm(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> float:
+    """Median over cameras of the spacing of fitted pixels at the tooth."""
+    centre_mm = tooth.outer.vertices_mm.mean(axis=0, keepdims=True)
+    sizes = [camera.project(centre_mm)[1][0] / camera.K[0][0] for camera in cameras]
+    return float(np.median(sizes)) * spec.pixel_step

@@ -32,8 +32,9 @@ from services.fit.observations import (
     write_channel,
 )
 from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.priors import SHAPE
 from services.fit.pictures import shown_images
-from services.fit.schedule import PRIORS, ChannelSchedule
+from services.fit.schedule import ChannelSchedule
 from services.fit.transport.recipe import DentinShape
 
 START_STEPS = 4
@@ -91,7 +92,7 @@ def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> To
         shape = None
     if shape is None:
         return replace(tooth, dentin=None)
-    return replace(tooth, dentin=Mesh(shape.vertices_mm((PRIORS["shape"][0],) * len(shape.modes_mm)), shape.base.faces))
+    return replace(tooth, dentin=Mesh(shape.vertices_mm((SHAPE[0],) * len(shape.modes_mm)), shape.base.faces))
 
 
 def known_dentin(tooth: Tooth) -> DentinShape | None:
@@ -171,7 +172,7 @@ class _ChannelRun:
         require_signal(views, f"Tooth {name}" if fdi is not None else "The picture of the gums")
         folder = self.attempt.inputs / name
         scene = channel_scene(alone, channel, (dentin,), spec)
-        files = write_channel(folder, scene if fdi is not None else replace(scene, ior=scene.gums_ior), channel, views)
+        files = write_channel(folder, scene if fdi is not None else replace(scene, ior=scene.gums_ior), channel, views, spec.loss)
         schedule = ChannelSchedule(
             files=files,
             passes=self.attempt.passes(self.run_on, files, f"{channel}/{name}"),

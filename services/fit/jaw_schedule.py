@@ -27,8 +27,9 @@ import numpy as np
 from services.fit.jaw_starts import ToothStart, typical
 from services.fit.optics.domain import Coordinate, Domain, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.optics.priors import priors_of
 from services.fit.passes import Near, StackProblem
-from services.fit.schedule import EXACT_SAMPLES, PRIORS, SIMILAR_G, START_RATIOS, START_STEPS
+from services.fit.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 from services.fit.stages import ChannelFit, Stages
 
 TIED_SD = {"sigma": 0.2, "alpha": 0.15}
@@ -104,7 +105,8 @@ class JawSchedule(Stages[Mouth]):
                 elif self.teeth[int(tooth)].state != "fitted":
                     coordinates.append(Coordinate((name,), to_dual(kind, common.value(f"0.{medium}.{kind}")), TIED_SD[kind]))
                 else:
-                    coordinates.append(Coordinate((name,), *PRIORS[kind]) if kind in PRIORS else Coordinate((name,)))
+                    prior = priors_of(self.spec.prior).get(f"{medium}.{kind}")
+                    coordinates.append(Coordinate((name,), *prior) if prior else Coordinate((name,)))
         if mouth.reflectance is not None:
             assert self.start.reflectance is not None
             coordinates.append(Coordinate(("cavity.reflectance",), to_dual("reflectance", self.start.reflectance), WALL_SD))

@@ -11,7 +11,7 @@ from services.core.errors import InputError, NonFiniteError
 from services.fit.optics.domain import to_dual, to_natural
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.schedule import HELD_G
+from services.fit.optics.priors import HELD_G
 
 LEAST_TOOTH_PIXELS = 16
 """A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so few."""

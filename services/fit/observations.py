@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.meshfiles import read_mesh, read_teeth
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import open_stage, reading
 from services.fit.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
+from services.fit.solve.losses import first_weights
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
@@ -102,8 +103,6 @@ class ChannelFiles:
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
     evaluation_recipe: StoredFile
-    weight: float
-    """Weight of every fitted measurement: 1 / mean variance."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
 
@@ -216,10 +215,10 @@ def require_signal(views: Sequence[ViewStack], name: str) -> None:
         raise CaptureInputError(f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out.")
 
 
-def channel_scene(observations: Observations, channel: str, dentins: Sequence[DentinShape | None], spec: JobSpec) -> SceneRecipe:
+def channel_scene(observations: Observations, channel: str, dentins: Sequence[DentinShape | None], spec: JobSpec, stain_uv: Array | None = None) -> SceneRecipe:
     """All that was captured, with the dentin of each tooth, under all lights of a channel."""
     return SceneRecipe(
-        tuple(ToothSurfaces(tooth.outer, dentin) for tooth, dentin in zip(observations.teeth, dentins, strict=True)),
+        tuple(ToothSurfaces(tooth.outer, dentin, stain_uv) for tooth, dentin in zip(observations.teeth, dentins, strict=True)),
         observations.light_positions_mm,
         observations.light_intensities(channel),
         spec.boundary,
@@ -230,7 +229,7 @@ def channel_scene(observations: Observations, channel: str, dentins: Sequence[De
     )
 
 
-def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...]) -> ChannelFiles:
+def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...], loss: Loss = "l2") -> ChannelFiles:
     """Write one channel's blocks and scenes; the same input gives the same files.
 
     Args:
@@ -241,40 +240,43 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
     seen = np.any([v.valid.any(axis=1) for v in views], axis=0)
     noise = np.concatenate([v.variance[f] for v, f in zip(views, fitted, strict=True)])
     values = np.concatenate([v.reference[f] for v, f in zip(views, fitted, strict=True)])
-    weight = 1.0 / float(noise.mean()) if noise.mean() > 0 else 1.0
+    weight = first_weights(loss, values, noise)
+    by_view = np.split(weight, np.cumsum([f.sum() for f in fitted])[:-1])
+    weights = [np.zeros(v.reference.shape) for v in views]
+    for whole, f, part in zip(weights, fitted, by_view, strict=True):
+        whole[f] = part
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         chosen = replace(scene, light_positions_mm=scene.light_positions_mm[lights], light_intensities=scene.light_intensities[lights])
         return write_recipe(folder, chosen)
 
-    def block(view: ViewStack, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
+    def block(view: ViewStack, weight: Array, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
         cut = np.ix_(np.flatnonzero(lights), pixels)
-        chosen, held = view.valid[cut], view.held_out[lights][:, None]
+        held = view.valid[cut] & view.held_out[lights][:, None]
         measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
         parts = None if view.parts is None else view.parts.of(pixels)
-        return write_block(folder, Block(*measured, np.where(chosen & ~held, weight, 0.0), chosen & held, parts))
+        return write_block(folder, Block(*measured, weight[cut], held, parts))
 
     def level(most: int | None) -> Level:
         fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
-        for view, fit in zip(views, fitted, strict=True):
+        for view, weight, fit in zip(views, weights, fitted, strict=True):
             counted = np.asarray(fit.any(axis=0))
             kept = np.ones(len(view.pixels), dtype=bool) if most is None else on_coarse_grid(view.pixels, counted, most)
             relevant = np.flatnonzero(counted & kept)
-            pixels, signal = pixels + len(relevant), signal + weight * float((view.reference[:, kept][fit[:, kept]] ** 2).sum())
-            fits += [block(view, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)]
+            pixels, signal = pixels + len(relevant), signal + float((weight * view.reference**2)[:, kept].sum())
+            fits += [block(view, weight, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)]
             seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
-            compares += [block(view, seen, part) for part in _split(seen_pixels, int(seen.sum()), len(views)) if len(part)]
+            compares += [block(view, weight, seen, part) for part in _split(seen_pixels, int(seen.sum()), len(views)) if len(part)]
         return Level(tuple(fits), tuple(compares), pixels, signal)
 
-    search = [(view, _spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views))) for view, fit in zip(views, fitted, strict=True)]
+    few = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
     return ChannelFiles(
         channel=channel,
         recipe=recipe(used),
         coarse=level(COARSE_PIXELS * len(scene.teeth)),
         full=level(None),
-        search_blocks=tuple(block(view, used, pixels) for view, pixels in search if len(pixels)),
+        search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
         evaluation_recipe=recipe(seen),
-        weight=weight,
         quality=float(values @ values / noise.sum()),
     )
 

@@ -29,6 +29,7 @@ from services.fit.executors import Executor
 from services.fit.optics.domain import BOUNDS, Domain, kind_of, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.seeds import Seeds
+from services.fit.solve.adam import Gradient
 from services.fit.solve.normal_equations import LossChange, NormalEquations, Region, loss_change, normal_equations
 from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
 
@@ -135,6 +136,19 @@ def _regions(block: Block, near: Near) -> list[Region]:
     return [(near[tooth], np.tile(block.parts.tooth == tooth, lights)) for tooth in np.unique(block.parts.tooth)]
 
 
+def gradient_task(
+    host: EngineHost, task: BlockTask, similar: Tissue, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]
+) -> tuple[Gradient, TraceRow]:
+    """A block's stochastic gradient: residual from one seed, derivatives from another."""
+    start, block = time.time(), read_block(task.block)
+    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0])
+    residual, weight = stack.mean - block.reference, block.fit_weight
+    found: JacobianEstimate = host.call("jacobian", task.recipe, similar, block.fitted_view, parameters, samples=task.samples, seed=seeds[1])
+    slopes = np.tensordot(np.asarray(found.jacobian, dtype=np.float64), weight * residual, axes=2)
+    loss = 0.5 * float((weight * (residual**2 - stack.variance)).sum())
+    return Gradient(np.asarray(chain.T @ slopes), loss), trace_row("gradient", task, start)
+
+
 def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
     """Render a block at two points with the same two seeds and compare their losses."""
     start, block = time.time(), read_block(task.block)
@@ -209,6 +223,17 @@ class StackProblem(Generic[Optics]):
         total = products[0].equations
         for p in products[1:]:
             total = total + p.equations
+        return total
+
+    def gradient(self, x: Array, *, samples: int, step: int) -> Gradient:
+        """See adam.Problem: one task per block, summed in block order."""
+        tissue, similar, parameters, chain = self._jacobian_media(x)
+        seeds = self._seed(step, "image"), self._seed(step, "jacobian")
+        parts = self.passes.run(f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, parameters, chain, seeds)
+        self.passes.record([row for _, row in parts])
+        total: Gradient = parts[0][0]
+        for part, _ in parts[1:]:
+            total = total + part
         return total
 
     def compare(self, x_old: Array, x_new: Array, *, samples: int, step: int, trial: int) -> LossChange:

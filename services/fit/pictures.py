@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import PreparedManifest
 from services.core.store import write_atomic
+from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.anatomy.thickness import thickness_image
 from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
+from services.fit.export.stains import stain_image
 from services.fit.observations import ViewStack
 from services.fit.stages import StepReport
 
@@ -105,14 +107,18 @@ def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest
     np.savez_compressed(folder / PICTURES, allow_pickle=False, **arrays)
 
 
-def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth | None, cameras: tuple[Camera, ...]) -> ReportPictures:
-    """What the report shows; the thickness of enamel where it is about one tooth with dentin."""
+def read_pictures(
+    folder: Path, channels: tuple[str, ...], tooth: Tooth | None, cameras: tuple[Camera, ...], stains: ToothStains | None = None
+) -> ReportPictures:
+    """What the report shows; the thickness of enamel and stains where it is about one tooth."""
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)
         pictures = []
         for k in range(count):
             camera, light = (str(part) for part in stored[f"{k}.name"])
             pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
-    if tooth is None or tooth.dentin is None:
+    if tooth is None:
         return ReportPictures(channels, tuple(pictures))
-    return ReportPictures(channels, tuple(pictures), thickness_image(tooth.outer, tooth.dentin, cameras[0]), cameras[0].name)
+    thickness_mm = None if tooth.dentin is None else thickness_image(tooth.outer, tooth.dentin, cameras[0])
+    seen = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
+    return ReportPictures(channels, tuple(pictures), thickness_mm, cameras[0].name, seen, () if stains is None else tuple(stains.textures))

@@ -10,6 +10,7 @@ layered       the same                                         similar   converg
 shape         the same and the dentin's blend weights          similar   converged, or max_steps; only where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
+stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; only where stains are fitted
 ============  ===============================================  ========  =======================================================
 
 Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several times less for equal noise, and
@@ -26,23 +27,19 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from services.core.errors import SettingsError
-from services.fit.optics.domain import Coordinate, Domain, similar_medium, to_dual
+from services.fit.anatomy.stain_uv import StainLayout
+from services.fit.optics.domain import Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.priors import HELD_G, SHAPE, WEAK, Priors, priors_of
 from services.fit.passes import StackProblem, orders_task
-from services.fit.solve import table_search
-from services.fit.solve.gauss_newton import Options
+from services.fit.reweighting import reweighted
+from services.fit.solve import adam, table_search
+from services.fit.solve.gauss_newton import Options, Solution
+from services.fit.solve.losses import is_reweighted
 from services.fit.stages import ChannelFit, Stages
+from services.fit.stain_passes import StainStage
 
-PRIORS = {
-    "g1": (to_dual("g1", 0.8), 0.35),
-    "alpha": (2.3, 1.0),
-    "beta": (to_dual("beta", 0.9), 1.0),
-    "g2": (to_dual("g2", -0.1), 0.35),
-    "shape": (0.6, 0.3),
-}
-"""Mean and standard deviation in the unbounded domain. g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma).
-Blend weights: those nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3 to 1."""
-HELD_G = 0.8
+ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
 SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature table."""
@@ -51,7 +48,15 @@ EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
+REWEIGHTINGS = 2
+"""Rounds of a loss that follows residuals, after the first exact stage."""
+STAIN_SAMPLES = 2
+"""Least paths per pixel of a step of the stains, over those of the start; as many as the media needed in the end."""
 START_STEPS = 2
+ADAM_BURST = 10
+"""Steps of Adam between two journal entries and reports, each of which costs an evaluation of all images."""
+
+Fitted = tuple[StackProblem[Tissue], Tissue, Solution]
 
 
 @dataclass(kw_only=True)
@@ -63,41 +68,25 @@ class ChannelSchedule(Stages[Tissue]):
     """Blend weights to fit; 0 where the dentin's shape is known."""
     shape: tuple[float, ...] = ()
     """Known blend weights."""
+    stain_layout: StainLayout | None = None
+    """Texels to fit; None where the surface counts as clean."""
 
     def run(self) -> ChannelFit[Tissue]:
         """Fit the channel."""
-        spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
-        domain = self._free(media_domain(self.media, ("sigma", "alpha")))
-        if not domain.coordinates and not self.modes:
-            raise SettingsError(f"held = {sorted(spec.held)} leaves nothing to fit; hold fewer parameters.")
-        tissue = self.start()
-        if self.has_dentin:
-            tissue = self._best_start(tissue, self.short(START_STEPS))
-        tissue = tissue.with_values(spec.held)
-        stage = "layered" if self.has_dentin else "homogeneous"
-        tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
-        if self.modes:
-            domain = Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",), *PRIORS["shape"]) for k in range(self.modes)))
-            tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
-        options = self.at_full_resolution()
-        exact_samples = self.fewer(min(solution.samples, EXACT_SAMPLES * samples))
-        problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
-        tissue, solution = self._iterate(problem, options, exact_samples)
-        if spec.lobes == 2:
-            domain = self._free(media_domain(self.media, ("sigma", "alpha", "g1", "beta", "g2")))
-            problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
-            tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
+        if not self._domain(("sigma", "alpha")).coordinates and not self.modes:
+            raise SettingsError(f"held = {sorted(self.spec.held)} leaves nothing to fit; hold fewer parameters.")
+        problem, tissue, solution = self._paper_stages() if self.spec.solver == "adam" else self._stages()
+        if self.stain_layout is not None:
+            problem, tissue, solution = self._stained(self.stain_layout, problem, tissue, solution)
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
-
-    def _free(self, domain: Domain) -> Domain:
-        return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
 
     def start(self) -> Tissue:
         """The first stages alone: the table's best point, and with dentin a few steps of the homogeneous tooth."""
         tissue = self._homogeneous_start()
         if not self.has_dentin:
             return tissue
-        return self._solve("homogeneous", shared_domain(), tissue, self.short(HOMOGENEOUS_STEPS), self.spec.samples_per_pixel, SIMILAR_G)[0]
+        domain, options = shared_domain(self._priors), self.short(HOMOGENEOUS_STEPS)
+        return self._solve("homogeneous", domain, tissue, options, self.spec.samples_per_pixel, SIMILAR_G)[0]
 
     @property
     def media(self) -> tuple[str, ...]:
@@ -107,11 +96,98 @@ class ChannelSchedule(Stages[Tissue]):
     def _others(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
 
+    def _stages(self) -> Fitted:
+        # The media, and the dentin's shape, by Gauss-Newton.
+        spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
+        tissue, domain = self.start(), self._domain(("sigma", "alpha"))
+        if self.has_dentin:
+            tissue = self._best_start(tissue, self.short(START_STEPS))
+        tissue = tissue.with_values(spec.held)
+        stage = "layered" if self.has_dentin else "homogeneous"
+        tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
+        if self.modes:
+            domain = self._with_shape(domain)
+            tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
+
+        options = self.at_full_resolution()
+        exact_samples = self.fewer(min(solution.samples, EXACT_SAMPLES * samples))
+        self._reweight("exact", tissue)
+        problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
+        tissue, solution = self._iterate(problem, options, exact_samples)
+        for again in range(1, REWEIGHTINGS + 1) if is_reweighted(spec.loss) else ():
+            self._reweight(f"exact.{again}", tissue)
+            problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
+            tissue, solution = self._iterate(problem, options, solution.samples)
+        if spec.lobes == 2:
+            problem = StackProblem(self.passes, self._domain(ALL_LEAVES), self._with_lobes(tissue), "phase")
+            tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
+        return problem, tissue, solution
+
+    def _paper_stages(self) -> Fitted:
+        # As in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
+        tissue = self._homogeneous_start()
+        if self.has_dentin:
+            _, tissue, _ = self._descend("homogeneous", shared_domain(self._priors), tissue, self.spec.samples_per_pixel)
+        tissue = (self._with_lobes(tissue) if self.spec.lobes == 2 else tissue).with_values(self.spec.held)
+        domain = self._with_shape(self._domain(ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha")))
+        self.at_full_resolution()
+        return self._descend("layered" if self.has_dentin else "homogeneous", domain, tissue, self.fewer(self.spec.samples_per_pixel))
+
+    def _descend(self, stage: str, domain: Domain, tissue: Tissue, samples: int) -> Fitted:
+        # The exact media and their own derivatives, at constant samples.
+        self._reweight(stage, tissue)
+        problem = StackProblem(self.passes, domain, tissue, stage)
+        options = adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps)
+        return problem, *self._run(adam.Adam(domain, options), adam, problem, samples, ADAM_BURST)
+
+    def _reweight(self, stage: str, tissue: Tissue) -> None:
+        # New weights where the loss follows residuals; all later stages have them.
+        if is_reweighted(self.spec.loss):
+            self.pause()
+            samples = self.fewer(self.spec.max_samples_per_pixel)
+            self.passes = reweighted(self.passes, self.journal, self.spec.loss, tissue, samples=samples, stage=stage)
+
+    def _stained(self, layout: StainLayout, problem: StackProblem[Tissue], tissue: Tissue, solution: Solution) -> Fitted:
+        # The texture in turn with the media; what is returned is the plain fit where a texture gains nothing.
+        options = self.options(self.files.full)
+        samples = min(max(self.fewer(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples), options.max_samples)
+        last = problem, tissue, solution
+
+        def refit(stained: Tissue, turn: int, is_last: bool) -> Tissue:
+            nonlocal last
+            if self.spec.solver == "adam":
+                last = self._descend(f"stained.{turn}", problem.domain, stained, self.fewer(self.spec.samples_per_pixel))
+                return last[1]
+            limits = options if is_last else replace(options, max_steps=min(HOMOGENEOUS_STEPS, options.max_steps))
+            problem_now = replace(problem, base=stained, stage=f"stained.{turn}")
+            last = problem_now, *self._iterate(problem_now, limits, samples)
+            return last[1]
+
+        def tell(stage: str, step: int, stained: Tissue, verdict: str, is_new: bool) -> None:
+            self.steps += 1
+            if is_new:
+                self._announce(stage, step, stained, samples, verdict)
+
+        stage = StainStage(self.passes, self.journal, layout, samples, self.pause, tell)
+        return last if stage.run(tissue, refit) is not None else (problem, tissue, solution)
+
+    def _domain(self, leaves: tuple[str, ...]) -> Domain:
+        # The media's parameters that are not held.
+        domain = media_domain(self.media, leaves, self._priors)
+        return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
+
+    def _with_shape(self, domain: Domain) -> Domain:
+        return Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",), *SHAPE) for k in range(self.modes)))
+
+    @property
+    def _priors(self) -> Priors:
+        return priors_of(self.spec.prior)
+
     def _homogeneous_start(self) -> Tissue:
         # The table's best point, seen as a medium of the mean cosine that is held.
         start = self._search()
         medium = similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G)
-        return Tissue(medium, medium, (PRIORS["shape"][0],) * self.modes if self.modes else self.shape)
+        return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
 
     def _search(self) -> table_search.Candidate:
         # One render per node and view with two seeds each, so that <C,C> is free of noise; every albedo follows from it.
@@ -124,7 +200,7 @@ class ChannelSchedule(Stages[Tissue]):
             pending = []
             for n, node in enumerate(nodes):
                 medium = Medium(node.sigma, 1.0, g1=node.g)
-                tissue = Tissue(medium, medium, (PRIORS["shape"][0],) * self.modes if self.modes else self.shape)
+                tissue = Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
                 label = f"{self.scope}-search-{n}"
                 for task in passes.tasks(label, tissue, max(self.spec.samples_per_pixel, SEARCH_SAMPLES)):
                     for k in (1, 2):
@@ -146,7 +222,7 @@ class ChannelSchedule(Stages[Tissue]):
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
         # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a single start may end with enamel
         # and dentin exchanged.
-        domain, ends = self._free(media_domain(("enamel", "dentin"), ("sigma", "alpha"))), []
+        domain, ends = self._domain(("sigma", "alpha")), []
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values({"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma} | self.spec.held)
             ends.append(self._solve(f"start.{k}", domain, start, options, self.spec.samples_per_pixel, SIMILAR_G)[0])
@@ -172,16 +248,17 @@ class ChannelSchedule(Stages[Tissue]):
         return tissue.with_values({f"{part}.{leaf}": value for part in ("enamel", "dentin") for leaf, value in lobes} | self.spec.held)
 
 
-def shared_domain() -> Domain:
+def shared_domain(priors: Priors = WEAK) -> Domain:
     """Both media alike, sigma and alpha."""
-    return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}")) for leaf in ("sigma", "alpha")))
+    return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}"), priors) for leaf in ("sigma", "alpha")))
 
 
-def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...]) -> Domain:
+def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors = WEAK) -> Domain:
     """Each medium on its own."""
-    return Domain(tuple(_coordinate((f"{part}.{leaf}",)) for part in parts for leaf in leaves))
+    return Domain(tuple(_coordinate((f"{part}.{leaf}",), priors) for part in parts for leaf in leaves))
 
 
-def _coordinate(targets: tuple[str, ...]) -> Coordinate:
-    leaf = targets[0].rpartition(".")[2]
-    return Coordinate(targets, *PRIORS[leaf]) if leaf in PRIORS else Coordinate(targets)
+def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
+    # What both media share has a prior only where theirs are one.
+    (prior, *others) = (priors.get(target) for target in targets)
+    return Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)

@@ -66,6 +66,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.core.meshfiles import read_mesh
     from services.fit.export.asset import errors_json, parameters_json, write_asset
     from services.fit.export.report import write_report
+    from services.fit.export.stains import kept_stains
     from services.fit.pictures import read_pictures
 
     context.report(StageEvent(stage="export", kind="started"))
@@ -81,14 +82,25 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     lights = tuple(
         light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
     )
+    stains = kept_stains(fit_folder)
     files = write_asset(
-        writer.folder, report, teeth, prepared.cameras, lights, channels=channels, boundary=spec.boundary, ior=spec.ior, gums=gums, cavity=cavity
+        writer.folder,
+        report,
+        teeth,
+        prepared.cameras,
+        lights,
+        channels=channels,
+        boundary=spec.boundary,
+        ior=spec.ior,
+        gums=gums,
+        cavity=cavity,
+        stains=stains,
     )
 
     history = json.loads((fit_folder / "history.json").read_text())
     title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"
     facts = {"title": title, "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
-    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras)
+    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, stains)
     write_report(context.root / "report.html", report, pictures, history, facts)
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
     write_atomic(context.root / "errors.json", _json(errors_json(report)))

@@ -15,7 +15,8 @@ from services.fit.observations import ChannelFiles, Level
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.passes import Passes, StackProblem
-from services.fit.solve.gauss_newton import GaussNewton, Options, Solution, State, state_from, state_record
+from services.fit.solve import adam, gauss_newton
+from services.fit.solve.gauss_newton import Options, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 
 IMAGE_TOLERANCE = 0.004
@@ -113,19 +114,27 @@ class Stages(ABC, Generic[Optics]):
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
 
     def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int) -> tuple[Optics, Solution]:
-        # The solver's loop; each step is one journal entry.
-        domain, solver = problem.domain, GaussNewton(problem.domain, options)
-        state = solver.init(domain.x_of(problem.base), min(samples, options.max_samples))
+        solver = gauss_newton.GaussNewton(problem.domain, options)
+        return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
+
+    def _run(self, solver: Any, kind: Any, problem: StackProblem[Optics], samples: int, burst: int = 1) -> tuple[Optics, Solution]:
+        # A solver's loop; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
+        def advance(state: Any) -> Any:
+            for _ in range(burst):
+                state = state if solver.terminate(state) else solver.step(problem, state)
+            return kind.state_record(state)
+
+        state = solver.init(problem.domain.x_of(problem.base), samples)
         while not solver.terminate(state):
             self.pause()
-            key = f"{self.scope}/{problem.stage}/{state.step}"
-            entry, is_new = self.journal.once(key, partial(_recorded_step, solver, problem, state))
-            state = state_from(entry)
-            self.steps += 1
+            entry, is_new = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))
+            self.steps -= state.step
+            state = kind.state_from(entry)
+            self.steps += state.step
             if is_new:
                 self._tell(problem, state)
         solution = solver.finish(state)
-        return domain.tissue_at(solution.x, problem.base), solution
+        return problem.domain.tissue_at(solution.x, problem.base), solution
 
     def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
         # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
@@ -148,7 +157,7 @@ class Stages(ABC, Generic[Optics]):
         passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
         return evaluate(passes, label, tissue, samples, self.shown)
 
-    def _tell(self, problem: StackProblem[Optics], state: State) -> None:
+    def _tell(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
         stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
         shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
         self._announce(stage, state.step, tissue, state.samples, state.verdict, shown)
@@ -177,7 +186,3 @@ class Stages(ABC, Generic[Optics]):
             ),
             evaluation,
         )
-
-
-def _recorded_step(solver: GaussNewton, problem: StackProblem[Any], state: State) -> dict[str, Any]:
-    return state_record(solver.step(problem, state))

@@ -6,6 +6,7 @@ import json
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from services.core.geometry import Camera, Light, Tooth
 from services.core.records import Boundary, Estimate, FitReport
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.anatomy.stain_paint import painted_depth
+from services.fit.anatomy.stain_uv import ToothStains, stain_layout
 from services.fit.export.asset import tissue_of, write_asset
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
@@ -46,17 +49,25 @@ class Rig:
         self.cameras: tuple[Camera, ...] = dome_cameras(2, 1.2, (incisor.outer,))
         self.lights: tuple[Light, ...] = dome_lights(4, CHANNELS, seed=2)
 
-    def write(self, folder: Path, boundary: Boundary) -> tuple[str, ...]:
-        return write_asset(folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary, ior=1.631)
+    def write(self, folder: Path, boundary: Boundary, stains: ToothStains | None = None) -> tuple[str, ...]:
+        return write_asset(
+            folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary, ior=1.631, stains=stains
+        )  # fmt: skip
 
-    def engine_image(self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    def engine_image(
+        self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int, stains: ToothStains | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         dentin = self.tooth.dentin
         assert dentin is not None
         shape = DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
         recipe = single_tooth(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
+        tissue = TISSUE
+        if stains is not None:
+            recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=stains.corners_uv),))
+            tissue = replace(TISSUE, stain=stains.textures.get(CHANNELS[channel]))
         width, height = camera.size
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.int32)
-        estimate = Engine(recipe).images(TISSUE, View(camera, pixels), samples=samples, seed=11)
+        estimate = Engine(recipe).images(tissue, View(camera, pixels), samples=samples, seed=11)
         return estimate.mean[0].reshape(height, width), estimate.variance[0].reshape(height, width)
 
 
@@ -65,10 +76,18 @@ def rig() -> Rig:
     return Rig()
 
 
-@pytest.mark.parametrize("boundary", ["matched", "thin"])
-def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, boundary: Boundary, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def stains(rig: Rig) -> ToothStains:
+    # Strong ones, and in one channel only.
+    layout = stain_layout(rig.tooth.outer, 1.0)
+    return ToothStains(layout.corners_uv, {"green": layout.texture(painted_depth(layout, 3, strength=2.0))})
+
+
+@pytest.mark.parametrize(("boundary", "stained"), [("matched", False), ("thin", False), ("matched", True), ("thin", True)])
+def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, stains: ToothStains, boundary: Boundary, stained: bool, tmp_path: Path) -> None:
     prepare_device()
-    rig.write(tmp_path, boundary)
+    shown = stains if stained else None
+    rig.write(tmp_path, boundary, shown)
     render = runpy.run_path(str(tmp_path / "render.py"))["render"]
     light, camera = rig.lights[2], rig.cameras[1]
     stack = np.stack([render(tmp_path, camera.name, light.name, 64, seed=seed) for seed in range(16)])
@@ -76,7 +95,7 @@ def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, boundary: Boundary,
     mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1) / len(stack)
     scores = []
     for channel in range(2):
-        ours, ours_variance = rig.engine_image(boundary, camera, light, channel, samples=2048)
+        ours, ours_variance = rig.engine_image(boundary, camera, light, channel, 2048, shown)
         assert ours.sum() > 1
         for rows in np.array_split(np.arange(camera.size[1]), 4):
             noise = variance[rows, :, channel].sum() + ours_variance[rows].sum()
@@ -101,6 +120,17 @@ def test_the_folder_is_complete_and_self_contained(rig: Rig, tmp_path: Path) -> 
     parameters = json.loads((tmp_path / "thin/parameters.json").read_text())
     assert parameters["red"]["enamel.sigma"] == {"value": 2.5, "se": 0.01, "unit": "1", "determined": True}
     assert json.loads((tmp_path / "thin/errors.json").read_text())["held_out_error"] == {"red": 0.03, "green": 0.03}
+
+
+def test_textures_come_with_their_place_and_as_fitted(rig: Rig, stains: ToothStains, tmp_path: Path) -> None:
+    from PIL import Image
+
+    assert {"teeth/11/stain_green.npy", "teeth/11/stain_green.png"} <= set(rig.write(tmp_path, "matched", stains))
+    a_t = stains.textures["green"].transmittance
+    np.testing.assert_allclose(np.load(tmp_path / "teeth/11/stain_green.npy"), a_t, rtol=1e-6)
+    # 16 bits, rounded.
+    np.testing.assert_allclose(1 - np.asarray(Image.open(tmp_path / "teeth/11/stain_green.png")) / 65535, a_t, atol=0.51 / 65535)
+    assert "stain" not in (tmp_path / "scene_red.xml").read_text()
 
 
 def test_the_script_runs_alone(rig: Rig, tmp_path: Path) -> None:

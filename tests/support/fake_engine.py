@@ -4,7 +4,8 @@ The image of a pixel with enamel of thickness d under a light at angle c has a n
 
     I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d),   s = reduced scattering, a = reduced albedo
 
-so reduced quantities are fixed by the images and nothing else is. Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
+so reduced quantities are fixed by the images and nothing else is. A stain multiplies by a_t at the texel a pixel looks at, and by its mean over all texels of
+the tooth, for the way in. Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
 """
 
 # ruff: noqa: ARG002 - signatures are those of what is replaced
@@ -17,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.optics.parameters import Tissue
+from services.fit.anatomy.stain_uv import bilinear_texels
+from services.fit.optics.parameters import Stain, Tissue
 from services.fit.solve.table_search import bin_powers
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
+from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
 
 Array = NDArray[np.float64]
 
@@ -50,6 +52,25 @@ class FakeEngine:
             rows.append((exact + scale * self._normal(view, seed, k + 1), np.full(exact.shape, scale**2)))
         return JacobianEstimate(names, image.mean, image.variance, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
 
+    def stain_gradient(self, tissue: Tissue, view: View, cotangent: Array, *, samples: int, seed: int, batches: int = 16) -> StainGradient:
+        image = self.images(tissue, view, samples=samples, seed=seed).mean
+        assert tissue.stain is not None
+        light = (np.asarray(cotangent) * image).sum(axis=0)
+        texels, shares = self._texels(view, tissue.stain)
+        values = tissue.stain.transmittance.reshape(-1)
+        out = np.bincount(texels.reshape(-1), (shares * (light / (shares * values[texels]).sum(axis=1))[:, None]).reshape(-1), values.size)
+        entry = light.sum() / values.sum()
+        gradient = (out + entry).reshape(tissue.stain.transmittance.shape)
+        return StainGradient((gradient,), (np.zeros_like(gradient),), samples)
+
+    def _texels(self, view: View, stain: Stain) -> tuple[NDArray[np.int64], Array]:
+        # The middle of a face chosen by the pixel: neighbouring pixels look at faces far apart, which no smoothness explains away.
+        uv = self.recipe.teeth[0].stain_uv
+        assert uv is not None
+        x, y = view.pixels.T
+        middle = uv[(37 * x + 101 * y) % len(uv)].mean(axis=1)
+        return bilinear_texels(middle, (stain.transmittance.shape[0], stain.transmittance.shape[1]))
+
     def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> Array:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
         # Shares of the orders whose power series in the albedo follows the formula's mean image.
@@ -77,6 +98,10 @@ class FakeEngine:
         near = cosine * (1 - through) * enamel.alpha_reduced**1.5
         deep = np.sqrt(cosine) * through * dentin.alpha_reduced**1.5 * (1 - np.exp(-dentin.sigma_s_reduced * cosine**2))
         image = np.asarray(near + deep + 0.05 + 0.0 * lights)
+        if tissue.stain is not None:
+            texels, shares = self._texels(view, tissue.stain)
+            values = tissue.stain.transmittance.reshape(-1)
+            image = image * (shares * values[texels]).sum(axis=1) * values.mean()
         if not np.isfinite(image).all():
             raise NonFiniteError("The formula is not finite; check the parameters.")
         return image

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light, Mesh
 from services.core.meshfiles import write_mesh
@@ -46,11 +48,15 @@ def write_prepared(
     masked: bool = False,
     dark: bool = False,
     uneven: float = 0.0,
+    shadowed: float = 0.0,
+    stain_uv: NDArray[np.float64] | None = None,
     seed: int = 5,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
     Args:
+        shadowed: share of every photograph that loses nine tenths of its light, which no medium explains either.
+        stain_uv: texture coordinates of the outer surface, for a truth with stains.
         uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
     """
     writer = StageWriter(root, "prepared", 1)
@@ -67,10 +73,12 @@ def write_prepared(
     y, x = (index.reshape(-1) for index in np.mgrid[:height, :width])
     dentin = DentinShape(sphere(3.0), np.zeros((len(truth.shape), 1, 3)))
     recipe = single_tooth(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
+    recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=stain_uv),))
     for c, one in enumerate(cameras):
         image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
         image[::2] *= 1 + uneven
+        image = np.where(rng.uniform(size=(*image.shape[:-1], 1)) < shadowed, 0.1 * image, image) if shadowed else image
         spread = np.maximum(noise * image, 1e-4)
         radiance[c] = (image + spread * rng.standard_normal(image.shape)).astype(np.float32)
         variance[c] = (spread**2).astype(np.float32)

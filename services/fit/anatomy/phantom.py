@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,12 +12,15 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.meshfiles import read_mesh, write_mesh
+from services.core.meshfiles import read_mesh, write_mapped_mesh, write_mesh
 from services.core.records import Boundary, FolderCapture, ImageEntry
 from services.core.store import write_atomic, write_record
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.anatomy.stain_paint import painted_stains
+from services.fit.anatomy.stain_uv import ToothStains
+from services.fit.export.stains import keep_stains, write_textures
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, View, single_tooth
@@ -51,6 +55,7 @@ def write_phantom(
     renderer: Renderer = "engine",
     highlights: bool = False,
     gums: bool = False,
+    stains: bool = False,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``teeth/11``) and ``truth.json`` with its optics.
 
@@ -65,6 +70,7 @@ def write_phantom(
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
         highlights: add the surface's reflection of each light; also written alone to ``highlights/<camera>_<light>.npy``.
         gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
+        stains: paint stains on the enamel; also written as ``stains.npz``.
 
     Raises:
         InputError: impossible combination of options.
@@ -76,11 +82,17 @@ def write_phantom(
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, (tooth.outer,))
     _write_meshes(out, tooth, shown_gums)
+    painted = painted_stains(tooth.outer, names, seed) if stains else None
+    if painted is not None:
+        keep_stains(out, painted)
 
     entries = []
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
-        stacks = [_render(out, tooth, camera, rig_lights, c, name, surface, boundary, renderer, samples, seed + 7919 * number) for c, name in enumerate(names)]
+        stacks = [
+            _render(out, tooth, camera, rig_lights, c, name, surface, boundary, renderer, samples, seed + 7919 * number, painted)
+            for c, name in enumerate(names)
+        ]  # fmt: skip
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
         share = surface.enamel_share[None, ..., None]
         mean, variance = mean * share + surface.gums, variance * share**2
@@ -94,7 +106,7 @@ def write_phantom(
                 _write_image(out / "highlights" / f"{stem}.npy", surface.highlight[n])
             held_out = n % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
             entries.append(ImageEntry(camera=camera.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy", held_out=held_out))
-    truth = _truth(names, boundary, renderer, samples, seed, highlights, gums)
+    truth = _truth(names, boundary, renderer, samples, seed, highlights, gums) | {"stains": stains}
     write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
     write_record(out / "capture.json", FolderCapture(units="mm", channels=names, cameras=rig_cameras, lights=rig_lights, images=tuple(entries)))
 
@@ -163,11 +175,12 @@ def _render(
     renderer: Renderer,
     samples: int,
     seed: int,
+    painted: ToothStains | None = None,
 ) -> Stack:
     """Radiance (L, H, W) from inside the tooth, and the variance of its mean."""
     prepare_device()
     if renderer == "mitsuba":
-        return _render_mitsuba(out, tooth, camera, lights, channel, TRUE_TISSUE[name], samples, seed)
+        return _render_mitsuba(out, tooth, camera, lights, channel, name, samples, seed, painted)
     from services.fit.transport.engine import Engine
 
     recipe = single_tooth(
@@ -178,8 +191,12 @@ def _render(
         boundary=boundary,
         ior=IOR,
     )
+    tissue = TRUE_TISSUE[name]
+    if painted is not None:
+        recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=painted.corners_uv),))
+        tissue = replace(tissue, stain=painted.textures[name])
     pixels = np.argwhere(surface.enamel_pixels)[:, ::-1].astype(np.int32)
-    estimate = Engine(recipe).images(TRUE_TISSUE[name], View(camera, pixels), samples=samples, seed=seed)
+    estimate = Engine(recipe).images(tissue, View(camera, pixels), samples=samples, seed=seed)
     width, height = camera.size
     images = np.zeros((2, len(lights), height, width))
     # Single estimates of almost no light may come out below zero; a photograph's cannot.
@@ -187,14 +204,21 @@ def _render(
     return images[0], images[1]
 
 
-def _render_mitsuba(out: Path, tooth: Tooth, camera: Camera, lights: tuple[Light, ...], channel: int, tissue: Tissue, samples: int, seed: int) -> Stack:
+def _render_mitsuba(
+    out: Path, tooth: Tooth, camera: Camera, lights: tuple[Light, ...], channel: int, name: str, samples: int, seed: int, painted: ToothStains | None
+) -> Stack:
     import mitsuba as mi
 
     from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
 
     folder = teeth_folder(out, tooth.fdi)
     inner = folder / "dentin.ply" if tooth.dentin is not None else None
-    scene = load_scene(nested_scene({str(tooth.fdi): (folder / "outer.ply", inner)}, tissue, (camera,), lights[0].position_mm, 1.0))
+    outer, pictures = folder / "outer.ply", {}
+    if painted is not None:
+        outer = folder / "stained.ply"
+        write_mapped_mesh(outer, tooth.outer, painted.corners_uv)
+        pictures = {str(tooth.fdi): write_textures(folder, painted)[name]}
+    scene = load_scene(nested_scene({str(tooth.fdi): (outer, inner)}, TRUE_TISSUE[name], (camera,), lights[0].position_mm, 1.0, stains=pictures))
     params = mi.traverse(scene)
     images = []
     for n, light in enumerate(lights):

@@ -5,6 +5,7 @@
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
     gums.ply, cavity.ply       of a jaw; gums hold the roots, so they are in no scene: stock media cannot overlap
+    teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer surface's u, v
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
     errors.json                fitted and held-out image error, of a jaw's teeth too
@@ -18,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.meshfiles import write_mesh
+from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
+from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.export.mitsuba_scene import nested_scene
 from services.fit.export.scene_xml import SceneParameter, write_scene
+from services.fit.export.stains import write_textures
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
@@ -40,6 +43,7 @@ def write_asset(
     ior: float,
     gums: Mesh | None = None,
     cavity: Mesh | None = None,
+    stains: ToothStains | None = None,
 ) -> tuple[str, ...]:
     """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative to ``folder``.
 
@@ -47,6 +51,7 @@ def write_asset(
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
         lights: ``intensity`` in the order of ``channels``.
         gums, cavity: of a jaw.
+        stains: of a single tooth.
 
     Raises:
         CaptureInputError: a camera that Mitsuba cannot render.
@@ -56,12 +61,20 @@ def write_asset(
     for tooth in teeth:
         place = teeth_folder(Path(), tooth.fdi)
         files[str(tooth.fdi)] = (place / "outer.ply", place / "dentin.ply" if tooth.dentin is not None else None)
-        write_mesh(folder / place / "outer.ply", tooth.outer)
+        if stains is None:
+            write_mesh(folder / place / "outer.ply", tooth.outer)
+        else:
+            write_mapped_mesh(folder / place / "outer.ply", tooth.outer, stains.corners_uv)
         if tooth.dentin is not None:
             write_mesh(folder / place / "dentin.ply", tooth.dentin)
     for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
         if mesh is not None:
             write_mesh(folder / name, mesh)
+
+    textures = {}
+    if stains is not None:
+        (tooth,) = teeth
+        textures = {channel: path.relative_to(folder) for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()}
 
     first = lights[0]
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
@@ -70,7 +83,9 @@ def write_asset(
         table = report.parameters[channel]
         tissue = {fdi: tissue_of(tooth.parameters[channel]) for fdi, tooth in report.teeth.items()} or tissue_of(table)
         wall = None if cavity is None else (Path("cavity.ply"), table["cavity.reflectance"].value)
-        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), wall=wall)
+        stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
+        surroundings: dict[str, Any] = {"wall": wall, "stains": stained}
+        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), **surroundings)
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -67,9 +68,18 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
     }
 
 
-def boundary_dict(boundary: Boundary, ior: float) -> SceneDict:
-    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset."""
-    return {"type": "null"} if boundary == "matched" else {"type": "thin_boundary", "ior": ior}
+def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:
+    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset.
+
+    Args:
+        stain: picture of what the surface takes of light that passes, 1 - a_t; over nothing it is a mask before black.
+    """
+    texture = None if stain is None else {"type": "bitmap", "filename": stain.as_posix(), "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    if boundary == "thin":
+        return {"type": "thin_boundary", "ior": ior} | ({} if texture is None else {"stain": texture})
+    if texture is None:
+        return {"type": "null"}
+    return {"type": "mask", "opacity": texture, "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 
 
 TeethFiles = Mapping[str, tuple[Path, Path | None]]
@@ -87,6 +97,7 @@ def nested_scene(
     ior: float = 1.631,
     samples: Any = 64,
     wall: tuple[Path, float] | None = None,
+    stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
     """Scene of teeth under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
 
@@ -95,6 +106,7 @@ def nested_scene(
     Args:
         tissue: of all teeth, or of each by name.
         wall: PLY file and diffuse reflectance of the wall behind the teeth.
+        stains: by name of the tooth, as in ``boundary_dict``; its outer PLY then has texture coordinates.
     """
     scene: SceneDict = {
         "type": "scene",
@@ -104,7 +116,8 @@ def nested_scene(
     for name, (outer, dentin) in teeth.items():
         own, ending = (tissue, "") if isinstance(tissue, Tissue) else (tissue[name], f"_{name}")
         enamel, inner = {"type": "ref", "id": f"medium_enamel{ending}"}, {"type": "ref", "id": f"medium_dentin{ending}"}
-        scene |= {f"medium_enamel{ending}": medium_dict(own.enamel), f"outer_{name}": _surface(outer, boundary_dict(boundary, ior)) | {"interior": enamel}}
+        shell = _surface(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
+        scene |= {f"medium_enamel{ending}": medium_dict(own.enamel), f"outer_{name}": shell}
         if dentin is not None:
             around = {"interior": inner, "exterior": enamel}
             scene |= {f"medium_dentin{ending}": medium_dict(own.dentin), f"dentin_{name}": _surface(dentin, {"type": "null"}) | around}

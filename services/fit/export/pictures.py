@@ -104,3 +104,12 @@ def png_bytes(image: Image8) -> bytes:
 def data_uri(image: Image8) -> str:
     """Bytes (H, W, 3) as a ``data:`` address for a page that opens alone."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
+
+
+def png16_bytes(values: NDArray[np.floating]) -> bytes:
+    """A grey PNG of 16 bits from values (H, W) of 0 to 1, linear."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(np.rint(65535 * np.clip(values, 0, 1)).astype(np.uint16)).save(stream, format="PNG")
+    return stream.getvalue()

@@ -53,6 +53,11 @@ class ReportPictures:
     thickness_mm: NDArray[np.floating] | None = None
     """Enamel thickness seen by one camera (H, W), NaN off the tooth; see ``anatomy.thickness.thickness_image``."""
     thickness_camera: str = ""
+    """Also that of the stains."""
+    stains: NDArray[np.floating] | None = None
+    """Transmittance of the stains (H, W, C), NaN off the tooth; see ``export.stains.stain_image``."""
+    stained: tuple[str, ...] = ()
+    """The C channels that have stains."""
 
 
 def write_report(path: Path, report: FitReport, pictures: ReportPictures, history: list[dict[str, Any]], context: dict[str, Any]) -> None:
@@ -86,6 +91,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         tooth_sentences=[tooth.sentence for tooth in report.teeth.values() if tooth.sentence],
         thickness=_thickness(pictures),
         thickness_bar=_gradient(SEQUENTIAL),
+        stains=_stains(pictures),
         caveat=THIN_CAVEAT if boundary == "thin" else "",
         provenance=_provenance(boundary, context),
     )
@@ -235,6 +241,21 @@ def _thickness(pictures: ReportPictures) -> dict[str, str] | None:
         "mean": f"{np.nanmean(values):.2f} mm",
         "width": str(values.shape[1]),
         "height": str(values.shape[0]),
+    }
+
+
+def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
+    # One map per channel from the darkest texel seen to a clean surface; of few channels that is plainer than one in colour.
+    if pictures.stains is None or not np.isfinite(pictures.stains).any():
+        return None
+    low = float(np.floor(10 * np.nanmin(pictures.stains)) / 10)
+    drawn = [(name, scalar_map(pictures.stains[..., k], (low, 1.0))) for k, name in enumerate(pictures.stained)]
+    return {
+        "images": [(name, data_uri(enlarge(image, 240)), f"{np.nanmean(pictures.stains[..., k]):.2f}") for k, (name, image) in enumerate(drawn)],
+        "camera": pictures.thickness_camera,
+        "low": f"{low:g}",
+        "width": str(pictures.stains.shape[1]),
+        "height": str(pictures.stains.shape[0]),
     }
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,8 +178,8 @@ def similar_medium(medium: Medium, g: float) -> Medium:
 
 
 def similar_tissue(tissue: Optics, g: float) -> Optics:
-    """All media replaced by similar ones; shapes and what is opaque stay."""
+    """All media replaced by similar ones; shapes, stains and what is opaque stay."""
     if isinstance(tissue, Tissue):
-        return Tissue(similar_medium(tissue.enamel, g), similar_medium(tissue.dentin, g), tissue.shape)
+        return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
     gums = None if tissue.gums is None else similar_medium(tissue.gums, g)
     return Mouth(tuple(similar_tissue(tooth, g) for tooth in tissue.teeth), gums, tissue.reflectance)

@@ -130,7 +130,7 @@ class MeshGeometry:
 
     def restain(self, stains: tuple[Stain | None, ...]) -> bool:
         """Put these textures on the teeth; returns whether any changed."""
-        if stains == self._stains:
+        if all(map(_alike, stains, self._stains)):
             return False
         self._stains, self.textures = stains, None
         if any(stain is not None for stain in stains):
@@ -241,3 +241,8 @@ class MeshGeometry:
                 displacement += weight * dr.gather(mi.Vector3f, table, face + corner, active)
             speeds.append(dr.select(active, dr.dot(hit.normal, displacement), 0))
         return speeds
+
+
+def _alike(one: Stain | None, other: Stain | None) -> bool:
+    # By value, because a stain that travelled between processes is another object.
+    return one is other or (one is not None and other is not None and np.array_equal(one.transmittance, other.transmittance))

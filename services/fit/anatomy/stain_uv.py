@@ -1,0 +1,142 @@
+"""Where stains lie: a chart of a tooth's outer surface in a coarse texture, made by xatlas, and which of its texels are neighbours on the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+from services.fit.optics.parameters import Stain
+
+Array = NDArray[np.float64]
+
+TEXEL_MM = (0.5, 1.0)
+"""Least and greatest edge of a texel."""
+TEXEL_PIXELS = 1.5
+"""Edge of a texel in pixels of the capture: what one pixel sees does not fix two texels."""
+REACH = 1.6
+"""Texels this many edges apart are neighbours: the eight around one, and those across a seam."""
+SAME_SIDE = 0.3
+"""Least cosine between neighbours' normals, so that the two sides of an incisal edge are none."""
+SAMPLES_PER_TEXEL = 4
+"""Along an edge, for finding the texels that a face touches."""
+
+
+@dataclass(frozen=True)
+class StainLayout:
+    """A texture's place on a surface of F faces; T of its texels are touched by it."""
+
+    corners_uv: Array
+    """Texture coordinates (F, 3, 2) of the faces' corners, 0 to 1."""
+    index: NDArray[np.int64]
+    """(H, W): a texel's number among those that count, -1 where no face is near."""
+    points_mm: Array
+    """(T, 3): the mean place that a texel colours."""
+    area_mm2: Array
+    """(T,) of the surface, by the texels' bilinear shares."""
+    neighbours: NDArray[np.int64]
+    """(E, 2) pairs of texels next to each other on the surface."""
+
+    def texture(self, optical_depth: Array) -> Stain:
+        """The stain of optical depths d (T,), a_t = exp(-d)."""
+        values = np.append(np.exp(-np.asarray(optical_depth, dtype=np.float64)), 1.0)
+        return Stain(values[self.index])
+
+    def depths(self, stain: Stain) -> Array:
+        """Optical depths (T,) of a stain."""
+        return np.asarray(-np.log(stain.transmittance[self.index >= 0]))
+
+
+@dataclass(frozen=True)
+class ToothStains:
+    """A tooth's textures by channel, where it has one, and where they lie on its outer faces."""
+
+    corners_uv: Array
+    """(F, 3, 2)"""
+    textures: Mapping[str, Stain]
+
+
+def texel_edge_mm(pixel_mm: float) -> float:
+    """Edge of a texel for a capture whose pixels have this size at the tooth."""
+    return float(np.clip(TEXEL_PIXELS * pixel_mm, *TEXEL_MM))
+
+
+def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
+    """Unwrap a surface; the same mesh and size give the same layout.
+
+    Args:
+        texel_mm: edge of a texel on the surface.
+    """
+    import xatlas
+
+    # A texel between charts, so that no bilinear look-up of one reaches another.
+    atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
+    atlas.add_mesh(outer.vertices_mm.astype(np.float32), outer.faces.astype(np.uint32))
+    packing.padding, packing.bilinear, packing.texels_per_unit = 2, True, 1.0 / texel_mm
+    atlas.generate(pack_options=packing)
+    _, corners, uv = atlas[0]
+    corners_uv = np.asarray(uv, dtype=np.float64)[np.asarray(corners)]
+    height, width = int(atlas.height), int(atlas.width)
+
+    # Splat samples of the surface onto the texels that a look-up there reads.
+    faces, weights, shares = _surface_samples(outer, texel_mm / SAMPLES_PER_TEXEL)
+    texels, bilinear = bilinear_texels(np.einsum("sc,scd->sd", weights, corners_uv[faces]), (height, width))
+    carried = (bilinear * shares[:, None]).reshape(-1)
+    area = np.bincount(texels.reshape(-1), carried, height * width)
+    touched = area > 1e-9 * texel_mm**2
+    place: Array = np.einsum("sc,scd->sd", weights, outer.vertices_mm[outer.faces[faces]])
+
+    def mean(values: Array) -> Array:
+        sums = [np.bincount(texels.reshape(-1), carried * np.repeat(values[:, k], 4), height * width)[touched] for k in range(3)]
+        return np.asarray(np.stack(sums, axis=-1) / area[touched, None])
+
+    normals = mean(_normals(outer)[faces])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    points = mean(place)
+    index = np.where(touched, np.cumsum(touched) - 1, -1).reshape(height, width)
+    return StainLayout(corners_uv, index, points, np.asarray(area[touched], dtype=np.float64), _neighbours(points, normals, REACH * texel_mm))
+
+
+def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:
+    """Texels (N, 4), numbered row by row, and weights (N, 4) that a look-up at uv (N, 2) mixes; texel centres lie at half-integers, edges go on."""
+    height, width = size
+    x, y = (np.clip(uv[:, k] * n - 0.5, 0, n - 1) for k, n in ((0, width), (1, height)))
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    u, v = x - column, y - row
+    right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+    texels = np.stack([row * width + column, row * width + right, below * width + column, below * width + right], axis=-1)
+    return texels, np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=-1)
+
+
+def _surface_samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.int64], Array, Array]:
+    """Faces (S,), barycentric weights (S, 3) and areas (S,) of a lattice of points on every face, its corners included."""
+    corners = mesh.vertices_mm[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    cuts = np.maximum(np.ceil(longest / spacing_mm).astype(int), 1)
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    parts = []
+    for n in np.unique(cuts):
+        chosen = np.flatnonzero(cuts == n)
+        i, j = (index.reshape(-1) for index in np.mgrid[: n + 1, : n + 1])
+        lattice = np.stack([i, j, n - i - j], axis=-1)[i + j <= n] / n
+        count = len(lattice)
+        parts.append((np.repeat(chosen, count), np.tile(lattice, (len(chosen), 1)), np.repeat(areas[chosen] / count, count)))
+    faces, weights, shares = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return faces, weights, shares
+
+
+def _normals(mesh: Mesh) -> Array:
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+
+
+def _neighbours(points_mm: Array, normals: Array, reach_mm: float) -> NDArray[np.int64]:
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points_mm).query_pairs(reach_mm, output_type="ndarray").astype(np.int64)
+    facing = np.einsum("ec,ec->e", normals[pairs[:, 0]], normals[pairs[:, 1]]) > SAME_SIDE
+    return pairs[facing][np.lexsort(pairs[facing].T[::-1])]

@@ -1,0 +1,93 @@
+"""Gaussian priors of the fit's coordinates, in the unbounded domain: weak ones, those of the literature, and those towards other teeth.
+
+sigma and g are nearly one parameter, and a fit holds g1 at ``HELD_G``. So a measured medium counts through its reduced scattering and its absorption: the
+medium with these at that mean cosine is what a fit of it would report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from services.fit.optics.domain import similar_medium, to_dual
+from services.fit.optics.parameters import Medium
+
+HELD_G = 0.8
+LEAST_SD = {"sigma": 0.2, "alpha": 0.1}
+"""However well few teeth agree, a prior towards them is no narrower."""
+
+Priors = Mapping[str, tuple[float, float]]
+"""By parameter: mean and standard deviation in the unbounded domain; one not named has a flat prior."""
+
+_LEAVES = {
+    "g1": (to_dual("g1", 0.8), 0.35),
+    "alpha": (2.3, 1.0),
+    "beta": (to_dual("beta", 0.9), 1.0),
+    "g2": (to_dual("g2", -0.1), 0.35),
+}
+WEAK: Priors = MappingProxyType({f"{part}.{leaf}": prior for part in ("enamel", "dentin") for leaf, prior in _LEAVES.items()})
+"""g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
+SHAPE = (0.6, 0.3)
+"""Of a blend weight: those nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3 to 1."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One source's reduced scattering and absorption, per mm; absorption None where it gives none."""
+
+    tissue: str
+    wavelength_nm: float
+    sigma_s_reduced: float
+    sigma_a: float | None
+    source: str
+
+
+LITERATURE_TABLE = (
+    Measured("enamel", 633, 2.11, None, "Zijp, ten Bosch & Groenhuis 1995"),
+    Measured("enamel", 632, 0.24, 0.1, "Fried et al. 1995"),
+    Measured("enamel", 780, 0.0287, 0.1, "Hoffmann et al. 2021"),
+    Measured("enamel", 400, 0.08, 0.06, "Zoller et al. 2018"),
+    Measured("enamel", 700, 0.02, 0.02, "Zoller et al. 2018"),
+    Measured("dentin", 632, 1.96, 0.35, "Fried et al. 1995"),
+    Measured("dentin", 780, 3.77, 0.35, "Hoffmann et al. 2021"),
+    Measured("dentin", 400, 0.504, 0.2, "Zoller et al. 2018"),
+    Measured("dentin", 700, 0.245, 0.1, "Zoller et al. 2018"),
+)
+"""Where both reduced scattering and its source are known. Fried's absorption of enamel is an upper limit."""
+
+
+def towards(part: str, media: Iterable[Medium]) -> Priors:
+    """Prior around the mean of other media, as wide as they differ: teeth of the same mouth (teeth 2018, section 7), or other authors' teeth.
+
+    Args:
+        part: ``enamel`` or ``dentin``, or with a tooth's number before it.
+        media: at least one.
+    """
+    seen = [similar_medium(medium, HELD_G) for medium in media]
+    priors = {}
+    for leaf, least in LEAST_SD.items():
+        x = np.array([to_dual(leaf, getattr(medium, leaf)) for medium in seen])
+        spread = float(x.std(ddof=1)) if len(x) > 1 else 0.0
+        priors[f"{part}.{leaf}"] = (float(x.mean()), max(spread, least))
+    return priors
+
+
+def literature() -> Priors:
+    """Prior towards the table; a source without absorption takes the mean of the others', in the logarithm. Lobes keep the weak priors."""
+    priors = dict(WEAK)
+    for part in ("enamel", "dentin"):
+        rows = [row for row in LITERATURE_TABLE if row.tissue == part]
+        usual = float(np.exp(np.mean([np.log(row.sigma_a) for row in rows if row.sigma_a is not None])))
+        absorbed = [usual if row.sigma_a is None else row.sigma_a for row in rows]
+        media = [Medium(row.sigma_s_reduced + a, row.sigma_s_reduced / (row.sigma_s_reduced + a)) for row, a in zip(rows, absorbed, strict=True)]
+        priors |= towards(part, media)
+    return priors
+
+
+def priors_of(kind: Literal["weak", "literature"]) -> Priors:
+    """The priors of a job's option."""
+    return WEAK if kind == "weak" else literature()

@@ -1,0 +1,132 @@
+"""The stain stage of one channel, after its media are fitted: steps of the texture in turn with steps of the media, each a journal entry.
+
+::
+
+    images(block), seed 1 ── cotangents w C and w ref ── stain_gradient(block), seed 2, of both ── sum in block order ── step
+
+The common factor of a texture and the absorption of the media are nearly one parameter, so the first steps find the pattern up to a factor, media take that
+factor, and exact steps and media then end together.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.anatomy.stain_uv import StainLayout
+from services.fit.blocks import read_block
+from services.fit.engine_host import EngineHost
+from services.fit.journal import Journal
+from services.fit.optics.domain import similar_tissue
+from services.fit.optics.parameters import Tissue
+from services.fit.passes import BlockTask, Passes, TraceRow, compare_task, trace_row
+from services.fit.solve.normal_equations import LossChange
+from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
+from services.fit.transport.recipe import StackEstimate, StainGradient
+
+RATIO_STEPS, PATTERN_STEPS = 2, 3
+"""Before the media's first turn."""
+EXACT_STEPS = (3, 2)
+"""Before the media's second and third turn."""
+GRADIENT_G = 0.0
+"""Mean cosine of the similar media in which gradients are rendered, as Jacobians are."""
+SURE_Z = 3.0
+
+
+def stain_task(host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
+    """A block's derivatives of sum(w ref C) and of sum(w C1 C) to the texels (H, W), paths shared, and its sum of squares."""
+    start, block = time.time(), read_block(task.block)
+    view, weight = block.fitted_view, block.fit_weight
+    image: StackEstimate = host.call("images", task.recipe, task.tissue, view, samples=task.samples, seed=seeds[0])
+
+    def gradient(cotangent: NDArray[np.float64]) -> NDArray[np.float64]:
+        found: StainGradient = host.call("stain_gradient", task.recipe, similar, view, cotangent, samples=task.samples, seed=seeds[1])
+        (texels,) = found.gradient
+        assert texels is not None
+        return texels
+
+    squares = float((weight * ((image.mean - block.reference) ** 2 - image.variance)).sum())
+    return gradient(weight * block.reference), gradient(weight * image.mean), squares, trace_row("stain", task, start)
+
+
+@dataclass
+class StainStage:
+    """Fits one tooth's texture in one channel."""
+
+    passes: Passes
+    journal: Journal
+    layout: StainLayout
+    samples: int
+    """Paths per pixel of every pass."""
+    pause: Callable[[], None]
+    tell: Callable[[str, int, Tissue, str, bool], None]
+    """Told of every step: stage, step in it, tissue, what happened, and whether it is new."""
+
+    def run(self, tissue: Tissue, refit: Callable[[Tissue, int, bool], Tissue]) -> Tissue | None:
+        """Fit the texture of a tooth whose media are fitted.
+
+        Args:
+            refit: fits the media of a stained tissue: the tissue, which turn it is from 0, and whether it is the last.
+
+        Returns:
+            The tissue with its stain, or None where a clean surface explains the images as well.
+        """
+        solver = StainSolver(self.layout.neighbours, len(self.layout.points_mm))
+        state, stained = clean(solver.texels), tissue
+        for step, solve in enumerate((solver.ratio_step,) * RATIO_STEPS + (solver.pattern_step,) * PATTERN_STEPS):
+            state = self._step("stain.0", step, stained, state, solve)
+            stained = self._with(stained, state)
+        stained = refit(stained, 0, False)
+        done = 0
+        for turn, steps in enumerate(EXACT_STEPS, 1):
+            for step in range(steps):
+                state = self._step(f"stain.{turn}", step, stained, state, partial(solver.exact_step, number=done))
+                stained, done = self._with(stained, state), done + 1
+            stained = refit(stained, turn, turn == len(EXACT_STEPS))
+        return stained if self._is_better(tissue, stained, state) else None
+
+    def sums(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> StainSums:
+        """Sums over all blocks at a stained tissue."""
+        assert tissue.stain is not None
+        parts = self.passes.run(f"{self.passes.seeds.channel}-{label}", tissue, self.samples, stain_task, similar_tissue(tissue, GRADIENT_G), seeds)
+        self.passes.record([row for *_, row in parts])
+        touched, a_t = self.layout.index >= 0, tissue.stain.transmittance
+        explained, carried = (sum(((a_t * part[k])[touched] for part in parts), np.zeros(touched.sum())) for k in (0, 1))
+        return StainSums(explained, carried, sum(part[2] for part in parts))
+
+    def _step(
+        self, stage: str, step: int, tissue: Tissue, state: StainState, solve: Callable[[StainState, StainSums], StainState]
+    ) -> StainState:  # fmt: skip
+        def compute() -> dict[str, object]:
+            seeds = self.passes.seeds(stage, step, "image"), self.passes.seeds(stage, step, "gradient")
+            return solve(state, self.sums(f"{stage}-{step}", self._with(tissue, state), seeds)).record()
+
+        self.pause()
+        entry, is_new = self.journal.once(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
+        moved = StainState.of(entry)
+        size = float(np.sqrt(np.mean((moved.depth - state.depth) ** 2)))
+        self.tell(stage, step + 1, self._with(tissue, moved), f"texels moved by {size:.3f}", is_new)
+        return moved
+
+    def _with(self, tissue: Tissue, state: StainState) -> Tissue:
+        return replace(tissue, stain=self.layout.texture(state.depth))
+
+    def _is_better(self, plain: Tissue, stained: Tissue, state: StainState) -> bool:
+        # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike 1974).
+        def compute() -> dict[str, float]:
+            seeds = self.passes.seeds("stain.compare", 1), self.passes.seeds("stain.compare", 2)
+            parts = self.passes.run(f"{self.passes.seeds.channel}-stain-compare", plain, self.samples, compare_task, stained, seeds)
+            self.passes.record([row for _, row in parts])
+            total: LossChange = parts[0][0]
+            for change, _ in parts[1:]:
+                total = total + change
+            return {"change": total.change, "se": total.se}
+
+        self.pause()
+        found, _ = self.journal.once(f"{self.passes.seeds.channel}/stain.compare", compute)
+        return bool(found["change"] + int(state.seen.sum()) + SURE_Z * found["se"] < 0)

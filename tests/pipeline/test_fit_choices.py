@@ -1,0 +1,102 @@
+"""Losses, solvers and priors that a job may choose, on the fake engine whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.core.records import FitReport, JobSpec
+from services.core.stage import LocalContext, StageEvent
+from services.fit.stage import run
+from tests.support.prepared import FAKE, TRUTH, write_prepared
+
+QUANTITIES = [(part, leaf) for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "alpha_reduced")]
+
+
+def fit(root: Path, *, attempt: int = 1, listen: Any = None, **options: Any) -> FitReport:
+    values: dict[str, Any] = {
+        "capture": root, "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 8,
+        "search_candidates": 500,
+    }  # fmt: skip
+    return run(JobSpec(**(values | options)), LocalContext(root, attempt, listen), engine=FAKE)
+
+
+def scores(report: FitReport) -> list[float]:
+    """Errors of the reduced quantities in their own standard errors."""
+    table, z = report.parameters["green"], []
+    for part, leaf in QUANTITIES:
+        estimate, medium = table[f"{part}.{leaf}"], getattr(TRUTH, part)
+        assert estimate.se
+        z.append((estimate.value - getattr(medium, leaf)) / estimate.se)
+    return z
+
+
+def off(report: FitReport) -> float:
+    """Root mean square relative error of the reduced quantities."""
+    table = report.parameters["green"]
+    return float(np.sqrt(np.mean([(table[f"{part}.{leaf}"].value / getattr(getattr(TRUTH, part), leaf) - 1) ** 2 for part, leaf in QUANTITIES])))
+
+
+def require_truth(report: FitReport) -> None:
+    # One fit at one seed: 4.5 of its own standard errors, and these are small enough to mean something.
+    table = report.parameters["green"]
+    assert max(map(abs, scores(report))) < 4.5
+    assert all((table[f"{part}.{leaf}"].se or 1) < 0.1 * table[f"{part}.{leaf}"].value for part, leaf in QUANTITIES)
+
+
+@pytest.mark.parametrize("loss", ["relative_l2", "l1", "relative_l1", "robust"])
+def test_every_loss_finds_the_truth_where_the_model_holds(loss: str, tmp_path: Path) -> None:
+    # Unmodelled is the noise alone, so all losses have one minimum.
+    write_prepared(tmp_path)
+    require_truth(fit(tmp_path, loss=loss))
+
+
+def test_images_outvote_the_literature(tmp_path: Path) -> None:
+    # Dentin's true albedo lies 2.5 widths from the table's centre.
+    write_prepared(tmp_path)
+    require_truth(fit(tmp_path, prior="literature"))
+
+
+def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
+    errors = {}
+    for loss in ("l2", "robust"):
+        write_prepared(tmp_path / loss, shadowed=0.08)
+        errors[loss] = off(fit(tmp_path / loss, loss=loss))
+    assert errors["robust"] < 0.5 * errors["l2"]
+
+
+def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
+    options = {"solver": "adam", "adam_steps": 150}
+    write_prepared(tmp_path / "whole")
+    report = fit(tmp_path / "whole", **options)
+    # A constant rate of 0.05 leaves densities wandering by 3 % a step, several times that where enamel and dentin trade places.
+    assert off(report) < 0.15
+    assert report.held_out_error["green"] < 0.02
+    # Its standard errors are those of normal equations at the end.
+    assert all(report.parameters["green"][f"{part}.{leaf}"].se for part, leaf in QUANTITIES)
+    write_prepared(tmp_path / "twice")
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(event: StageEvent) -> None:
+        if event.kind == "step" and event.data["stage"] == "layered":
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        fit(tmp_path / "twice", listen=stop, **options)
+    again = fit(tmp_path / "twice", attempt=2, **options)
+    assert again.model_dump(exclude={"seconds"}) == report.model_dump(exclude={"seconds"})
+
+
+def test_weights_follow_residuals_once_a_round_and_are_kept(tmp_path: Path) -> None:
+    write_prepared(tmp_path, shadowed=0.08)
+    fit(tmp_path, loss="robust")
+    entries = json.loads((tmp_path / "fit-checkpoint" / "journal.json").read_text())["entries"]
+    rounds = [key for key in entries if key.endswith("/weights")]
+    assert rounds == ["green/exact/weights", "green/exact.1/weights", "green/exact.2/weights"]
+    assert all(Path(path).is_file() for key in rounds for path, _ in entries[key])
