@@ -14,14 +14,14 @@ from services.fit.export.mitsuba_scene import MAX_DEPTH, ROULETTE_DEPTH, SceneDi
 from services.fit.optics.parameters import Mouth
 
 SurfaceFiles = Mapping[str, Path]
-"""PLY files by the name of the surface: ``crown_11``, ``root_11`` and ``dentin_11`` by FDI number, ``gums``, ``cavity``."""
+"""PLY files by the name of the surface: ``crown_11``, ``root_11``, ``dentin_11`` and ``contact_11_12`` by FDI number, ``gums``, ``cavity``."""
 
 
 def write_mouth_surfaces(folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | None, cavity: Mesh | None) -> dict[str, Path]:
     """Write the surfaces between media, none of which overlap; what is empty has no file.
 
     Raises:
-        MeshError: two teeth overlap, or a surface cannot be cut.
+        MeshError: a tooth reaches into another one's dentin, or a surface cannot be cut.
     """
     parts = separate(teeth, gums)
     meshes = {"gums": parts.gums} | ({} if cavity is None else {"cavity": cavity})
@@ -29,6 +29,7 @@ def write_mouth_surfaces(folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | No
         meshes |= {f"crown_{tooth.fdi}": crown, f"root_{tooth.fdi}": root}
         if tooth.dentin is not None:
             meshes[f"dentin_{tooth.fdi}"] = tooth.dentin
+    meshes |= {f"contact_{teeth[i].fdi}_{teeth[j].fdi}": mesh for (i, j), mesh in parts.contacts.items()}
     files = {name: folder / f"{name}.ply" for name, mesh in meshes.items() if len(mesh.faces)}
     for name, path in files.items():
         write_mesh(path, meshes[name])
@@ -68,13 +69,15 @@ def mouth_scene(
         return _mesh(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
 
     for name, path in files.items():
-        kind, _, number_of = name.partition("_")
+        kind, _, whose = name.partition("_")
         if kind == "crown":
-            scene[name] = between(path, ior, f"enamel_{number_of}")
+            scene[name] = between(path, ior, f"enamel_{whose}")
         elif kind == "root":
-            scene[name] = between(path, ior / gums_ior, f"enamel_{number_of}", "gums")
+            scene[name] = between(path, ior / gums_ior, f"enamel_{whose}", "gums")
         elif kind == "dentin":
-            scene[name] = between(path, 1.0, f"dentin_{number_of}", f"enamel_{number_of}")
+            scene[name] = between(path, 1.0, f"dentin_{whose}", f"enamel_{whose}")
+        elif kind == "contact":
+            scene[name] = between(path, 1.0, *(f"enamel_{number}" for number in whose.split("_")))
         elif kind == "gums":
             scene[name] = between(path, gums_ior, "gums")
         else:
