@@ -24,7 +24,7 @@ class Subject:
     cavity: Mesh | None
     """Open, seen from either side."""
     whole: bool
-    """Whether gums and wall are to be fitted too; else gums are in the way, and nothing is known of the wall."""
+    """Whether gums and wall are to be fitted too; else gums are in the way."""
 
     @property
     def gums_number(self) -> int:
@@ -62,15 +62,16 @@ class Subject:
 
 
 def read_subject(root: Path, whole: bool) -> Subject:
-    """Read ``teeth/``, ``gums.ply`` and ``cavity.ply`` of a capture.
+    """Read ``teeth/``, ``gums.ply`` and, where all is to be fitted, ``cavity.ply`` of a capture.
 
     Raises:
         CaptureInputError: no tooth is there, or a file cannot be read. MeshError: a surface cannot bound a medium.
     """
-    teeth, gums, cavity = read_teeth(root), _optional(root / "gums.ply"), _optional(root / "cavity.ply")
+    teeth, gums = read_teeth(root), _optional(root / "gums.ply")
+    cavity = _optional(root / "cavity.ply") if whole else None
     if whole and gums is not None:
         gums.require_solid("gums.ply")
-    if whole and cavity is not None:
+    if cavity is not None:
         cavity.require_surface("cavity.ply")
     return Subject(teeth, gums, cavity, whole)
 

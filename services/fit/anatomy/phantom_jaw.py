@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,8 @@ from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces
 
-if TYPE_CHECKING:
-    from services.fit.transport.engine import Engine
-
+Painter = Callable[[Camera, int, int], Stack]
+"""One channel's images of a camera, given paths per pixel and a seed."""
 SCAN_DENTIN = (0.3, 0.8)
 """Range of the blend weights of a scanned tooth's dentin, whose true surface nobody has seen."""
 _DENTIN = 3
@@ -121,11 +121,13 @@ def write_jaw_phantom(
     mouths = {name: known_mouth(jaw, name, subject) for name in names}
     write_jaw_meshes(out, jaw)
 
-    stacks = _render(jaw, mouths, rig_cameras, rig_lights, boundary, renderer, samples, seed)
     entries, kept = [], held_out_lights(lights, held_out)
-    for number, camera in enumerate(rig_cameras):
-        mean, variance = (np.stack([stacks[name, number][k] for name in names], axis=-1) for k in range(2))
-        entries += write_images(out, camera, rig_lights, mean, variance, kept)
+    with TemporaryDirectory() as folder:
+        painters = _by_mitsuba(jaw, mouths, rig_lights, Path(folder)) if renderer == "mitsuba" else _by_engine(jaw, mouths, rig_lights, boundary)
+        for number, camera in enumerate(rig_cameras):
+            stacks = [paint(camera, samples, seed + 7919 * number) for paint in painters]
+            mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
+            entries += write_images(out, camera, rig_lights, mean, variance, kept)
     made = {"subject": subject, "scan": None if scan is None else scan.name, "renderer": renderer, "samples_per_pixel": samples, "seed": seed}
     write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | made)
 
@@ -167,41 +169,26 @@ def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
     return mouth if jaw.cavity is not None else replace(mouth, reflectance=None)
 
 
-def _render(
-    jaw: JawSurfaces,
-    mouths: dict[str, Mouth],
-    cameras: tuple[Camera, ...],
-    lights: tuple[Light, ...],
-    boundary: Boundary,
-    renderer: Renderer,
-    samples: int,
-    seed: int,
-) -> dict[tuple[str, int], Stack]:
-    """Images by channel and number of the camera."""
-    prepare_device()
-    if renderer == "mitsuba":
-        return _render_mitsuba(jaw, mouths, cameras, lights, samples, seed)
+def _by_engine(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], boundary: Boundary) -> list[Painter]:
     from services.fit.transport.engine import Engine
 
-    stacks = {}
-    for channel, (name, mouth) in enumerate(mouths.items()):
-        engine: Engine = Engine(jaw.recipe(lights, channel, boundary))
-        for number, camera in enumerate(cameras):
-            everything = np.ones(camera.size[::-1], dtype=bool)
-            stacks[name, number] = render_engine(engine, mouth, camera, everything, samples, seed + 7919 * number)
-    return stacks
+    def painter(channel: int, mouth: Mouth) -> Painter:
+        engine = Engine(jaw.recipe(lights, channel, boundary))
+        return lambda camera, samples, seed: render_engine(engine, mouth, camera, np.ones(camera.size[::-1], dtype=bool), samples, seed)
+
+    return [painter(channel, mouth) for channel, mouth in enumerate(mouths.values())]
 
 
-def _render_mitsuba(
-    jaw: JawSurfaces, mouths: dict[str, Mouth], cameras: tuple[Camera, ...], lights: tuple[Light, ...], samples: int, seed: int
-) -> dict[tuple[str, int], Stack]:
+def _by_mitsuba(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], folder: Path) -> list[Painter]:
     from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 
-    fdi = tuple(tooth.fdi for tooth in jaw.teeth)
-    with TemporaryDirectory() as folder:
-        files, stacks = write_mouth_surfaces(Path(folder), jaw.teeth, jaw.gums, jaw.cavity), {}
-        for channel, (name, mouth) in enumerate(mouths.items()):
-            for number, camera in enumerate(cameras):
-                scene = mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0)
-                stacks[name, number] = render_mitsuba(scene, lights, channel, samples, seed + 7919 * number)
-    return stacks
+    prepare_device()
+    files, fdi = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.cavity), tuple(tooth.fdi for tooth in jaw.teeth)
+
+    def painter(channel: int, mouth: Mouth) -> Painter:
+        def paint(camera: Camera, samples: int, seed: int) -> Stack:
+            return render_mitsuba(mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, channel, samples, seed)
+
+        return paint
+
+    return [painter(channel, mouth) for channel, mouth in enumerate(mouths.values())]
