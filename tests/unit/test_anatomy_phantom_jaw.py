@@ -18,7 +18,7 @@ from services.core.store import read_record
 from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.anatomy.jaw_optics import COSINE_SPREAD, SIGMA_SPREAD, gums_medium, jaw_mouth
 from services.fit.anatomy.phantom import TRUE_TISSUE
-from services.fit.anatomy.phantom_files import held_out_lights
+from services.fit.anatomy.phantom_files import Renderer, held_out_lights
 from services.fit.anatomy.phantom_jaw import SCAN_DENTIN, write_jaw_phantom
 from services.fit.optics.parameters import Medium
 from tests.support.labelled_scan import bumps, universal, write_vtp
@@ -78,9 +78,10 @@ def test_a_scanned_jaw_is_the_same_by_both_renderers(tmp_path: Path) -> None:
     scan = bumps({11: (-4.5, 0.0), 21: (4.5, 0.0)})
     write_vtp(tmp_path / "scan.vtp", scan.mesh, universal(scan.fdi))
     brightness, noise = [], []
-    for renderer in ("engine", "mitsuba"):
+    renderers: tuple[Renderer, ...] = ("engine", "mitsuba")
+    for renderer in renderers:
         out = tmp_path / renderer
-        write_jaw_phantom(out, subject=3, scan=tmp_path / "scan.vtp", pixel_mm=1.5, cameras=1, lights=2, samples=1024, renderer=renderer)  # type: ignore[arg-type]
+        write_jaw_phantom(out, subject=3, scan=tmp_path / "scan.vtp", pixel_mm=1.5, cameras=1, lights=2, samples=1024, renderer=renderer)
         images = read_record(out / "capture.json", FolderCapture).images
         brightness.append([np.load(out / entry.file).astype(float).sum() for entry in images])
         noise.append([np.load(out / str(entry.variance_file)).astype(float).sum() for entry in images])
