@@ -80,7 +80,7 @@ class RigSpec(Record):
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
-    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with gums and the wall of the mouth")
+    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with their gums and the wall behind")
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")

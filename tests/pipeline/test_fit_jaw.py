@@ -14,7 +14,7 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.jaw_schedule import TIED_SD
-from services.fit.stage import export, run
+from services.fit.stage import ENGINE, export, run
 from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
 
 FAKE = "tests.support.fake_mouth:FakeMouthEngine"
@@ -128,6 +128,26 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(finished: tuple[P
     events: list[StageEvent] = []
     assert without_time(fit(tmp_path, attempt=3, events=events)) == without_time(report)
     assert min(e.data["step"] for e in events if e.kind == "step") == joint + 1
+
+
+def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
+    # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
+    write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
+    spec = jaw_spec(tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=6, search_candidates=1600)
+    report = run(spec, LocalContext(tmp_path))
+    found = {name: report.parameters["green"][name] for name in ("gums.sigma_s_reduced", "gums.alpha_reduced", "cavity.reflectance")}
+    truth = {"gums.sigma_s_reduced": TRUE_GUMS.sigma_s_reduced, "gums.alpha_reduced": TRUE_GUMS.alpha_reduced, "cavity.reflectance": TRUE_REFLECTANCE}
+    for fdi in ("11", "12"):
+        for leaf in ("sigma_s_reduced", "alpha_reduced"):
+            found[f"{fdi}.{leaf}"] = report.teeth[fdi].parameters["green"][f"enamel.{leaf}"]
+            truth[f"{fdi}.{leaf}"] = getattr(TRUE_TEETH[int(fdi)].enamel, leaf)
+    for name, estimate in found.items():
+        assert estimate.determined, (name, estimate)
+        assert estimate.se is not None
+        # One fit at one seed: 4.5 of its own standard errors, which are small enough to mean something.
+        assert abs(estimate.value - truth[name]) < 4.5 * estimate.se, (name, truth[name], estimate)
+        assert estimate.se < 0.15 * estimate.value, (name, estimate)
+    assert report.held_out_error["green"] < 0.05
 
 
 @pytest.mark.parametrize(
