@@ -137,7 +137,7 @@ class CaptureManifest(Record):
 
 
 class PreparedManifest(Record):
-    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid; and ``teeth/``."""
+    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid, surface; and ``teeth/``."""
 
     channels: tuple[str, ...]
     cameras: tuple[Camera, ...]
@@ -145,6 +145,9 @@ class PreparedManifest(Record):
     held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
     fdi: tuple[int, ...]
     dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
+    gums: bool = Field(default=False, description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there")
+    cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
+    tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
     valid_fraction: float
 
