@@ -111,7 +111,9 @@ def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpe
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":
-        return tuple(fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth)
+        fitted = [fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth]
+        layered = {fdi for fdi, tooth in report.teeth.items() if all("dentin.sigma" in table for table in tooth.parameters.values())}
+        return tuple(tooth if str(tooth.fdi) in layered else replace(tooth, dentin=None) for tooth in fitted)
     (tooth,) = teeth
     dentin = dentin_shape(tooth, prepared.cameras, spec)
     return (replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(report.shape), dentin.base.faces)),)

@@ -15,6 +15,7 @@ from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.jaw_schedule import TIED_SD
 from services.fit.stage import ENGINE, export, run
+from services.fit.transport.platform import prepare_device
 from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
 
 FAKE = "tests.support.fake_mouth:FakeMouthEngine"
@@ -104,6 +105,14 @@ def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEve
     assert parameters["12.dentin.sigma"] == report.teeth["12"].parameters["green"]["dentin.sigma"].model_dump()
     assert {"gums.sigma", "cavity.reflectance"} <= parameters.keys()
     assert json.loads((root / "errors.json").read_text())["teeth"]["21"]["state"] == "failed"
+    prepare_device()
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono")
+    scene = mi.load_file(str(root / "asset" / "scene_green.xml"), optimize=False)
+    image = np.array(mi.render(scene, sensor=0, spp=16))
+    assert np.isfinite(image).all()
+    assert image.mean() > 0
     page = (root / "report.html").read_text()
     assert "Jaw of 4 teeth" in page
     assert report.teeth[FAILED].sentence in page

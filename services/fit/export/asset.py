@@ -4,7 +4,8 @@
 
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
-    gums.ply, cavity.ply       of a jaw; gums hold the roots, so they are in no scene: stock media cannot overlap
+    gums.ply, cavity.ply       of a jaw
+    surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
     errors.json                fitted and held-out image error, of a jaw's teeth too
@@ -22,8 +23,9 @@ from services.core.meshfiles import write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
 from services.fit.export.mitsuba_scene import nested_scene
+from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.export.scene_xml import SceneParameter, write_scene
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
 
@@ -49,7 +51,7 @@ def write_asset(
         gums, cavity: of a jaw.
 
     Raises:
-        CaptureInputError: a camera that Mitsuba cannot render.
+        CaptureInputError: a camera that Mitsuba cannot render. MeshError: surfaces of a jaw that cannot be cut along each other.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
@@ -62,15 +64,20 @@ def write_asset(
     for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
         if mesh is not None:
             write_mesh(folder / name, mesh)
+    cut = write_mouth_surfaces(folder / "surfaces", teeth, gums, cavity) if report.teeth else {}
+    surfaces = {name: path.relative_to(folder) for name, path in cut.items()}
 
     first = lights[0]
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
-        table = report.parameters[channel]
-        tissue = {fdi: tissue_of(tooth.parameters[channel]) for fdi, tooth in report.teeth.items()} or tissue_of(table)
-        wall = None if cavity is None else (Path("cavity.ply"), table["cavity.reflectance"].value)
-        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), wall=wall)
+        samples = SceneParameter("spp", 256)
+        if report.teeth:
+            numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
+            scene = mouth_scene(surfaces, numbers, mouth, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples)
+        else:
+            tissue = tissue_of(report.parameters[channel])
+            scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples)
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {
@@ -90,11 +97,20 @@ def write_asset(
 
 def tissue_of(table: dict[str, Estimate]) -> Tissue:
     """The tissue that a table of estimates describes; a part that was not modelled is empty."""
-    parts = {}
-    for part in ("enamel", "dentin"):
-        values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
-        parts[part] = Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
-    return Tissue(parts["enamel"], parts["dentin"])
+    return Tissue(_medium_of(table, "enamel"), _medium_of(table, "dentin"))
+
+
+def mouth_of(report: FitReport, channel: str) -> Mouth:
+    """The mouth that a jaw's report describes, teeth in its order."""
+    table = report.parameters[channel]
+    gums = _medium_of(table, "gums") if "gums.sigma" in table else None
+    reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
+    return Mouth(tuple(tissue_of(tooth.parameters[channel]) for tooth in report.teeth.values()), gums, reflectance)
+
+
+def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
+    values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
+    return Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
 
 
 def parameters_json(report: FitReport) -> dict[str, Any]:

@@ -18,6 +18,7 @@ TAGS = {
     "null": "bsdf",
     "thin_boundary": "bsdf",
     "diffuse": "bsdf",
+    "uniform": "spectrum",
     "twosided": "bsdf",
     "homogeneous": "medium",
     "hg": "phase",
