@@ -24,7 +24,7 @@ from services.fit.passes import Passes, TraceRow
 from services.fit.pictures import shown_images, write_pictures, write_preview
 from services.fit.schedule import ChannelFit, ChannelSchedule, StepReport
 from services.fit.seeds import Seeds
-from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
+from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.transport.recipe import DentinShape
 
 CHECKPOINT = "fit-checkpoint"
@@ -113,7 +113,7 @@ class FitDriver:
         write_atomic(folder / "trace.json", _json([asdict(row) for row in self.trace]))
         write_pictures(folder, {c: fit.evaluation for c, fit in fits.items()}, observations.manifest, views)
 
-        known = {c: uncertainty(fit.domain, fit.solution.x, fit.equations) for c, fit in fits.items()}
+        known = {c: fit.known for c, fit in fits.items()}
         tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
         off = {c: max(fit.fit_error, fit.held_out_error or 0.0) for c, fit in fits.items()}

@@ -25,8 +25,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from services.core.records import JobSpec
+from services.fit.closing import measure_closing
 from services.fit.evaluate import Evaluation, evaluate
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles
@@ -34,7 +38,9 @@ from services.fit.optics.domain import Coordinate, Domain, similar_medium, simil
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.passes import Passes, StackProblem, orders_task
 from services.fit.solve import table_search
-from services.fit.solve.gauss_newton import GaussNewton, Options, Solution, State, state_from, state_record
+from services.fit.solve.closing import ClosingSums
+from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
+from services.fit.solve.gauss_newton import GaussNewton, Options, Result, Solution, State, state_from, state_record
 from services.fit.solve.normal_equations import NormalEquations
 
 PRIORS = {
@@ -86,6 +92,7 @@ class ChannelFit:
     domain: Domain
     solution: Solution
     equations: NormalEquations
+    known: Uncertainty
     fit_error: float
     held_out_error: float | None
     steps: int
@@ -220,9 +227,32 @@ class ChannelSchedule:
             self.pause()
             stored, _ = self.journal.once(f"{self.files.channel}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
             equations = NormalEquations.of(stored)
+        problem, solution, known = self._close(problem, solution, equations, samples)
         evaluation = self._evaluate("final", problem.base, self.spec.max_samples_per_pixel)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
-        return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
+        return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation)
+
+    def _close(self, problem: StackProblem, solution: Solution, equations: NormalEquations, samples: int) -> tuple[StackProblem, Solution, Uncertainty]:
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.
+        domain, x = problem.domain, solution.x
+        if problem.jacobian_g is None or solution.result is Result.STALLED:
+            return problem, solution, uncertainty(domain, x, equations)
+        known = whitening(domain, equations)
+        held = {part: PRIORS["g1"] for part in (("enamel", "dentin") if self.has_dentin else ("enamel",)) if f"{part}.g1" not in domain.parameters}
+
+        def compute() -> dict[str, Any]:
+            sums = measure_closing(problem, x, known.transform, held, samples)
+            step = closing_step(domain, x, equations, sums)
+            mean, precision = domain.prior
+            compared = problem.compare(x, x + step, samples=samples, step=0, trial=0)
+            change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+            return {"sums": sums.record(), "step": (0.0 * step if change > Options().sure_z * compared.se else step).tolist()}
+
+        self.pause()
+        entry, _ = self.journal.once(f"{self.files.channel}/closing", compute)
+        step = np.array(entry["step"])
+        measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
+        return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
     def _evaluate(self, label: str, tissue: Tissue, samples: int) -> Evaluation:
         passes = replace(self.passes, blocks=self.files.evaluation_blocks, recipe=self.files.evaluation_recipe)

@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--truths", type=int, default=1)
     parser.add_argument("--paths", type=int, default=65536, help="of the truth, per pixel")
-    parser.add_argument("--pixels", type=int, default=8, help="of a camera's side")
+    parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--max-samples", type=int, default=512)

@@ -73,9 +73,9 @@ class RenderedTooth:
         )
 
 
-def rendered_tooth(tissue: Tissue, *, samples: int, seed: int, pixels: int = 8, directions: tuple[tuple[float, float, float], ...] | None = None) -> RenderedTooth:
-    """Render a tissue with so many paths per pixel, cameras of ``pixels`` x ``pixels`` from the given directions."""
-    directions = directions or ((0.2, 1.0, 0.1), (-1.0, 0.3, 0.2))
+def rendered_tooth(tissue: Tissue, *, samples: int, seed: int, pixels: int = 10, views: int = 1) -> RenderedTooth:
+    """Render a tissue with so many paths per pixel and one or two cameras of ``pixels`` x ``pixels``."""
+    directions = ((0.2, 1.0, 0.1), (-1.0, 0.3, 0.2))[:views]
     cameras = tuple(camera_at(d, pixels).model_copy(update={"name": f"c{k}"}) for k, d in enumerate(directions))
     base = ellipsoid(SEMI_AXES_MM - ENAMEL_MM)
     dentin = DentinShape(base, np.zeros((0, len(base.vertices_mm), 3)))
