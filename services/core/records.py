@@ -95,6 +95,7 @@ class JobSpec(Record):
     max_samples_per_pixel: int = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
     max_steps: int = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
     search_candidates: int = Field(default=50_000, ge=100, description="table-search points per channel")
+    advise: bool = Field(default=True, description="say at the end which further light or view would help most")
     sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
     workers: int = Field(default=2, ge=1, le=1024, description="processes of a local run")
@@ -156,6 +157,13 @@ class Estimate(Record):
     determined: bool = Field(description="whether the data fixes this number")
 
 
+class Correlation(Record):
+    """How errors go together, between -1 and 1."""
+
+    names: tuple[str, ...] = Field(description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)")
+    matrix: tuple[tuple[float, ...], ...]
+
+
 class FitReport(Record):
     """Published by the fit stage, and as parameters.json and errors.json by export."""
 
@@ -166,6 +174,9 @@ class FitReport(Record):
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
+    correlations: dict[str, Correlation] = Field(default={}, description="per channel: correlation of the fitted coordinates")
+    told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
+    next_capture: str = Field(default="", description="in plain words, which further light or view would help most; empty where none was looked for")
     seconds: float
 
 

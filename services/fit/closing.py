@@ -90,5 +90,7 @@ def closing_task(
 
 
 def _with_cosine(tissue: Tissue, part: str, dual: float) -> Tissue:
-    medium = similar_medium(tissue.enamel if part == "enamel" else tissue.dentin, to_natural("g1", dual))
-    return replace(tissue, **{part: medium})
+    cosine = to_natural("g1", dual)
+    if part == "enamel":
+        return replace(tissue, enamel=similar_medium(tissue.enamel, cosine))
+    return replace(tissue, dentin=similar_medium(tissue.dentin, cosine))

@@ -18,6 +18,7 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
+from services.fit.identifiability import correlation, told
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, read_channel, read_observations, write_channel
 from services.fit.passes import Passes, TraceRow
@@ -64,7 +65,7 @@ class FitDriver:
         modes = len(dentin.modes_mm) if dentin is not None else 0
         order = sorted(channels, key=lambda c: -files[c].quality)
         fits: dict[str, ChannelFit] = {}
-        shape: tuple[float, ...] = ()
+        shape, next_capture = tuple[float, ...](), ""
         prefix = hashlib.sha256(f"{journal.path}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[:12]
         with executor(self.engine, prefix) as run_on:
             for number, channel in enumerate(order):
@@ -73,7 +74,10 @@ class FitDriver:
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
-        return self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+                if spec.advise and number == 0:
+                    next_capture = schedule.next_capture(fits[channel], folder / "inputs")
+        report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+        return report.model_copy(update={"next_capture": next_capture})
 
     def _schedule(
         self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]
@@ -127,6 +131,8 @@ class FitDriver:
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
             steps=sum(fit.steps for fit in fits.values()),
             shape=fits[first].tissue.shape,
+            correlations=(correlations := {c: correlation(known[c]) for c in fits}),
+            told=told(tables, correlations),
             seconds=seconds,
         )
 

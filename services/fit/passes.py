@@ -120,8 +120,8 @@ def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual)
     """Multiply where the Jacobian lies."""
     start, block = time.time(), read_block(jacobian.task.block)
     j1, j2 = jacobian.derivatives(host)
-    measured = (a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight))
-    equations = normal_equations(j1, j2, *measured, lights=len(block.reference))
+    r1, r2, variance, weight = (a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight))
+    equations = normal_equations(j1, j2, r1, r2, variance, weight, lights=len(block.reference))
     return Products(equations, (residual.trace, jacobian.trace, trace_row("products", jacobian.task, start)))
 
 

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from services.core.records import JobSpec
 from services.fit.closing import measure_closing
 from services.fit.evaluate import Evaluation, evaluate
 from services.fit.journal import Journal
+from services.fit.next_capture import Sensor, advice
 from services.fit.observations import ChannelFiles
 from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
 from services.fit.optics.parameters import Medium, Tissue
@@ -97,6 +99,10 @@ class ChannelFit:
     held_out_error: float | None
     steps: int
     evaluation: Evaluation
+    problem: StackProblem
+    """At the solution."""
+    samples: int
+    """Paths per pixel of the last measurement."""
 
 
 @dataclass
@@ -141,6 +147,14 @@ class ChannelSchedule:
             problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, EXACT_SAMPLES * samples))
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
+
+    def next_capture(self, fit: ChannelFit, folder: Path) -> str:
+        """The light or view that would help this channel most, in one sentence."""
+        self.pause()
+        sensor, parts = Sensor(self.spec.sensor_noise_relative, self.spec.sensor_noise_floor), ("enamel", "dentin") if self.has_dentin else ("enamel",)
+        given = folder, parts, sensor, self.files.weight, fit.samples, self.spec.pixel_step
+        found, _ = self.journal.once(f"{self.files.channel}/next-capture", lambda: advice(fit.problem, fit.known, *given)[0])
+        return str(found)
 
     def _homogeneous_start(self) -> Tissue:
         # The table's best point, seen as a medium of the mean cosine that is held.
@@ -230,7 +244,7 @@ class ChannelSchedule:
         problem, solution, known = self._close(problem, solution, equations, samples)
         evaluation = self._evaluate("final", problem.base, self.spec.max_samples_per_pixel)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
-        return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation)
+        return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation, problem, samples)
 
     def _close(self, problem: StackProblem, solution: Solution, equations: NormalEquations, samples: int) -> tuple[StackProblem, Solution, Uncertainty]:
         # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.

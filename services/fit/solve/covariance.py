@@ -50,6 +50,17 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
 
 
 @dataclass(frozen=True)
+class Sandwich:
+    """Cov(x) = T M^-1 meat M^-T T', each (F, F)."""
+
+    transform: Array
+    inverse: Array
+    meat: Array
+    misfit: float
+    """Factor s by which residuals exceed the measurements' noise."""
+
+
+@dataclass(frozen=True)
 class Uncertainty:
     """Covariance (F, F) of x, and the scaled directions (F, K) that the data leave open."""
 
@@ -59,6 +70,8 @@ class Uncertainty:
     open_directions: Array
     posterior: Array
     """(J'WJ + Lambda)^-1, (F, F)."""
+    sandwich: Sandwich | None = None
+    """What the covariance is made of, but for r r'."""
 
     def standard_error(self, slope: Array) -> float:
         """One standard error of a quantity with gradient ``slope`` (F,) to x."""
@@ -113,7 +126,7 @@ class Pooled:
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
     # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise.
-    carried = np.linalg.solve(t, equations.carried + np.zeros(len(t)))
+    carried: Array = np.linalg.solve(t, equations.carried + np.zeros(len(t)))
     known, known_noise = t.T @ equations.gradient + solved.excess @ carried, t.T @ equations.gradient_noise @ t
     first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
     share = first / (first + second)
@@ -160,7 +173,7 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: Clos
     rest = t @ inverse @ left / domain.scale
     rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
     covariance = t @ inverse @ meat @ inverse.T @ t.T + np.outer(rest, rest)
-    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T)
+    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, Sandwich(t, inverse, meat, misfit))
 
 
 def estimates(tissue: Tissue, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:
