@@ -108,14 +108,14 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
     parser.add_argument("--samples", type=int, default=32)
-    parser.add_argument("--max-samples", type=int, default=512)
-    parser.add_argument("--max-steps", type=int, default=15)
+    parser.add_argument("--max-samples", type=int, default=256)
+    parser.add_argument("--max-steps", type=int, default=8)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     prepare_device(arguments.threads)
     options: dict[str, object] = {
-        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000,
+        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000, "advise": False,
     }  # fmt: skip
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})

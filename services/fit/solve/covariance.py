@@ -126,7 +126,7 @@ class Pooled:
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
     # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise.
-    carried: Array = np.linalg.solve(t, equations.carried + np.zeros(len(t)))
+    carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
     known, known_noise = t.T @ equations.gradient + solved.excess @ carried, t.T @ equations.gradient_noise @ t
     first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
     share = first / (first + second)
