@@ -185,4 +185,5 @@ class AssetManifest(Record):
 
     files: tuple[str, ...]
     held_out_error: float = Field(description="mean over channels")
+    converged: bool = Field(default=True, description="whether the fit behind it did")
     centre_mm: Vector3 = (0.0, 0.0, 0.0)

@@ -77,7 +77,8 @@ class FitDriver:
                 if spec.advise and number == 0:
                     next_capture = schedule.next_capture(fits[channel], folder / "inputs")
         report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
-        return report.model_copy(update={"next_capture": next_capture})
+        where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
+        return report.model_copy(update={"next_capture": where + next_capture})
 
     def _schedule(
         self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]

@@ -55,7 +55,7 @@ def _is_told(estimate: Estimate) -> bool:
 def _sentence(seen: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool) -> str:
     def values(name: str, what: str) -> str:
         found = [(channel, tables[channel][name]) for channel in channels]
-        texts = [("" if alone else f"{channel} ") + (_value(e) if what == "value" else _limits(e)) for channel, e in found]
+        texts = [("" if len(found) == 1 else f"{channel} ") + (_value(e) if what == "value" else _limits(e)) for channel, e in found]
         return ", ".join(texts)
 
     opening = "This capture" if alone else f"In {_listed(channels)} this capture"

@@ -57,7 +57,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         StoreError: fit or prepared stage missing or damaged.
     """
     from services.core.records import PreparedManifest
-    from services.fit.export.asset import write_asset
+    from services.fit.export.asset import errors_json, write_asset
     from services.fit.export.report import write_report
     from services.fit.pictures import read_pictures
 
@@ -77,14 +77,14 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     history = json.loads((fit_folder / "history.json").read_text())
     facts = {"title": f"Tooth {tooth.fdi}", "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
     write_report(context.root / "report.html", report, read_pictures(fit_folder, channels, tooth, prepared.cameras), history, facts)
-    errors = {"fit_error": report.fit_error, "held_out_error": report.held_out_error, "unit": "1", "converged": report.converged, "advice": report.advice}
     parameters = {channel: {name: e.model_dump() for name, e in table.items()} for channel, table in report.parameters.items()}
     write_atomic(context.root / "parameters.json", _json(parameters))
-    write_atomic(context.root / "errors.json", _json(errors))
+    write_atomic(context.root / "errors.json", _json(errors_json(report)))
 
     held_out = list((report.held_out_error or report.fit_error).values())
     centre = (tooth.outer.vertices_mm.min(axis=0) + tooth.outer.vertices_mm.max(axis=0)) / 2
-    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), centre_mm=(float(centre[0]), float(centre[1]), float(centre[2])))
+    place = float(centre[0]), float(centre[1]), float(centre[2])
+    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), converged=report.converged, centre_mm=place)
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
     context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))

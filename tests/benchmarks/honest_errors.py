@@ -115,7 +115,8 @@ def main() -> None:
     arguments = parser.parse_args()
     prepare_device(arguments.threads)
     options: dict[str, object] = {
-        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000, "advise": False,
+        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000,
+        "advise": False,
     }  # fmt: skip
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})
