@@ -2,10 +2,12 @@
 
 python -m tests.benchmarks.honest_errors --fits 100 --out honest_errors.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --out honest_errors_drawn.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --out honest_errors_formula.json
 
 Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
 six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits
-hold; with more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
+hold; with more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too. ``--formula``
+puts a formula in place of light transport, in which similar media are not alike either: seconds per fit, and errors of the solver alone.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -24,12 +28,15 @@ from services.core.stage import LocalContext
 from services.fit.optics.domain import to_natural
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.schedule import PRIORS
-from services.fit.stage import run
+from services.fit.stage import ENGINE, run
 from services.fit.transport.platform import prepare_device
-from tests.support.rendered_capture import RenderedTooth, rendered_tooth
+from tests.support.fake_engine import DirectFakeEngine
+from tests.support.prepared import write_prepared
+from tests.support.rendered_capture import rendered_tooth
 
 CENTRE = {"enamel": (0.9, 0.01), "dentin": (2.4, 0.03)}
 """Reduced scattering and absorption, per mm."""
+FORMULA = "tests.support.fake_engine:DirectFakeEngine"
 LEAVES = ("sigma_s_reduced", "alpha_reduced")
 INTERVAL = 1.959964
 
@@ -50,13 +57,31 @@ def drawn_tissue(rng: np.random.Generator) -> Tissue:
     return tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part in CENTRE})
 
 
-def fit_rows(tooth: RenderedTooth, truth: Tissue, seed: int, options: dict[str, object]) -> Iterator[dict[str, object]]:
+class Subject(Protocol):
+    """What can be photographed."""
+
+    def photograph(self, root: Path, seed: int) -> None:
+        """Publish ``prepared`` in ``root`` with the sensor's noise drawn anew."""
+
+
+@dataclass(frozen=True)
+class FormulaTooth:
+    """Images by the formula of ``DirectFakeEngine``."""
+
+    truth: Tissue
+
+    def photograph(self, root: Path, seed: int) -> None:
+        """See Subject."""
+        write_prepared(root, truth=self.truth, seed=seed, engine=DirectFakeEngine)
+
+
+def fit_rows(tooth: Subject, truth: Tissue, seed: int, options: dict[str, object], engine: str = ENGINE) -> Iterator[dict[str, object]]:
     """One fit's quantities with what they should be."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         tooth.photograph(root, seed)
         spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "known", "seed": seed, **options})
-        report = run(spec, LocalContext(root))
+        report = run(spec, LocalContext(root), engine=engine)
         last = json.loads((root / "fit" / "history.json").read_text())[-1]
     for part in CENTRE:
         for leaf in LEAVES:
@@ -104,6 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--truths", type=int, default=1)
+    parser.add_argument("--formula", action="store_true", help="a formula in place of light transport")
     parser.add_argument("--paths", type=int, default=65536, help="of the truth, per pixel")
     parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
@@ -121,13 +147,14 @@ def main() -> None:
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})
     truths = [held] if arguments.truths == 1 else [drawn_tissue(rng) for _ in range(arguments.truths)]
-    teeth: dict[int, RenderedTooth] = {}
+    teeth: dict[int, Subject] = {}
     for number in range(arguments.first, arguments.first + arguments.fits):
         which = number % len(truths)
         if which not in teeth:
-            teeth[which] = rendered_tooth(truths[which], samples=arguments.paths, seed=770_000 + which, pixels=arguments.pixels)
+            rendered = dict(samples=arguments.paths, seed=770_000 + which, pixels=arguments.pixels)
+            teeth[which] = FormulaTooth(truths[which]) if arguments.formula else rendered_tooth(truths[which], **rendered)
         began_s = time.process_time()
-        fresh = list(fit_rows(teeth[which], truths[which], number, options))
+        fresh = list(fit_rows(teeth[which], truths[which], number, options, FORMULA if arguments.formula else ENGINE))
         rows += fresh
         print(number, f"{time.process_time() - began_s:.1f} s", fresh[0]["verdict"], [f"{row['z']:+.1f}" for row in fresh], flush=True)
         arguments.out.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
