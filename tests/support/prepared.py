@@ -47,10 +47,12 @@ def write_prepared(
     dark: bool = False,
     uneven: float = 0.0,
     seed: int = 5,
+    engine: type[FakeEngine] = FakeEngine,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
     Args:
+        engine: whose formula the photographs follow.
         uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
     """
     writer = StageWriter(root, "prepared", 1)
@@ -68,7 +70,7 @@ def write_prepared(
     dentin = DentinShape(sphere(3.0), np.zeros((len(truth.shape), 1, 3)))
     recipe = single_tooth(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
     for c, one in enumerate(cameras):
-        image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
+        image = engine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
         image[::2] *= 1 + uneven
         spread = np.maximum(noise * image, 1e-4)

@@ -8,7 +8,8 @@
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
-    errors.json                fitted and held-out image error, of a jaw's teeth too
+    errors.json                fitted and held-out image error, whether the fit converged, correlations, what the capture tells; of a jaw's teeth too
+    NOT-CONVERGED.txt          only where it did not: what to do
     render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for boundary thin
 """
 
@@ -28,6 +29,8 @@ from services.fit.export.scene_xml import SceneParameter, write_scene
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
+NOT_CONVERGED = "NOT-CONVERGED.txt"
+"""Lies in the asset of a fit that did not converge, with what to do about it."""
 
 
 def write_asset(
@@ -90,6 +93,8 @@ def write_asset(
     _write_json(folder / "rig.json", rig)
     _write_json(folder / "parameters.json", parameters_json(report))
     _write_json(folder / "errors.json", errors_json(report))
+    if not report.converged:
+        write_atomic(folder / NOT_CONVERGED, f"The fit did not converge. {report.advice}\n".encode())
     for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
         write_atomic(folder / name, (SHIPPED / name).read_bytes())
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
@@ -130,6 +135,9 @@ def errors_json(report: FitReport) -> dict[str, Any]:
         "held_out_error": report.held_out_error,
         "converged": report.converged,
         "advice": report.advice,
+        "told": report.told,
+        "next_capture": report.next_capture,
+        "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},
     }
     teeth = {fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"}) for fdi, tooth in report.teeth.items()}
     return errors | ({"teeth": teeth} if teeth else {})
