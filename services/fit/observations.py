@@ -103,6 +103,8 @@ class ChannelFiles:
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
     evaluation_recipe: StoredFile
+    weight: float
+    """Mean weight of a fitted measurement."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
 
@@ -277,6 +279,7 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
         full=level(None),
         search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
         evaluation_recipe=recipe(seen),
+        weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),
     )
 
