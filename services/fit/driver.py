@@ -90,7 +90,8 @@ class FitDriver:
         passes = Passes(run_on, files.blocks, files.recipe, seeds, self.trace.extend)
 
         def tell(step: StepReport, evaluation: Evaluation) -> None:
-            expected = self.spec.max_steps + 10
+            media = 2 * self.spec.adam_steps if self.spec.solver == "adam" else self.spec.max_steps + 10
+            expected = 2 * media if self.spec.stains else media
             done = (place[0] + min(step.step / expected, 0.99)) / place[1]
             data = asdict(step)
             message = f"{step.channel} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
