@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import IntFlag
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -78,15 +79,22 @@ class RigSpec(Record):
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
 
+HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)})
+"""Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
+
+
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
-    kind: Literal["tooth"] = Field(default="tooth", description="what is fitted")
+    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with gums and the wall of the mouth")
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
-    dentin: Literal["known", "fit", "none"] = Field(default="fit", description="dentin surface: given by the capture, fitted as blend shape, or absent")
+    dentin: Literal["known", "fit", "none"] = Field(
+        default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
+    )
+    held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
     loss: Loss = Field(default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders")
     solver: Literal["gauss-newton", "adam"] = Field(default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples")
     adam_steps: int = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
@@ -113,6 +121,13 @@ class JobSpec(Record):
             raise ValueError("give exactly one of 'capture' (a folder) and '[rig]'")
         if self.max_samples_per_pixel < self.samples_per_pixel:
             raise ValueError("max_samples_per_pixel must be at least samples_per_pixel")
+        for name, value in self.held.items():
+            part, _, leaf = name.partition(".")
+            if part not in {"enamel", "dentin"} or leaf not in HELD_RANGES:
+                raise ValueError(f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as enamel.sigma")
+            low, high = HELD_RANGES[leaf]
+            if not low < value < high:
+                raise ValueError(f"held {name} = {value:g} must lie between {low:g} and {high:g}")
         return self
 
 
@@ -142,7 +157,7 @@ class CaptureManifest(Record):
 
 
 class PreparedManifest(Record):
-    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid; and ``teeth/``."""
+    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid, surface; and ``teeth/``."""
 
     channels: tuple[str, ...]
     cameras: tuple[Camera, ...]
@@ -150,6 +165,9 @@ class PreparedManifest(Record):
     held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
     fdi: tuple[int, ...]
     dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
+    gums: bool = Field(default=False, description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there")
+    cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
+    tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
     valid_fraction: float
 
@@ -163,6 +181,17 @@ class Estimate(Record):
     determined: bool = Field(description="whether the data fixes this number")
 
 
+class ToothReport(Record):
+    """One tooth of a jaw."""
+
+    state: Literal["fitted", "tied", "failed"] = Field(description="from its own pixels; held near other teeth for lack of them; or its own fit raised")
+    sentence: str = Field(description="why it is tied or failed, or what is wrong with it; may be empty")
+    pixels: int = Field(description="pixels that show it and enter the fit, over all views")
+    parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
+    fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
+    held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
+
+
 class FitReport(Record):
     """Published by the fit stage, and as parameters.json and errors.json by export."""
 
@@ -173,6 +202,7 @@ class FitReport(Record):
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
+    teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
     seconds: float
 
 

@@ -47,6 +47,24 @@ class StoredFile:
             return dict(arrays)
 
 
+GUMS, CAVITY = -1, -2
+"""What else than a tooth a pixel may show."""
+
+
+@dataclass(frozen=True)
+class PixelParts:
+    """What the pixels of a jaw show; arrays (N,)."""
+
+    shown: NDArray[np.int16]
+    """Position of the tooth among the scene's, or GUMS or CAVITY."""
+    tooth: NDArray[np.int16]
+    """Position of the nearest tooth: the one that is shown, if any is."""
+
+    def of(self, pixels: NDArray[Any]) -> PixelParts:
+        """Those of some pixels, by index or mask."""
+        return PixelParts(self.shown[pixels], self.tooth[pixels])
+
+
 @dataclass(frozen=True)
 class Block:
     """Measurements of some pixels of one view; arrays over (light, pixel) are (L, N)."""
@@ -58,6 +76,8 @@ class Block:
     """Weight in the fitted loss, 1/variance units; 0 where masked or held out."""
     held_out: NDArray[np.bool_]
     """Valid and kept from the fit."""
+    parts: PixelParts | None = None
+    """None where the scene is one tooth."""
 
     @property
     def fitted_view(self) -> View:
@@ -76,6 +96,7 @@ def pixels_per_block(lights: int) -> int:
 
 def write_block(folder: Path, block: Block) -> StoredFile:
     """Store a block in ``folder``."""
+    parts = {} if block.parts is None else {"shown": block.parts.shown, "tooth": block.parts.tooth}
     return _write(
         folder,
         "block",
@@ -85,6 +106,7 @@ def write_block(folder: Path, block: Block) -> StoredFile:
         variance=block.variance,
         fit_weight=block.fit_weight,
         held_out=block.held_out,
+        **parts,
     )
 
 
@@ -93,7 +115,8 @@ def read_block(stored: StoredFile) -> Block:
     a = stored.load()
     camera = Camera.model_validate_json(a["camera"].tobytes())
     view = View(camera, a["pixels"].astype(np.int32))
-    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool))
+    parts = PixelParts(a["shown"].astype(np.int16), a["tooth"].astype(np.int16)) if "shown" in a else None
+    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool), parts)
 
 
 def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:

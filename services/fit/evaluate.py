@@ -10,14 +10,14 @@ never below its own Monte Carlo error, so that few samples cannot look like a pe
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.blocks import read_block
 from services.fit.engine_host import EngineHost
-from services.fit.optics.parameters import Tissue
+from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.passes import BlockTask, Passes, TraceRow, trace_row
 
 Array = NDArray[np.float64]
@@ -87,21 +87,27 @@ class Evaluation:
     held_out: ErrorSums
     renders: dict[tuple[str, int], tuple[NDArray[np.int32], Array]]
     """By camera name and light index: pixels (N, 2) and the mean of the two renders (N,)."""
+    parts: dict[int, tuple[ErrorSums, ErrorSums]] = field(default_factory=dict)
+    """Of a jaw: sums on fitted and on held-out images by what the pixels show (``blocks.PixelParts``)."""
 
 
-def evaluate(passes: Passes, label: str, tissue: Tissue, samples: int, shown: Shown = ()) -> Evaluation:
+def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = ()) -> Evaluation:
     """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else."""
     seeds = passes.seeds(label, "evaluate-1"), passes.seeds(label, "evaluate-2")
-    parts: list[BlockErrors] = passes.run(f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown)
-    passes.record([part.trace for part in parts])
+    found: list[BlockErrors] = passes.run(f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown)
+    passes.record([block.trace for block in found])
     fitted, held_out = ErrorSums(), ErrorSums()
+    parts: dict[int, tuple[ErrorSums, ErrorSums]] = {}
     pieces: dict[tuple[str, int], list[tuple[NDArray[np.int32], Array]]] = {}
-    for part in parts:
-        fitted, held_out = fitted + part.fitted, held_out + part.held_out
-        for image, values in part.renders.items():
-            pieces.setdefault(image, []).append((part.pixels, values))
-    renders = {image: (np.concatenate([p for p, _ in found]), np.concatenate([v for _, v in found])) for image, found in pieces.items()}
-    return Evaluation(fitted, held_out, renders)
+    for block in found:
+        fitted, held_out = fitted + block.fitted, held_out + block.held_out
+        for part, (own_fitted, own_held_out) in block.parts.items():
+            known_fitted, known_held_out = parts.get(part, (ErrorSums(), ErrorSums()))
+            parts[part] = known_fitted + own_fitted, known_held_out + own_held_out
+        for image, values in block.renders.items():
+            pieces.setdefault(image, []).append((block.pixels, values))
+    renders = {image: (np.concatenate([p for p, _ in some]), np.concatenate([v for _, v in some])) for image, some in pieces.items()}
+    return Evaluation(fitted, held_out, renders, parts)
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,7 @@ class BlockErrors:
     held_out: ErrorSums
     pixels: NDArray[np.int32]
     renders: dict[tuple[str, int], Array]
+    parts: dict[int, tuple[ErrorSums, ErrorSums]]
     trace: TraceRow
 
 
@@ -121,7 +128,13 @@ def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], sho
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
     first, second = (host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed).mean for seed in seeds)
-    fitted, held_out = (error_sums(first, second, block.reference, block.variance, chosen) for chosen in (block.fit_weight > 0, block.held_out))
+
+    def sums(pixels: NDArray[np.bool_]) -> tuple[ErrorSums, ErrorSums]:
+        fitted, held_out = (error_sums(first, second, block.reference, block.variance, chosen & pixels) for chosen in (block.fit_weight > 0, block.held_out))
+        return fitted, held_out
+
+    fitted, held_out = sums(np.ones(len(block.view), dtype=bool))
+    parts = {} if block.parts is None else {int(part): sums(block.parts.shown == part) for part in np.unique(block.parts.shown)}
     camera = block.view.camera.name
     renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in shown if name == camera}
-    return BlockErrors(fitted, held_out, block.view.pixels, renders, trace_row("evaluate", task, start))
+    return BlockErrors(fitted, held_out, block.view.pixels, renders, parts, trace_row("evaluate", task, start))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,18 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, SettingsError
-from services.core.geometry import Camera, Tooth
-from services.core.meshfiles import read_teeth
-from services.core.records import JobSpec, PreparedManifest
+from services.core.geometry import Camera, Mesh, Tooth
+from services.core.meshfiles import read_mesh, read_teeth
+from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import open_stage, reading
-from services.fit.blocks import Block, StoredFile, pixels_per_block, write_block, write_recipe
+from services.fit.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
 from services.fit.solve.losses import first_weights
-from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 
 LEAST_BLOCKS = 4
 LEAST_BLOCK_PIXELS = 128
+COARSE_PIXELS = 600
+"""Most pixels of a view, for each of its teeth, in all stages but the last, and while the fit is watched."""
 SEARCH_PIXELS = 210
 """Pixels over all views that the table search compares."""
 
@@ -36,17 +39,32 @@ class ViewStack:
     valid: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
     """(L,): this camera's image under that light is kept from the fit."""
+    parts: PixelParts | None = None
+    """What each pixel shows, where the scene is more than one tooth."""
+
+    def of(self, pixels: NDArray[np.bool_]) -> ViewStack:
+        """Some of its pixels, by a mask (N,)."""
+        parts = None if self.parts is None else self.parts.of(pixels)
+        arrays = (self.reference[:, pixels], self.variance[:, pixels], self.valid[:, pixels])
+        return ViewStack(self.camera, self.pixels[pixels], *arrays, self.held_out, parts)
+
+    @property
+    def fitted(self) -> NDArray[np.bool_]:
+        """(L, N): what the fit may use."""
+        return self.valid & ~self.held_out[:, None]
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What the prepared stage holds for one tooth."""
+    """What the prepared stage holds."""
 
     folder: Path
     manifest: PreparedManifest
-    tooth: Tooth
+    teeth: tuple[Tooth, ...]
     held_out: NDArray[np.bool_]
     """(camera, light)"""
+    gums: Mesh | None = None
+    cavity: Mesh | None = None
 
     @property
     def light_positions_mm(self) -> Array:
@@ -60,22 +78,38 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class Level:
+    """One resolution of a channel's images."""
+
+    blocks: tuple[StoredFile, ...]
+    """Fitted lights only."""
+    evaluation_blocks: tuple[StoredFile, ...]
+    """All lights."""
+    pixels: int
+    """Fitted pixels of all views."""
+    signal: float
+    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
+
+
+@dataclass(frozen=True)
 class ChannelFiles:
     """One channel's blocks and scenes on disk."""
 
     channel: str
     recipe: StoredFile
-    blocks: tuple[StoredFile, ...]
-    """Fitted lights only."""
+    coarse: Level
+    """Every n-th pixel in x and y, so that no view has more than about COARSE_PIXELS."""
+    full: Level
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
     evaluation_recipe: StoredFile
-    evaluation_blocks: tuple[StoredFile, ...]
-    """All lights."""
-    signal: float
-    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
+
+    @property
+    def blocks(self) -> tuple[StoredFile, ...]:
+        """All that is fitted or compared at full resolution."""
+        return self.full.blocks + self.full.evaluation_blocks
 
 
 def read_observations(root: Path, spec: JobSpec) -> Observations:
@@ -85,15 +119,24 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
         CaptureInputError, SettingsError: what is asked cannot be fitted to what was captured; names the thing and the remedy.
     """
     folder, manifest = open_stage(root, "prepared", PreparedManifest)
-    if len(manifest.fdi) != 1:
-        raise CaptureInputError(f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); keep one folder below teeth/.")
-    (tooth,) = read_teeth(folder, manifest.fdi)
-    if spec.dentin == "known" and tooth.dentin is None:
-        raise SettingsError(f"dentin = 'known' but tooth {tooth.fdi} has no dentin.ply; add it, or set dentin to 'fit' or 'none'.")
+    if spec.kind == "tooth" and len(manifest.fdi) != 1:
+        raise CaptureInputError(
+            f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); keep one folder below teeth/, or set kind to 'jaw'."
+        )
+    if spec.kind == "jaw" and len(manifest.fdi) < 2:
+        raise CaptureInputError("A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set kind to 'tooth'.")
+    teeth = read_teeth(folder, manifest.fdi)
+    for tooth in teeth:
+        if spec.dentin == "known" and tooth.dentin is None:
+            raise SettingsError(f"dentin = 'known' but tooth {tooth.fdi} has no dentin.ply; add it, or set dentin to 'fit' or 'none'.")
     for channel in spec.channels or ():
         if channel not in manifest.channels:
             raise SettingsError(f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}.")
-    return Observations(folder, manifest, tooth, held_out_images(manifest, spec))
+    held_out = held_out_images(manifest, spec)
+    if spec.kind == "tooth":
+        return Observations(folder, manifest, teeth, held_out)
+    gums, cavity = (read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply"))
+    return Observations(folder, manifest, teeth, held_out, gums, cavity)
 
 
 def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
@@ -152,60 +195,98 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
             views.append(ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c]))
     if not views:
         raise CaptureInputError("No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres.")
-    fitted = [(v.valid & ~v.held_out[:, None]) for v in views]
-    if not any(f.any() for f in fitted):
-        raise CaptureInputError("No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks.")
-    signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
-    if signal <= 0:
-        raise CaptureInputError(f"Channel {channel} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out.")
+    require_signal(views, f"Channel {channel}")
     if spec.held_out_lights != () and not any((v.valid & v.held_out[:, None]).any() for v in views):
         raise CaptureInputError("No pixel is valid in any held-out image; name other lights in held_out_lights.")
     return tuple(views)
 
 
-def write_channel(
-    folder: Path,
-    observations: Observations,
-    channel: str,
-    views: tuple[ViewStack, ...],
-    dentin: DentinShape | None,
-    spec: JobSpec,
-    stain_uv: Array | None = None,
-) -> ChannelFiles:
-    """Write one channel's blocks and scenes; the same input gives the same files."""
-    fitted = [v.valid & ~v.held_out[:, None] for v in views]
+def require_signal(views: Sequence[ViewStack], name: str) -> None:
+    """Refuse views with nothing to fit.
+
+    Raises:
+        CaptureInputError: no valid pixel, or no light in them.
+    """
+    fitted = [v.fitted for v in views]
+    if not any(f.any() for f in fitted):
+        raise CaptureInputError("No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks.")
+    signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
+    if signal <= 0:
+        raise CaptureInputError(f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out.")
+
+
+def channel_scene(observations: Observations, channel: str, dentins: Sequence[DentinShape | None], spec: JobSpec, stain_uv: Array | None = None) -> SceneRecipe:
+    """All that was captured, with the dentin of each tooth, under all lights of a channel."""
+    return SceneRecipe(
+        tuple(ToothSurfaces(tooth.outer, dentin, stain_uv) for tooth, dentin in zip(observations.teeth, dentins, strict=True)),
+        observations.light_positions_mm,
+        observations.light_intensities(channel),
+        spec.boundary,
+        spec.ior,
+        spec.device,
+        gums=observations.gums,
+        cavity=observations.cavity,
+    )
+
+
+def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...], loss: Loss = "l2") -> ChannelFiles:
+    """Write one channel's blocks and scenes; the same input gives the same files.
+
+    Args:
+        scene: under all lights, in the order of the views' images.
+    """
+    fitted = [v.fitted for v in views]
     used = np.any([f.any(axis=1) for f in fitted], axis=0)
     seen = np.any([v.valid.any(axis=1) for v in views], axis=0)
     noise = np.concatenate([v.variance[f] for v, f in zip(views, fitted, strict=True)])
     values = np.concatenate([v.reference[f] for v, f in zip(views, fitted, strict=True)])
-    weight = first_weights(spec.loss, values, noise)
+    weight = first_weights(loss, values, noise)
     by_view = np.split(weight, np.cumsum([f.sum() for f in fitted])[:-1])
     weights = [np.zeros(v.reference.shape) for v in views]
     for whole, f, part in zip(weights, fitted, by_view, strict=True):
         whole[f] = part
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
-        positions, intensities = observations.light_positions_mm[lights], observations.light_intensities(channel)[lights]
-        scene = single_tooth(observations.tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device)
-        return write_recipe(folder, replace(scene, teeth=(replace(scene.teeth[0], stain_uv=stain_uv),)))
+        chosen = replace(scene, light_positions_mm=scene.light_positions_mm[lights], light_intensities=scene.light_intensities[lights])
+        return write_recipe(folder, chosen)
 
-    def blocks(lights: NDArray[np.bool_], most: int | None = None) -> tuple[StoredFile, ...]:
-        files = []
-        for v, weight in zip(views, weights, strict=True):
-            valid, held = v.valid[lights], v.held_out[lights][:, None]
-            relevant = np.flatnonzero((valid & ~held).any(axis=0) if lights is used else valid.any(axis=0))
-            for part in _split(relevant, int(lights.sum()), len(views)) if most is None else [_spread(relevant, most // len(views))]:
-                if len(part):
-                    cut = np.ix_(np.flatnonzero(lights), part)
-                    chosen = v.valid[cut]
-                    block = Block(View(v.camera, v.pixels[part]), v.reference[cut], v.variance[cut], weight[cut], chosen & held)
-                    files.append(write_block(folder, block))
-        return tuple(files)
+    def block(view: ViewStack, weight: Array, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
+        cut = np.ix_(np.flatnonzero(lights), pixels)
+        held = view.valid[cut] & view.held_out[lights][:, None]
+        measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
+        parts = None if view.parts is None else view.parts.of(pixels)
+        return write_block(folder, Block(*measured, weight[cut], held, parts))
 
+    def level(most: int | None) -> Level:
+        fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
+        for view, weight, fit in zip(views, weights, fitted, strict=True):
+            counted = np.asarray(fit.any(axis=0))
+            kept = np.ones(len(view.pixels), dtype=bool) if most is None else on_coarse_grid(view.pixels, counted, most)
+            relevant = np.flatnonzero(counted & kept)
+            pixels, signal = pixels + len(relevant), signal + float((weight * view.reference**2)[:, kept].sum())
+            fits += [block(view, weight, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)]
+            seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
+            compares += [block(view, weight, seen, part) for part in _split(seen_pixels, int(seen.sum()), len(views)) if len(part)]
+        return Level(tuple(fits), tuple(compares), pixels, signal)
+
+    few = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
     return ChannelFiles(
-        channel, recipe(used), blocks(used), blocks(used, SEARCH_PIXELS), recipe(seen), blocks(seen), float(weight @ values**2),
-        float(values @ values / noise.sum()),
-    )  # fmt: skip
+        channel=channel,
+        recipe=recipe(used),
+        coarse=level(COARSE_PIXELS * len(scene.teeth)),
+        full=level(None),
+        search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
+        evaluation_recipe=recipe(seen),
+        quality=float(values @ values / noise.sum()),
+    )
+
+
+def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
+    """Which pixels (N, 2) are every n-th in x and y, n the least that leaves no more than ``most`` of the counted ones."""
+    every = 1
+    while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
+        every += 1
+    return np.asarray(kept)
 
 
 def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:

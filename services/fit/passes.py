@@ -18,7 +18,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,19 @@ from numpy.typing import NDArray
 from services.fit.blocks import Block, StoredFile, read_block
 from services.fit.engine_host import EngineHost
 from services.fit.executors import Executor
-from services.fit.optics.domain import Domain, similar_tissue
-from services.fit.optics.parameters import Tissue
+from services.fit.optics.domain import BOUNDS, Domain, kind_of, similar_tissue
+from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.seeds import Seeds
 from services.fit.solve.adam import Gradient
-from services.fit.solve.normal_equations import LossChange, NormalEquations, loss_change, normal_equations
-from services.fit.transport.recipe import JacobianEstimate, StackEstimate
+from services.fit.solve.normal_equations import LossChange, NormalEquations, Region, loss_change, normal_equations
+from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
 
 Array = NDArray[np.float64]
+Near = tuple[tuple[int, ...], ...]
+"""For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
+
+SHAPE_STEP = 0.2
+"""Half the step of the differences that give derivatives to blend weights; of their scale in a fit."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class BlockTask:
     index: int
     recipe: StoredFile
     step: str
-    tissue: Tissue
+    tissue: Tissue | Mouth
     samples: int
 
 
@@ -116,12 +121,19 @@ def jacobian_task(host: EngineHost, task: BlockTask, parameters: tuple[str, ...]
     return JacobianBlock(task, parameters, chain, seeds, trace_row("jacobian", task, start), arrays)
 
 
-def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual) -> Products:
+def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual, near: Near | None) -> Products:
     """Multiply where the Jacobian lies."""
     start, block = time.time(), read_block(jacobian.task.block)
     j1, j2 = jacobian.derivatives(host)
-    equations = normal_equations(j1, j2, *(a.reshape(-1) for a in (residual.residual, residual.variance, block.variance, block.fit_weight)))
+    r, spread, sensor, weight = (a.reshape(-1) for a in (residual.residual, residual.variance, block.variance, block.fit_weight))
+    equations = normal_equations(j1, j2, r, spread, sensor, weight, None if near is None else _regions(block, near))
     return Products(equations, (residual.trace, jacobian.trace, trace_row("products", jacobian.task, start)))
+
+
+def _regions(block: Block, near: Near) -> list[Region]:
+    assert block.parts is not None
+    lights = len(block.reference)
+    return [(near[tooth], np.tile(block.parts.tooth == tooth, lights)) for tooth in np.unique(block.parts.tooth)]
 
 
 def gradient_task(
@@ -137,11 +149,11 @@ def gradient_task(
     return Gradient(np.asarray(chain.T @ slopes), loss), trace_row("gradient", task, start)
 
 
-def compare_task(host: EngineHost, task: BlockTask, new: Tissue, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
+def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
     """Render a block at two points with the same two seeds and compare their losses."""
     start, block = time.time(), read_block(task.block)
 
-    def residuals(tissue: Tissue) -> tuple[Array, Array]:
+    def residuals(tissue: Tissue | Mouth) -> tuple[Array, Array]:
         first, second = (
             (host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed).mean - block.reference).reshape(-1) for seed in seeds
         )
@@ -168,7 +180,7 @@ class Passes:
     record: Callable[[Sequence[TraceRow]], None]
     """Takes the trace of finished tasks."""
 
-    def run(self, label: str, tissue: Tissue, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
+    def run(self, label: str, tissue: Tissue | Mouth, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
         """One task per block, results in block order."""
         return self.executor.gather([self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)])
 
@@ -176,23 +188,25 @@ class Passes:
         """The blocks themselves, in order."""
         return [read_block(stored) for stored in self.blocks]
 
-    def tasks(self, label: str, tissue: Tissue, samples: int) -> list[BlockTask]:
+    def tasks(self, label: str, tissue: Tissue | Mouth, samples: int) -> list[BlockTask]:
         """What the blocks' tasks are told, in block order."""
         return [BlockTask(block, k, self.recipe, label, tissue, samples) for k, block in enumerate(self.blocks)]
 
 
 @dataclass(frozen=True)
-class StackProblem:
+class StackProblem(Generic[Optics]):
     """The least-squares problem of one stage, as the solver sees it (``solve.gauss_newton.Problem``)."""
 
     passes: Passes
     domain: Domain
-    base: Tissue
+    base: Optics
     stage: str
     jacobian_g: float | None = None
     """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma, alpha and shape."""
     image_g: float | None = None
     """The same for images: a fit of similar media."""
+    near: Near | None = None
+    """Of a jaw, the coordinates between which the curvature's noise is known."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
@@ -203,7 +217,7 @@ class StackProblem:
         for task in self.passes.tasks(label, tissue, samples):
             jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, seeds)
             image = run.submit(f"{label}-image-{task.index}", image_task, task, self._seed(step, "image"))
-            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image))
+            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, self.near))
         products: list[Products] = run.gather(pending)
         self.passes.record([row for p in products for row in p.trace])
         total = products[0].equations
@@ -234,11 +248,11 @@ class StackProblem:
             total = total + change
         return total
 
-    def _image_media(self, x: Array) -> Tissue:
+    def _image_media(self, x: Array) -> Optics:
         tissue = self.domain.tissue_at(x, self.base)
         return tissue if self.image_g is None else similar_tissue(tissue, self.image_g)
 
-    def _jacobian_media(self, x: Array) -> tuple[Tissue, Tissue, tuple[str, ...], Array]:
+    def _jacobian_media(self, x: Array) -> tuple[Optics, Optics, tuple[str, ...], Array]:
         # Media of the image and of the derivatives, the parameters to differentiate, and d parameter / d x.
         if self.jacobian_g is None:
             return self._image_media(x), self.domain.tissue_at(x, self.base), self.domain.parameters, self.domain.chain(x)
@@ -262,19 +276,30 @@ class StackProblem:
 
 
 def _similar_parameters(name: str) -> tuple[str, ...]:
-    part = name.partition(".")[0]
-    return (name,) if part == "shape" else (f"{part}.sigma", f"{part}.alpha")
+    part, _, leaf = name.rpartition(".")
+    return (f"{part}.sigma", f"{part}.alpha") if leaf in {"sigma", "alpha"} else (name,)
 
 
 def _render_jacobians(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> tuple[Array, Array]:
     view = read_block(task.block).fitted_view
+    scored = tuple(name for name in parameters if kind_of(name) != "shape")
 
     def render(seed: int) -> Array:
-        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, parameters, samples=task.samples, seed=seed)
-        natural = np.asarray(estimate.jacobian, dtype=np.float64)
+        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, scored, samples=task.samples, seed=seed)
+        scores = dict(zip(scored, estimate.jacobian, strict=True))
+        natural = np.stack([scores[name] if name in scores else _secant(host, task, view, name, seed) for name in parameters])
         return np.asarray(chain.T @ natural.reshape(len(natural), -1))
 
     return render(seeds[0]), render(seeds[1])
+
+
+def _secant(host: EngineHost, task: BlockTask, view: View, name: str, seed: int) -> Array:
+    """Derivative (L, N) to a blend weight by a difference of images with common random numbers; one-sided where a bound is near."""
+    low, high = BOUNDS["shape"]
+    value = task.tissue.value(name)
+    ends = max(value - SHAPE_STEP, low), min(value + SHAPE_STEP, high)
+    below, above = (host.call("images", task.recipe, task.tissue.with_values({name: end}), view, samples=task.samples, seed=seed).mean for end in ends)
+    return np.asarray((above - below) / (ends[1] - ends[0]))
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:

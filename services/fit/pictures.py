@@ -18,7 +18,7 @@ from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map
 from services.fit.export.report import ReportPictures
 from services.fit.export.stains import stain_image
 from services.fit.observations import ViewStack
-from services.fit.schedule import StepReport
+from services.fit.stages import StepReport
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"
@@ -41,7 +41,7 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
 def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> tuple[Picture, ...]:
     """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
     # A fit of every n-th pixel is shown as the smaller picture it is, not as dots.
-    every = min((spacing(view.pixels) for stack in views.values() for view in stack), default=1)
+    every = min((spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1)
     channels = list(evaluations)
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
@@ -54,9 +54,10 @@ def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifes
                 width, height = (-(-size // every) for size in view.camera.size)
                 blank = np.zeros((height, width, len(channels)))
                 images[key] = Picture(*key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool))
-            x, y = view.pixels.T // every
-            images[key].photo[y, x, index] = view.reference[number]
-            images[key].valid[y, x] |= view.valid[number]
+            shown = (view.pixels % every == 0).all(axis=1)
+            x, y = view.pixels[shown].T // every
+            images[key].photo[y, x, index] = view.reference[number, shown]
+            images[key].valid[y, x] |= view.valid[number, shown]
             images[key].render[pixels[:, 1] // every, pixels[:, 0] // every, index] = values
     return tuple(images[key] for key in sorted(images))
 
@@ -106,14 +107,18 @@ def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest
     np.savez_compressed(folder / PICTURES, allow_pickle=False, **arrays)
 
 
-def read_pictures(folder: Path, channels: tuple[str, ...], tooth: Tooth, cameras: tuple[Camera, ...], stains: ToothStains | None = None) -> ReportPictures:
-    """What the report shows."""
+def read_pictures(
+    folder: Path, channels: tuple[str, ...], tooth: Tooth | None, cameras: tuple[Camera, ...], stains: ToothStains | None = None
+) -> ReportPictures:
+    """What the report shows; the thickness of enamel and stains where it is about one tooth."""
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)
         pictures = []
         for k in range(count):
             camera, light = (str(part) for part in stored[f"{k}.name"])
             pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
+    if tooth is None:
+        return ReportPictures(channels, tuple(pictures))
     thickness_mm = None if tooth.dentin is None else thickness_image(tooth.outer, tooth.dentin, cameras[0])
     seen = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
     return ReportPictures(channels, tuple(pictures), thickness_mm, cameras[0].name, seen, () if stains is None else tuple(stains.textures))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.core.records import AssetManifest, FitReport, JobSpec
+from services.core.geometry import Mesh
+from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 
 if TYPE_CHECKING:
-    from services.core.geometry import Camera, Tooth
+    from services.core.geometry import Tooth
 
 ENGINE = "services.fit.transport.engine:Engine"
 CHECKPOINT = "fit-checkpoint"
@@ -30,12 +32,15 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     Raises:
         CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError: between two steps.
     """
+    from services.fit.attempt import Attempt
     from services.fit.driver import FitDriver
+    from services.fit.jaw_driver import JawDriver
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
     writer = StageWriter(context.root, "fit", context.attempt)
-    driver = FitDriver(spec, context, writer, engine)
+    attempt = Attempt(spec, context, writer, engine)
+    driver = FitDriver(attempt) if spec.kind == "tooth" else JawDriver(attempt)
     report = driver.run(time.time())
     writer.publish(report)
     context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=summary(report)))
@@ -56,8 +61,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     Raises:
         StoreError: fit or prepared stage missing or damaged.
     """
-    from services.core.records import PreparedManifest
-    from services.fit.export.asset import write_asset
+    import numpy as np
+
+    from services.core.meshfiles import read_mesh
+    from services.fit.export.asset import errors_json, parameters_json, write_asset
     from services.fit.export.report import write_report
     from services.fit.export.stains import kept_stains
     from services.fit.pictures import read_pictures
@@ -68,24 +75,39 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
     writer = StageWriter(context.root, "asset", context.attempt)
     channels = tuple(report.parameters)
-    tooth = fitted_tooth(prepared_folder, prepared.fdi[0], prepared.cameras, spec, report)
+    teeth = fitted_teeth(prepared_folder, prepared, spec, report)
+    surroundings = [prepared_folder / name for name in ("gums.ply", "cavity.ply")]
+    gums, cavity = (read_mesh(path) if spec.kind == "jaw" and path.is_file() else None for path in surroundings)
     index = [prepared.channels.index(channel) for channel in channels]
     lights = tuple(
         light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
     )
     stains = kept_stains(fit_folder)
-    files = write_asset(writer.folder, report, (tooth,), prepared.cameras, lights, channels=channels, boundary=spec.boundary, ior=spec.ior, stains=stains)
+    files = write_asset(
+        writer.folder,
+        report,
+        teeth,
+        prepared.cameras,
+        lights,
+        channels=channels,
+        boundary=spec.boundary,
+        ior=spec.ior,
+        gums=gums,
+        cavity=cavity,
+        stains=stains,
+    )
 
     history = json.loads((fit_folder / "history.json").read_text())
-    facts = {"title": f"Tooth {tooth.fdi}", "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
-    write_report(context.root / "report.html", report, read_pictures(fit_folder, channels, tooth, prepared.cameras, stains), history, facts)
-    errors = {"fit_error": report.fit_error, "held_out_error": report.held_out_error, "unit": "1", "converged": report.converged, "advice": report.advice}
-    parameters = {channel: {name: e.model_dump() for name, e in table.items()} for channel, table in report.parameters.items()}
-    write_atomic(context.root / "parameters.json", _json(parameters))
-    write_atomic(context.root / "errors.json", _json(errors))
+    title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"
+    facts = {"title": title, "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
+    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, stains)
+    write_report(context.root / "report.html", report, pictures, history, facts)
+    write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
+    write_atomic(context.root / "errors.json", _json(errors_json(report)))
 
     held_out = list((report.held_out_error or report.fit_error).values())
-    centre = (tooth.outer.vertices_mm.min(axis=0) + tooth.outer.vertices_mm.max(axis=0)) / 2
+    corners = [corner for tooth in teeth for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))]
+    centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
     manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), centre_mm=(float(centre[0]), float(centre[1]), float(centre[2])))
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
@@ -93,17 +115,18 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     return manifest
 
 
-def fitted_tooth(prepared_folder: Path, fdi: int, cameras: tuple[Camera, ...], spec: JobSpec, report: FitReport) -> Tooth:
-    """The tooth with the dentin surface the fit ended with."""
-    from services.core.geometry import Mesh, Tooth
+def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport) -> tuple[Tooth, ...]:
+    """The teeth with the dentin surfaces the fit ended with."""
     from services.core.meshfiles import read_teeth
     from services.fit.driver import dentin_shape
+    from services.fit.jaw_driver import fixed_dentin
 
-    (tooth,) = read_teeth(prepared_folder, (fdi,))
-    dentin = dentin_shape(tooth, cameras, spec)
-    if dentin is None:
-        return Tooth(fdi, tooth.outer)
-    return Tooth(fdi, tooth.outer, Mesh(dentin.vertices_mm(report.shape), dentin.base.faces))
+    teeth = read_teeth(prepared_folder, prepared.fdi)
+    if spec.kind == "jaw":
+        return tuple(fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth)
+    (tooth,) = teeth
+    dentin = dentin_shape(tooth, prepared.cameras, spec)
+    return (replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(report.shape), dentin.base.faces)),)
 
 
 def _source(spec: JobSpec) -> str:

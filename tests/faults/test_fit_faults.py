@@ -19,8 +19,10 @@ from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.stage import run
 from tests.support.prepared import FAKE, write_prepared
+from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 
 SLOW = "tests.support.fake_engine:SlowFakeEngine"
+SLOW_MOUTH = "tests.support.fake_mouth:SlowFakeMouthEngine"
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +126,30 @@ def test_killed_renderer_is_started_again(client: Client, undisturbed: Path, tmp
     os.kill(children[0], signal.SIGKILL)
     future.result(timeout=200)
     assert answer(tmp_path) == answer(undisturbed)
+
+
+def fit_jaw_once(root: Path) -> None:
+    lease = root / "fit.lease"
+    attempt = int(lease.read_text()) + 1 if lease.exists() else 1
+    (root / "driver.pid").write_text(str(os.getpid()))
+    spec = jaw_spec(root, samples_per_pixel=64, max_samples_per_pixel=128, max_steps=2, search_candidates=500)
+    run(spec, LocalContext(root, attempt), engine=SLOW_MOUTH)
+
+
+def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path) -> None:
+    # Two teeth, one of them hidden. The driver's worker dies while teeth are looked at alone, and its successor in the joint fit.
+    answers = []
+    for name, kills in (("undisturbed", ()), ("killed", (3, 8))):
+        root = tmp_path / name
+        write_prepared_jaw(root, SLOW_MOUTH, (11, 12), hidden=(12,), samples=64)
+        future = client.submit(fit_jaw_once, root, pure=False, retries=len(kills))
+        for count in kills:
+            await_entries(root, count)
+            os.kill(int((root / "driver.pid").read_text()), signal.SIGKILL)
+        future.result(timeout=200)
+        assert (root / "fit.lease").read_text() == str(1 + len(kills))
+        answers.append(answer(root))
+    assert answers[0] == answers[1]
 
 
 def test_renderers_end_with_their_worker(tmp_path: Path) -> None:

@@ -14,9 +14,11 @@ from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.anatomy.blend import BASE_DEPTH_MM, CLEARANCE_MM, FULL_DEPTH_MM, MODES, dentin_blend_shape
+from services.fit.anatomy.dimensions import upper_tooth
 from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.fit.anatomy.frame import ToothFrame, estimate_frame
 from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.jaw import build_jaw
 from services.fit.transport.recipe import DentinShape
 from tests.support.shared_data import shared_path
 
@@ -79,8 +81,10 @@ def test_every_weight_leaves_enamel_everywhere(case: Case, weights: tuple[float,
 def test_each_mode_moves_along_its_axis_and_thickens_enamel(case: Case) -> None:
     assert len(MODES) == len(case.shape.modes_mm) == 3
     for mode, axis in zip(case.shape.modes_mm, case.frame.axes[[1, 0, 2]], strict=True):
-        np.testing.assert_allclose(mode - np.outer(mode @ axis, axis), 0, atol=1e-12)
-        assert np.abs(mode).max() > 0.3
+        along = np.outer(mode @ axis, axis)
+        assert np.abs(along).max() > 0.3
+        # But for what is kept inside where the crown narrows.
+        assert np.square(mode - along).sum() <= 0.1 * np.square(mode).sum()
     volumes = [Mesh(case.shape.vertices_mm(c), case.shape.base.faces).signed_volume_mm3() for c in ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1))]
     assert volumes == sorted(volumes, reverse=True)
 
@@ -92,15 +96,31 @@ def test_other_teeth_of_a_scan_have_a_blend_shape_too(fdi: int) -> None:
         assert tooth.smallest_depth_mm(tuple(weights)) >= CLEARANCE_MM - GRID_ERROR_MM
 
 
-def test_full_weights_reach_the_full_depth_where_the_tooth_is_thick() -> None:
+def test_weights_make_enamel_thicken_with_the_root_of_height() -> None:
     outer, _ = procedural()
-    shape = dentin_blend_shape(outer)
-    full = shape.vertices_mm((1, 1, 1))
-    depth = SurfaceDistance(outer).closest(full)[1]
-    # The labial wall above the cervix, where each side has more than 2.5 mm: 1.5 mm, less what smoothing takes near the thinner parts.
-    thick = (np.abs(shape.base.vertices_mm[:, 0]) < 1.5) & (np.abs(shape.base.vertices_mm[:, 2] + 1.5) < 1.0) & (shape.base.vertices_mm[:, 1] > 0)
-    assert thick.sum() > 10
-    np.testing.assert_allclose(depth[thick], FULL_DEPTH_MM, atol=0.1)
+    crown = upper_tooth(1)
+    shape = dentin_blend_shape(outer, crown=crown)
+    depth = SurfaceDistance(outer).closest(shape.vertices_mm((1, 1, 0)))[1]
+    height = shape.base.vertices_mm[:, 2] - (outer.vertices_mm[:, 2].max() - crown.crown_length_mm)
+    # The middle of the labial wall, where each side has room: the rule, less what smoothing takes. Nothing on the root.
+    wall = (np.abs(shape.base.vertices_mm[:, 0]) < 1.5) & (shape.base.vertices_mm[:, 1] > 0) & (height > 1.5) & (height < 4.5)
+    assert wall.sum() > 10
+    rule = BASE_DEPTH_MM + (FULL_DEPTH_MM - BASE_DEPTH_MM) * np.sqrt(height[wall] / crown.crown_length_mm)
+    np.testing.assert_allclose(depth[wall], rule, atol=0.15)
+    np.testing.assert_allclose(shape.modes_mm[:, height < -0.1], 0, atol=GRID_ERROR_MM)
+
+
+@pytest.mark.parametrize("fdi", [11, 13, 14, 16])
+def test_some_weights_are_near_the_dentin_of_other_makers(fdi: int) -> None:
+    # The phantom's dentin does not come from this family. Bound: the 0.15 mm that a fit is to reach on average on this half of the crown.
+    tooth = build_jaw(1).tooth(fdi)
+    shape = dentin_blend_shape(tooth.outer, tooth.frame, crown=upper_tooth(fdi % 10))
+    height = tooth.outer.vertices_mm @ tooth.frame.axes[2]
+    points = tooth.outer.vertices_mm[height > height.max() - upper_tooth(fdi % 10).crown_length_mm / 2][::7]
+    true = SurfaceDistance(tooth.dentin).closest(points)[1]
+    grid = np.stack(np.meshgrid(*[(0.3, 0.55, 0.8, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    errors = [np.abs(SurfaceDistance(Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)).closest(points)[1] - true).mean() for c in grid]
+    assert min(errors) < 0.15
 
 
 def test_building_is_deterministic_and_of_the_size_asked_for() -> None:

@@ -9,6 +9,7 @@ from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.solve.covariance import estimates, uncertainty
 from services.fit.solve.normal_equations import NormalEquations
+from tests.support.curvature import isotropic
 
 TISSUE = Tissue(Medium(5.0, 0.995, g1=0.8), Medium(12.0, 0.99, g1=0.8))
 DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",)), Coordinate(("enamel.g1",), 1.1, 0.35)))
@@ -16,7 +17,7 @@ DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",)), C
 
 def _equations(hessian: np.ndarray, noise: float = 0.0, monte_carlo: float = 0.0) -> NormalEquations:
     count = len(hessian)
-    return NormalEquations(hessian, np.zeros(count), noise**2 * np.eye(count**2), monte_carlo * hessian, hessian, 100.0, 100.0)
+    return NormalEquations(hessian, np.zeros(count), isotropic(count, noise**2), monte_carlo * hessian, hessian, 100.0, 100.0)
 
 
 def test_well_posed_fit_has_the_inverse_curvature_as_covariance() -> None:
@@ -58,14 +59,14 @@ def test_indefinite_curvature_still_gives_finite_errors() -> None:
     for _ in range(200):
         root = rng.standard_normal((3, 3)) * 10.0 ** rng.uniform(-3, 3)
         h = root + root.T
-        equations = NormalEquations(h, rng.standard_normal(3), np.eye(9), root @ root.T, h, 1.0, 0.0)
+        equations = NormalEquations(h, rng.standard_normal(3), isotropic(3, 1.0), root @ root.T, h, 1.0, 0.0)
         known = uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), equations)
         assert all(e.se is None or (np.isfinite(e.se) and e.se >= 0) for e in estimates(TISSUE, ("enamel",), known).values())
 
 
 def test_misfit_widens_the_errors() -> None:
     h = np.diag([1e4, 1e4, 1e4])
-    exact, poor = _equations(h), NormalEquations(h, np.zeros(3), np.zeros((9, 9)), np.zeros((3, 3)), h, 900.0, 100.0)
+    exact, poor = _equations(h), NormalEquations(h, np.zeros(3), isotropic(3, 0.0), np.zeros((3, 3)), h, 900.0, 100.0)
     flat = Domain(tuple(Coordinate(c.targets) for c in DOMAIN.coordinates))
     x = flat.x_of(TISSUE)
     np.testing.assert_allclose(uncertainty(flat, x, poor).covariance, 9 * uncertainty(flat, x, exact).covariance, rtol=1e-8)

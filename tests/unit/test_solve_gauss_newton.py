@@ -14,6 +14,7 @@ from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.gauss_newton import ADVICE, GaussNewton, Options, Result, state_from, state_record
 from services.fit.solve.normal_equations import LossChange, NormalEquations
 from services.fit.solve.trust_region import solve_ball
+from tests.support.curvature import isotropic
 
 NAMES = ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.g1", "dentin.g1")
 
@@ -39,9 +40,8 @@ class Quadratic:
         g, h = self.gradient_noise / np.sqrt(samples), self.hessian_noise / np.sqrt(samples)
         shake = rng.standard_normal((count, count))
         symmetric = h * (shake + shake.T) / 2
-        identity = np.eye(count)
-        fourth = 0.5 * h**2 * (np.einsum("ac,bd->abcd", identity, identity) + np.einsum("ad,bc->abcd", identity, identity)).reshape(count**2, count**2)
-        return NormalEquations(self.a + symmetric, self.a @ (x - self.best) + g * rng.standard_normal(count), fourth, g**2 * identity, np.zeros((count, count)))
+        gradient, none = self.a @ (x - self.best) + g * rng.standard_normal(count), np.zeros((count, count))
+        return NormalEquations(self.a + symmetric, gradient, isotropic(count, h**2), g**2 * np.eye(count), none)
 
     def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
         self.calls.append(("compare", samples))

@@ -1,8 +1,11 @@
 """Dentin as a blend shape made from the enamel's outer surface (teeth 2018 Eq. 5, Fig. 4).
 
-V = B0 + Σ c_m (B_m − B0). B0 is the outer surface offset 0.1 mm inward, the most dentin there can be; B_m − B0 is the part along axis m of the
-displacement that leads to the surface offset 1.5 mm inward. Where the tooth is thinner than that, the displacement ends at 0.6 of the way to the
-middle, so that opposite walls never meet. Each V with 0 <= c <= 1 lies in a box whose corners are kept inside the enamel.
+V = B0 + Σ c_m (B_m − B0). B0 is the outer surface offset 0.1 mm inward, the most dentin there can be. Enamel grows from nothing at the cervical line
+with about the square root of height (the micro-CT incisor's wall: 1.25 mm √s to 0.1 mm, s the height as a part of the crown's), and so do the walls'
+modes, which at the top thicken it to 1.8 mm. The buccal one moves dentin inward along its axis, where the tooth is thin 0.75 of the way to the
+middle at most, so that opposite walls never meet; the proximal one makes it narrower, most at its sides, which cannot fold it. At an edge or a cusp dentin
+ends lower rather than thinner: the third mode moves it down by 2 mm and less below. What a mode would move out of the crown, which is hollow behind
+and narrows downwards, is kept at the base's depth. Each V with 0 <= c <= 1 lies in a box whose corners are kept inside the enamel.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
+from services.fit.anatomy.dimensions import ToothDimensions
 from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.isosurface import surface_net
@@ -24,23 +28,31 @@ MODES = ("buccal", "proximal", "occlusal")
 MODE_AXES = (1, 0, 2)
 """Axis of the canonical frame that each mode moves along."""
 BASE_DEPTH_MM = 0.1
-FULL_DEPTH_MM = 1.5
+FULL_DEPTH_MM = 1.8
+"""Of the walls' dentin at full weight and at the height of the edge."""
+FULL_DROP_MM = 2.0
+"""By which dentin ends below the edge or cusps at full weight."""
 CLEARANCE_MM = 0.05
 """Enamel that is left everywhere for any c, away from the base's own depth."""
 CORNER_DEPTH_MM = 0.075
 """Depth asked of each vertex's box at its corners: the clearance and half as much again for faces between vertices."""
 CREASE_MM = 0.03
 """How much nearer to the enamel's surface a face's middle may come than its corners."""
-MIDDLE_FRACTION = 0.6
+MIDDLE_FRACTION = 0.75
+PROXIMAL_FRACTION = 0.48
+"""Of half the width at that height: below a half, what is further out stays further out."""
 STEP_MM = 0.05
+SLICES = 20
+"""Of the tooth's height, in which its width is taken."""
 
 
-def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, faces: int = 4000) -> DentinShape:
-    """Base 0.1 mm below the enamel's surface and three modes towards 1.5 mm depth, in the coordinates of ``outer``.
+def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, crown: ToothDimensions | None = None, faces: int = 4000) -> DentinShape:
+    """Base 0.1 mm below the enamel's surface and three modes that thicken the enamel, in the coordinates of ``outer``.
 
     Args:
         outer: watertight enamel surface, mm.
         frame: the tooth's canonical frame; None when ``outer`` is in it.
+        crown: where its cervical line runs, by the average of its kind; None for a mesh that is all crown.
         faces: about so many triangles for the dentin surface, whatever the enamel has.
 
     Raises:
@@ -52,14 +64,49 @@ def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, faces: i
     base = _base(outer, grid, surface, faces)
     inward = _unit(_smooth(base, grid.inward(base.vertices_mm), 6))
 
-    reach = _smooth_below(base, _room_mm(base.vertices_mm, inward, grid))
+    height = _height(base.vertices_mm @ axes.T, crown)
+    buccal = _smooth(base, _room_mm(base.vertices_mm, inward, grid), 6) * np.sqrt(height)
+    proximal = _side(base.vertices_mm @ axes.T) * np.sqrt(height)
+    drop = (FULL_DROP_MM - BASE_DEPTH_MM) * height**2
+    share = np.ones(len(height))
     for _ in range(40):
-        modes = np.stack([np.outer(reach * (inward @ axes[axis]), np.ones(3)) * axes[axis] for axis in MODE_AXES])
+        along = (share * buccal * (inward @ axes[1]), -share * proximal, -share * drop)
+        moved = [_kept_inside(base.vertices_mm + np.outer(length, axes[axis]), grid) for length, axis in zip(along, MODE_AXES, strict=True)]
+        modes = np.stack(moved) - base.vertices_mm
         short = _shallowest_corner_mm(base.vertices_mm, modes, grid) < CORNER_DEPTH_MM
         if not short.any():
             return DentinShape(base, modes)
-        reach = _smooth_below(base, np.where(short, 0.8 * reach, reach))
+        share = _smooth_below(base, np.where(short, 0.8 * share, share))
     raise MeshError("The enamel mesh leaves no room for dentin between its walls; check its scale and that it is one solid tooth.")
+
+
+def _kept_inside(points_mm: NDArray[np.float64], grid: SignedDistanceGrid) -> NDArray[np.float64]:
+    for _ in range(4):
+        points_mm = points_mm + np.maximum(BASE_DEPTH_MM - grid.depth_mm(points_mm), 0)[:, None] * grid.inward(points_mm)
+    return points_mm
+
+
+def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> NDArray[np.float64]:
+    # Of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the edge. The line rises on the proximal sides.
+    across, up = points_mm[:, 0], points_mm[:, 2]
+    top, bottom = up.max(), np.full(len(up), up.min())
+    if crown is not None:
+        half = crown.md_cervix_mm / 2
+        rise = (crown.curvature_mesial_mm + crown.curvature_distal_mm) / 2
+        bottom = top - crown.crown_length_mm + rise * np.clip((across - np.median(across)) / half, -1, 1) ** 2
+    return np.asarray(np.clip((up - bottom) / (top - bottom), 0.0, 1.0))
+
+
+def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    # How far the proximal mode moves points in the canonical frame's axes: as the square of their place between the middle and the side.
+    up, middle = points_mm[:, 2], np.median(points_mm[:, 0])
+    across = points_mm[:, 0] - middle
+    edges = np.linspace(up.min(), up.max(), SLICES + 1)
+    slices = np.clip(np.digitize(up, edges) - 1, 0, SLICES - 1)
+    half = np.array([np.abs(across[slices == k]).max(initial=0.0) for k in range(SLICES)])
+    half_mm = np.maximum(np.interp(up, (edges[1:] + edges[:-1]) / 2, half), 1e-6)
+    reach = np.minimum(FULL_DEPTH_MM - BASE_DEPTH_MM, PROXIMAL_FRACTION * half_mm)
+    return np.asarray(reach * np.sign(across) * np.minimum(np.abs(across) / half_mm, 1) ** 2)
 
 
 def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces: int) -> Mesh:

@@ -4,10 +4,11 @@
 
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
+    gums.ply, cavity.ply       of a jaw; gums hold the roots, so they are in no scene: stock media cannot overlap
     teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer surface's u, v
     rig.json                   cameras, lights and channels by name
-    parameters.json            per channel: value, se, unit, determined
-    errors.json                fitted and held-out image error
+    parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
+    errors.json                fitted and held-out image error, of a jaw's teeth too
     render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for boundary thin
 """
 
@@ -17,7 +18,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from services.core.geometry import Camera, Light, Tooth, teeth_folder
+from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
@@ -40,6 +41,8 @@ def write_asset(
     channels: tuple[str, ...],
     boundary: Boundary,
     ior: float,
+    gums: Mesh | None = None,
+    cavity: Mesh | None = None,
     stains: ToothStains | None = None,
 ) -> tuple[str, ...]:
     """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative to ``folder``.
@@ -47,6 +50,7 @@ def write_asset(
     Args:
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
         lights: ``intensity`` in the order of ``channels``.
+        gums, cavity: of a jaw.
         stains: of a single tooth.
 
     Raises:
@@ -63,6 +67,9 @@ def write_asset(
             write_mapped_mesh(folder / place / "outer.ply", tooth.outer, stains.corners_uv)
         if tooth.dentin is not None:
             write_mesh(folder / place / "dentin.ply", tooth.dentin)
+    for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
+        if mesh is not None:
+            write_mesh(folder / name, mesh)
 
     textures = {}
     if stains is not None:
@@ -73,9 +80,12 @@ def write_asset(
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
-        tissue = tissue_of(report.parameters[channel])
+        table = report.parameters[channel]
+        tissue = {fdi: tissue_of(tooth.parameters[channel]) for fdi, tooth in report.teeth.items()} or tissue_of(table)
+        wall = None if cavity is None else (Path("cavity.ply"), table["cavity.reflectance"].value)
         stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
-        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), stains=stained)
+        surroundings: dict[str, Any] = {"wall": wall, "stains": stained}
+        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), **surroundings)
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {
@@ -104,18 +114,24 @@ def tissue_of(table: dict[str, Estimate]) -> Tissue:
 
 def parameters_json(report: FitReport) -> dict[str, Any]:
     """Per channel and name: value, se, unit, determined."""
-    return {channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in report.parameters.items()}
+    tables = {channel: dict(table) for channel, table in report.parameters.items()}
+    for fdi, tooth in report.teeth.items():
+        for channel, own in tooth.parameters.items():
+            tables[channel] |= {f"{fdi}.{name}": estimate for name, estimate in own.items()}
+    return {channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in tables.items()}
 
 
 def errors_json(report: FitReport) -> dict[str, Any]:
     """Relative image errors per channel, and whether they are those of a converged fit."""
-    return {
+    errors = {
         "unit": "1",
         "fit_error": report.fit_error,
         "held_out_error": report.held_out_error,
         "converged": report.converged,
         "advice": report.advice,
     }
+    teeth = {fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"}) for fdi, tooth in report.teeth.items()}
+    return errors | ({"teeth": teeth} if teeth else {})
 
 
 def _write_json(path: Path, value: object) -> None:

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Estimate, FitReport
+from services.core.records import Estimate, FitReport, ToothReport
 from services.core.store import write_atomic
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import DIVERGING, SEQUENTIAL, ColourStops, Picture, data_uri, enlarge, scalar_map, signed_map, tone_map, white_level
 
 RESIDUAL_OF_WHITE = 0.25
 """Residuals are drawn from minus to plus this fraction of the picture's white."""
-PART_LABELS = {"enamel": "Enamel", "dentin": "Dentin", "shape": "Dentin shape"}
+PART_LABELS = {"enamel": "Enamel", "dentin": "Dentin", "shape": "Dentin shape", "gums": "Gums", "cavity": "Wall of the mouth"}
 LEAF_LABELS = {
     "sigma": "extinction σ",
     "alpha": "albedo α",
@@ -31,6 +31,7 @@ LEAF_LABELS = {
     "sigma_a": "absorption σa",
     "alpha_reduced": "reduced albedo α′",
     "mean_cosine": "mean cosine g",
+    "reflectance": "diffuse reflectance",
 }
 SHAPE_LABELS = ("buccal", "proximal", "occlusal")
 LEADING = ("sigma_s_reduced", "alpha_reduced", "sigma_a")
@@ -86,6 +87,8 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         stages=_stages(history),
         channels=list(report.parameters),
         parameters=_parameter_rows(report.parameters),
+        teeth=_tooth_rows(report.teeth),
+        tooth_sentences=[tooth.sentence for tooth in report.teeth.values() if tooth.sentence],
         thickness=_thickness(pictures),
         thickness_bar=_gradient(SEQUENTIAL),
         stains=_stains(pictures),
@@ -137,6 +140,8 @@ def _triptych(picture: Picture) -> dict[str, Any]:
 
 
 def _charts(history: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    # Steps that look at one tooth of a jaw alone are not on the scale of the whole.
+    history = [entry for entry in history if entry.get("tooth") is None]
     channels = list(dict.fromkeys(str(entry.get("channel", "")) for entry in history))
 
     def lines(key: str) -> list[Series]:
@@ -154,7 +159,7 @@ def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
     # What each stage of each channel brought: its last step.
     last: dict[tuple[str, str], dict[str, Any]] = {}
     for entry in history:
-        if entry.get("stage"):
+        if entry.get("stage") and entry.get("tooth") is None:
             last[str(entry.get("channel", "")), str(entry["stage"])] = entry
     rows = []
     for (channel, stage), entry in last.items():
@@ -173,6 +178,22 @@ def _parameter_rows(parameters: dict[str, dict[str, Estimate]]) -> list[dict[str
         unit = "" if present[0].unit == "1" else present[0].unit
         rows.append({"group": _group(name), "label": _label(name), "name": name, "unit": unit, "cells": [_cell(t.get(name)) for t in parameters.values()]})
     return rows
+
+
+def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
+    # One line per tooth and channel: how well it is explained, and what images fix best.
+    names = [f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in LEADING[:2]]
+    return [
+        {
+            "fdi": fdi,
+            "state": tooth.state,
+            "channel": channel,
+            "errors": [_percent(errors[channel]) if channel in errors else "" for errors in (tooth.held_out_error, tooth.fit_error)],
+            "cells": [_cell(table.get(name)) for name in names],
+        }
+        for fdi, tooth in teeth.items()
+        for channel, table in tooth.parameters.items()
+    ]
 
 
 def _order(name: str) -> tuple[int, int]:

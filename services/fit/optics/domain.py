@@ -1,14 +1,15 @@
 """The unbounded domain in which parameters are fitted, and its chain-rule factors (teeth 2018 Eq. 22, 24; signs as in optics).
 
-==========  =====================  =======================  ==========================
-parameter   natural                d natural / d x          kept inside
-==========  =====================  =======================  ==========================
-sigma       exp(x), per mm         sigma                    1e-3 to 1e3 per mm
-alpha       1 - 10^-x              10^-x ln 10              1 - alpha from 1e-7 to 0.9
-g1, g2      tanh x                 sech^2 x                 abs(g) < 0.9991
-beta        logistic x             beta (1 - beta)          6e-4 to 1 - 6e-4
-shape       x                      1                        0 to 1, projected
-==========  =====================  =======================  ==========================
+===========  =====================  =======================  ==========================
+parameter    natural                d natural / d x          kept inside
+===========  =====================  =======================  ==========================
+sigma        exp(x), per mm         sigma                    1e-3 to 1e3 per mm
+alpha        1 - 10^-x              10^-x ln 10              1 - alpha from 1e-7 to 0.9
+g1, g2       tanh x                 sech^2 x                 abs(g) < 0.9991
+beta         logistic x             beta (1 - beta)          6e-4 to 1 - 6e-4
+reflectance  as beta                as beta                  as beta
+shape        x                      1                        0 to 1, projected
+===========  =====================  =======================  ==========================
 
 The bounds only keep a wild step representable in float32; a fit that ends on one is reported as undetermined.
 """
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import SettingsError
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.optics.parameters import Medium, Mouth, Optics, Tissue
 
 LN10 = math.log(10.0)
 
@@ -33,17 +34,19 @@ BOUNDS = {
     "g1": (-3.85, 3.85),
     "g2": (-3.85, 3.85),
     "beta": (-7.4, 7.4),
+    "reflectance": (-7.4, 7.4),
     "shape": (0.0, 1.0),
 }
-STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "g2": 0.35, "beta": 1.0, "shape": 0.25}
+STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "g2": 0.35, "beta": 1.0, "reflectance": 1.0, "shape": 0.25}
 """Length over which the image is roughly linear in each coordinate; a trust radius of 1 means one of these."""
-UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "g2": "1", "beta": "1", "shape": "1"}
+UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "g2": "1", "beta": "1", "reflectance": "1", "shape": "1"}
+LOGISTIC = frozenset({"beta", "reflectance"})
 
 
 def kind_of(name: str) -> str:
-    """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` is ``sigma``, for ``shape.0`` it is ``shape``."""
-    part, leaf = name.split(".")
-    kind = "shape" if part == "shape" else leaf
+    """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` or ``3.enamel.sigma`` is ``sigma``, for ``shape.0`` it is ``shape``."""
+    part, _, leaf = name.rpartition(".")
+    kind = "shape" if part.rpartition(".")[2] == "shape" else leaf
     if kind not in BOUNDS:
         raise SettingsError(f"Parameter {name} is not one a fit can change; choose from {', '.join(BOUNDS)}.")
     return kind
@@ -59,7 +62,7 @@ def to_dual(kind: str, value: float) -> float:
         x = -math.log10(max(1.0 - value, tiny))
     elif kind in {"g1", "g2"}:
         x = math.copysign(high, value) if abs(value) >= 1.0 else math.atanh(value)
-    elif kind == "beta":
+    elif kind in LOGISTIC:
         x = math.log(max(value, tiny)) - math.log(max(1.0 - value, tiny))
     else:
         x = value
@@ -74,7 +77,7 @@ def to_natural(kind: str, x: float) -> float:
         return -math.expm1(-x * LN10)
     if kind in {"g1", "g2"}:
         return math.tanh(x)
-    if kind == "beta":
+    if kind in LOGISTIC:
         return 1.0 / (1.0 + math.exp(-x)) if x >= 0 else math.exp(x) / (1.0 + math.exp(x))
     return x
 
@@ -87,7 +90,7 @@ def natural_derivative(kind: str, x: float) -> float:
         return LN10 * math.exp(-x * LN10)
     if kind in {"g1", "g2"}:
         return 1.0 / math.cosh(x) ** 2
-    if kind == "beta":
+    if kind in LOGISTIC:
         decay = math.exp(-abs(x))
         return decay / (1.0 + decay) ** 2
     return 1.0
@@ -105,7 +108,7 @@ class Coordinate:
     @property
     def name(self) -> str:
         """``enamel.sigma``, or ``tooth.sigma`` when it drives both media."""
-        return self.targets[0] if len(self.targets) == 1 else f"tooth.{self.targets[0].split('.')[1]}"
+        return self.targets[0] if len(self.targets) == 1 else f"tooth.{self.kind}"
 
     @property
     def kind(self) -> str:
@@ -147,11 +150,11 @@ class Domain:
         precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates])
         return mean, precision
 
-    def x_of(self, tissue: Tissue) -> NDArray[np.float64]:
+    def x_of(self, tissue: Tissue | Mouth) -> NDArray[np.float64]:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""
         return np.array([to_dual(c.kind, tissue.value(c.targets[0])) for c in self.coordinates])
 
-    def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Tissue) -> Tissue:
+    def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Optics) -> Optics:
         """``base`` with this domain's parameters at x."""
         values = {target: to_natural(c.kind, float(v)) for c, v in zip(self.coordinates, x, strict=True) for target in c.targets}
         return base.with_values(values)
@@ -174,6 +177,9 @@ def similar_medium(medium: Medium, g: float) -> Medium:
     return Medium(sigma, scattering / sigma, g1=g)
 
 
-def similar_tissue(tissue: Tissue, g: float) -> Tissue:
-    """Both media replaced by similar ones; shape and stain stay."""
-    return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
+def similar_tissue(tissue: Optics, g: float) -> Optics:
+    """All media replaced by similar ones; shapes, stains and what is opaque stay."""
+    if isinstance(tissue, Tissue):
+        return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
+    gums = None if tissue.gums is None else similar_medium(tissue.gums, g)
+    return Mouth(tuple(similar_tissue(tooth, g) for tooth in tissue.teeth), gums, tissue.reflectance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,10 @@ class Tissue:
     stain: Stain | None = None
     """None for a surface without stains."""
 
+    def medium(self, part: str) -> Medium:
+        """``enamel`` or ``dentin``."""
+        return self.enamel if part == "enamel" else self.dentin
+
     def value(self, name: str) -> float:
         """The parameter called ``name``."""
         part, leaf = name.split(".")
@@ -111,6 +115,14 @@ class Mouth:
     reflectance: float | None = None
     """Of the cavity's wall, diffuse, 0 to 1."""
 
+    def medium(self, part: str) -> Medium:
+        """``0.enamel`` ... ``13.dentin`` or ``gums``."""
+        if part == "gums":
+            assert self.gums is not None
+            return self.gums
+        tooth, own = part.split(".")
+        return self.teeth[int(tooth)].medium(own)
+
     def value(self, name: str) -> float:
         """The parameter called ``name``."""
         part, leaf = name.split(".", 1)
@@ -135,3 +147,7 @@ class Mouth:
             else:
                 teeth[int(part)] = teeth[int(part)].with_values({leaf: value})
         return Mouth(tuple(teeth), gums, reflectance)
+
+
+Optics = TypeVar("Optics", Tissue, Mouth)
+"""What a fit changes: one tooth alone, or a whole mouth."""

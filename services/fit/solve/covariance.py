@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.core.records import Estimate
 from services.fit.optics.domain import UNITS, Domain, kind_of, natural_derivative
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
 from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
@@ -92,34 +91,33 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations) -> Uncerta
     return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), vectors[:, is_open], inverse * np.outer(scale, scale))
 
 
-def estimates(tissue: Tissue, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:
+def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:
     """Every parameter of the named parts with unit, standard error and whether the data fix it, and the derived quantities.
 
     Args:
         tissue: the solution.
-        parts: ``enamel``, ``dentin``; blend weights follow ``tissue.shape``.
+        parts: ``enamel``, ``dentin``, of a mouth ``3.enamel``, ``gums`` or ``cavity``; a single tooth's blend weights follow ``tissue.shape``.
         known: uncertainty of the coordinates that were fitted; None where nothing was.
         shape_known: uncertainty of the blend weights where another channel's fit gave them.
     """
     fitted = set(known.domain.parameters) if known is not None else set()
     out: dict[str, Estimate] = {}
     for part in parts:
+        if part == "cavity":
+            out["cavity.reflectance"] = _raw(tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None)
+            continue
         for leaf in MEDIUM_FIELDS:
             name = f"{part}.{leaf}"
             out[name] = _raw(tissue, name, known if name in fitted else None)
         for leaf, (unit, quantity) in DERIVED.items():
-            out[f"{part}.{leaf}"] = _derived(tissue, known, partial(_of_part, part, quantity), unit)
-    for k in range(len(tissue.shape)):
+            out[f"{part}.{leaf}"] = _derived(tissue, known, part, quantity, unit)
+    for k in range(len(tissue.shape) if isinstance(tissue, Tissue) else 0):
         name = f"shape.{k}"
         out[name] = _raw(tissue, name, known if name in fitted else shape_known)
     return out
 
 
-def _of_part(part: str, quantity: Callable[[Medium], float], tissue: Tissue) -> float:
-    return quantity(tissue.enamel if part == "enamel" else tissue.dentin)
-
-
-def _raw(tissue: Tissue, name: str, known: Uncertainty | None) -> Estimate:
+def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:
     unit = UNITS[kind_of(name)]
     if known is None:
         return Estimate(value=tissue.value(name), se=None, unit=unit, determined=False)
@@ -130,17 +128,18 @@ def _raw(tissue: Tissue, name: str, known: Uncertainty | None) -> Estimate:
     return Estimate(value=tissue.value(name), se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope))
 
 
-def _derived(tissue: Tissue, known: Uncertainty | None, quantity: Callable[[Tissue], float], unit: str) -> Estimate:
-    value = quantity(tissue)
+def _derived(tissue: Optics, known: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str) -> Estimate:
+    value = quantity(tissue.medium(part))
     if known is None:
         return Estimate(value=value, se=None, unit=unit, determined=False)
     # Central differences in the unbounded domain; the step is far below every scale and far above rounding.
     slope, step = np.zeros(len(known.x)), 1e-5
-    for k in range(len(known.x)):
-        shift = np.zeros(len(known.x))
-        shift[k] = step
-        high, low = known.domain.tissue_at(known.x + shift, tissue), known.domain.tissue_at(known.x - shift, tissue)
-        slope[k] = (quantity(high) - quantity(low)) / (2 * step)
+    for k, coordinate in enumerate(known.domain.coordinates):
+        if any(target.startswith(f"{part}.") for target in coordinate.targets):
+            shift = np.zeros(len(known.x))
+            shift[k] = step
+            high, low = (quantity(known.domain.tissue_at(known.x + sign * shift, tissue).medium(part)) for sign in (1, -1))
+            slope[k] = (high - low) / (2 * step)
     if not slope.any():
         return Estimate(value=value, se=None, unit=unit, determined=False)
     return Estimate(value=value, se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope))

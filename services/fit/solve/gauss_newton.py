@@ -88,6 +88,8 @@ class Options:
     tolerance: float = 0.0
     """Converged when a further step promises no more than noise does, and noise is worth no more than this change of F."""
     least_radius: float = 1e-3
+    parts: int = 1
+    """Lengths of steps are root mean squares over so many things that images tell apart, such as teeth: each may go as far as one alone would."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class GaussNewton:
             step, promised = self._propose(equations, x, radius)
             if promised <= noise_gain:
                 break
-            new, length = x + step, float(np.linalg.norm(step / self.domain.scale))
+            new, length = x + step, self._length(step)
             compared = problem.compare(x, new, samples=state.samples, step=state.step - 1, trial=trial)
             change = compared.change + 0.5 * float(precision @ ((new - mean) ** 2 - (x - mean) ** 2))
             if not np.isfinite([change, compared.variance]).all():
@@ -217,7 +219,7 @@ class GaussNewton:
         sure = vectors[:, (eigenvalues > DETERMINED * noise) & (eigenvalues > spread) & (eigenvalues > 1e-13 * abs(eigenvalues).max())]
         curvature = np.einsum("ak,ab,bk->k", sure, equations.hessian * np.outer(scale, scale), sure)
         step = scale * (sure @ (-(sure.T @ (scale * equations.gradient)) / curvature))
-        length = float(np.linalg.norm(step / scale))
+        length = self._length(step)
         if state.memory is None or length == 0:
             return state
         low, high = self.domain.bounds
@@ -233,9 +235,13 @@ class GaussNewton:
             return self._limited(self._carry(replace(state, x=x + step, result=Result.RUNNING, verdict="settling"), step, 1.0))
         return replace(state, x=x + step, memory=state.memory.moved(step), verdict=f"{state.verdict}, settled")
 
+    def _length(self, step: Array) -> float:
+        return float(np.linalg.norm(step / self.domain.scale)) / math.sqrt(self.options.parts)
+
     def _propose(self, equations: NormalEquations, x: Array, radius: float) -> tuple[Array, float]:
         # Step within the radius and the gain that the model promises for it.
-        step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, radius, equations.hessian_noise)
+        reach = radius * math.sqrt(self.options.parts)
+        step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, reach, equations.hessian_noise)
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
     def _carry(self, state: State, step: Array, length: float) -> State:

@@ -7,11 +7,14 @@ symmetrised product of the two, unbiased for j j', and for any direction u the p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 
 Array = NDArray[np.float64]
 
@@ -24,8 +27,7 @@ class NormalEquations:
     """sum w j j', (F, F), from two independent seeds; may be indefinite."""
     gradient: Array
     """sum w j r, (F,), residual from a third seed."""
-    hessian_noise: Array
-    """(F*F, F*F): the variance of u'Hu is (u x u)' hessian_noise (u x u)."""
+    hessian_noise: CurvatureNoise
     gradient_noise: Array
     """Monte Carlo covariance of the gradient, (F, F)."""
     data_noise: Array
@@ -40,13 +42,14 @@ class NormalEquations:
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
-        return {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self)}
+        arrays = {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self) if f.name != "hessian_noise"}
+        return arrays | {"hessian_noise": self.hessian_noise.record()}
 
     @staticmethod
     def of(record: dict[str, Any]) -> NormalEquations:
         """From ``record``."""
-        values: dict[str, Any] = {name: np.array(value) if isinstance(value, list) else value for name, value in record.items()}
-        return NormalEquations(**values)
+        values: dict[str, Any] = {name: np.array(value) if isinstance(value, list) else value for name, value in record.items() if name != "hessian_noise"}
+        return NormalEquations(**values, hessian_noise=CurvatureNoise.of(record["hessian_noise"]))
 
     def scaled(self, factor: float) -> NormalEquations:
         """The same with every weight multiplied: sums scale once, their covariances twice."""
@@ -54,7 +57,7 @@ class NormalEquations:
         return NormalEquations(
             self.hessian * linear,
             self.gradient * linear,
-            self.hessian_noise * quadratic,
+            self.hessian_noise.scaled(quadratic),
             self.gradient_noise * quadratic,
             self.data_noise * quadratic,
             self.squares * linear,
@@ -63,22 +66,26 @@ class NormalEquations:
 
     def moved(self, step: Array) -> NormalEquations:
         """The quadratic model seen from ``step`` further on; the curvature's noise enters the gradient."""
-        count = len(step)
-        carried = np.einsum("aibj,i,j->ab", self.hessian_noise.reshape((count,) * 4), step, step)
+        carried = self.hessian_noise.of_product(step)
         return replace(self, gradient=self.gradient + self.hessian @ step, gradient_noise=self.gradient_noise + carried)
 
     def step_noise(self, step: Array) -> float:
         """Standard deviation of the change g'p + p'Hp/2 that the model predicts for a step p."""
-        pair = np.outer(step, step).reshape(-1)
-        return float(np.sqrt(max(float(step @ self.gradient_noise @ step + 0.25 * pair @ self.hessian_noise @ pair), 0.0)))
+        curvature = float(self.hessian_noise.variance(step[:, None])[0])
+        return float(np.sqrt(max(float(step @ self.gradient_noise @ step) + 0.25 * curvature, 0.0)))
 
     def eigenvalue_noise(self, directions: Array) -> Array:
         """Standard deviation of u'Hu for each column u of ``directions`` (F, K)."""
-        pairs = np.einsum("ak,bk->kab", directions, directions).reshape(directions.shape[1], -1)
-        return np.sqrt(np.maximum(np.einsum("ka,ab,kb->k", pairs, self.hessian_noise, pairs), 0.0))
+        return np.sqrt(self.hessian_noise.variance(directions))
 
 
-def normal_equations(j1: Array, j2: Array, residual: Array, residual_variance: Array, reference_variance: Array, weight: Array) -> NormalEquations:
+Region = tuple[Sequence[int], NDArray[np.bool_]]
+"""The coordinates that act on some measurements (M,), as far as the curvature's noise is concerned."""
+
+
+def normal_equations(
+    j1: Array, j2: Array, residual: Array, residual_variance: Array, reference_variance: Array, weight: Array, regions: Sequence[Region] | None = None
+) -> NormalEquations:
     """Sum one block of measurements.
 
     Args:
@@ -87,14 +94,15 @@ def normal_equations(j1: Array, j2: Array, residual: Array, residual_variance: A
         residual_variance: Monte Carlo variance of the render (M,).
         reference_variance: variance of the reference (M,).
         weight: (M,), 0 where a measurement does not count.
+        regions: which together hold all measurements; None for one of all coordinates.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
 
     # Curvature, and its noise from the products of mean and difference.
     weighted = weight * mean
     hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
-    products = 0.5 * (mean[:, None] * difference[None] + difference[:, None] * mean[None]) * weight
-    flat = products.reshape(-1, products.shape[-1])
+    regions = regions if regions is not None else ((range(len(mean)), np.ones(len(weight), dtype=bool)),)
+    noise = [CurvatureNoise((curvature_noise(mean[:, chosen], difference[:, chosen], weight[chosen], near),)) for near, chosen in regions]
 
     # Gradient; its noise is the Jacobian's seen through the residual plus the residual's seen through the Jacobian.
     through_residual = weight * residual * difference
@@ -103,7 +111,7 @@ def normal_equations(j1: Array, j2: Array, residual: Array, residual_variance: A
     return NormalEquations(
         hessian=hessian,
         gradient=weighted @ residual,
-        hessian_noise=flat @ flat.T,
+        hessian_noise=sum(noise[1:], start=noise[0]),
         gradient_noise=0.25 * through_residual @ through_residual.T + (image * mean) @ mean.T,
         data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * difference) @ difference.T,
         squares=float(weight @ (residual**2 - residual_variance)),

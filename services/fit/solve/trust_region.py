@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
+from services.fit.solve.curvature_noise import CurvatureNoise
 
 Array = NDArray[np.float64]
 
@@ -55,11 +56,13 @@ def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: 
     return np.asarray(-vectors @ (slope / (curvature + high)))
 
 
-def solve_box(hessian: Array, gradient: Array, x: Array, bounds: tuple[Array, Array], scale: Array, radius: float, hessian_noise: Array | None = None) -> Array:
+def solve_box(
+    hessian: Array, gradient: Array, x: Array, bounds: tuple[Array, Array], scale: Array, radius: float, hessian_noise: CurvatureNoise | None = None
+) -> Array:
     """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on their bound and the rest solved again.
 
     Args:
-        hessian_noise: (F*F, F*F) as in NormalEquations, for the least believed curvature; None for exact curvature.
+        hessian_noise: as in NormalEquations, for the least believed curvature; None for exact curvature.
     """
     low, high = bounds
     step = np.zeros_like(x)
@@ -77,8 +80,7 @@ def solve_box(hessian: Array, gradient: Array, x: Array, bounds: tuple[Array, Ar
             vectors = np.linalg.eigh(reduced)[1] if np.isfinite(reduced).all() else np.eye(len(index))
             directions = np.zeros((len(x), len(index)))
             directions[index] = s[:, None] * vectors
-            pairs = np.einsum("ak,bk->kab", directions, directions).reshape(len(index), -1)
-            floor = np.sqrt(np.maximum(np.einsum("ka,ab,kb->k", pairs, hessian_noise, pairs), 0.0))
+            floor = np.sqrt(hessian_noise.variance(directions))
         room = max(radius**2 - float(((step[fixed] / scale[fixed]) ** 2).sum()), 0.0) ** 0.5
         step[index] = s * solve_ball(reduced, slope, room, floor)
 

@@ -1,0 +1,79 @@
+"""Where a jaw's joint fit starts: each tooth from a fit of its own pixels, hidden and failed ones from the others, gums and wall from what is left."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from services.core.errors import InputError, NonFiniteError
+from services.fit.optics.domain import to_dual, to_natural
+from services.fit.optics.half_space import half_space_reflectance
+from services.fit.optics.parameters import Medium, Mouth, Tissue
+from services.fit.optics.priors import HELD_G
+
+LEAST_TOOTH_PIXELS = 16
+"""A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so few."""
+FRONT_PLACES = (1, 2, 3)
+"""Incisors and canines, the last digit of their FDI numbers: lit and seen best (teeth 2018, section 7)."""
+TOOTH_FAULTS = (InputError, NonFiniteError)
+"""What one tooth's data or meshes can cause; all else is the machine's or the operator's doing and ends the job."""
+GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
+"""Generic soft tissue: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of red and green."""
+
+
+@dataclass(frozen=True)
+class ToothStart:
+    """Where one tooth starts."""
+
+    fdi: int
+    state: Literal["fitted", "tied", "failed"]
+    sentence: str
+    pixels: int
+    tissue: Tissue | None
+    """None where it has to take the others'."""
+
+    @property
+    def is_front(self) -> bool:
+        """Whether it is an incisor or a canine."""
+        return self.fdi % 10 in FRONT_PLACES
+
+
+def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
+    """Fit one tooth alone, unless too little of it is seen; what its own data or meshes cause becomes its state."""
+    if pixels < LEAST_TOOTH_PIXELS:
+        seen = f"shows in {pixels} usable pixels" if pixels else "is hidden in every image"
+        return ToothStart(fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None)
+    try:
+        return ToothStart(fdi, "fitted", "", pixels, fit())
+    except TOOTH_FAULTS as problem:
+        return ToothStart(fdi, "failed", f"Tooth {fdi} could not be fitted and takes the optics of the other teeth: {problem.message}", pixels, None)
+
+
+def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
+    """Median of the front teeth that were fitted, coordinate by coordinate; of all that were where no front tooth was.
+
+    Args:
+        teeth: present optics of each tooth, None where there are none yet.
+
+    Raises:
+        InputError: no tooth was fitted.
+    """
+    fitted = [(start, tissue) for start, tissue in zip(starts, teeth, strict=True) if start.state == "fitted" and tissue is not None]
+    chosen = [tissue for start, tissue in fitted if start.is_front] or [tissue for _, tissue in fitted]
+    if not chosen:
+        raise InputError(f"No tooth of the jaw can be fitted; the first one says: {starts[0].sentence}")
+
+    def median(part: str) -> Medium:
+        values = {kind: to_natural(kind, statistics.median(to_dual(kind, getattr(t.medium(part), kind)) for t in chosen)) for kind in ("sigma", "alpha")}
+        return Medium(values["sigma"], values["alpha"], g1=HELD_G)
+
+    return Tissue(median("enamel"), median("dentin"))
+
+
+def start_mouth(starts: Sequence[ToothStart], gums: Medium | None, *, has_cavity: bool) -> Mouth:
+    """All parts together; the wall reflects like a half space of the gums (teeth 2018, section 4.3)."""
+    common = typical(starts, [start.tissue for start in starts])
+    teeth = tuple(start.tissue or common for start in starts)
+    return Mouth(teeth, gums, half_space_reflectance(gums or GUMS_START) if has_cavity else None)

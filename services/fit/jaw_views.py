@@ -1,0 +1,65 @@
+"""What each pixel of a jaw's photographs shows, by casting a ray through it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.fit.anatomy.rays import RayScene
+from services.fit.blocks import CAVITY, GUMS, PixelParts
+from services.fit.observations import Observations, ViewStack
+
+
+def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple[ViewStack, ...]:
+    """The views with what their pixels show at their middle; pixels whose middle shows nothing are left out.
+
+    Raises:
+        CaptureInputError: no pixel shows anything.
+    """
+    from scipy.spatial import cKDTree
+
+    surroundings = {part: mesh for part, mesh in ((GUMS, observations.gums), (CAVITY, observations.cavity)) if mesh is not None}
+    numbers = np.array([*range(len(observations.teeth)), *surroundings], dtype=np.int16)
+    scene = RayScene(*(tooth.outer for tooth in observations.teeth), *surroundings.values())
+    nearest = cKDTree(np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]))
+    tooth_of = np.repeat(np.arange(len(observations.teeth), dtype=np.int16), [len(tooth.outer.vertices_mm) for tooth in observations.teeth])
+
+    labelled = []
+    for view in views:
+        x, y = view.pixels.T + 0.5
+        hits = scene.first_hits(*view.camera.rays(x, y))
+        shown = numbers[hits.mesh[hits.hit]]
+        tooth = np.where(shown >= 0, shown, tooth_of[nearest.query(hits.points_mm[hits.hit])[1]]).astype(np.int16)
+        if hits.hit.any():
+            labelled.append(replace(view.of(hits.hit), parts=PixelParts(shown, tooth)))
+    if not labelled:
+        raise CaptureInputError("No valid pixel shows a tooth, gums or cavity; check that meshes and cameras share one frame in millimetres.")
+    return tuple(labelled)
+
+
+def showing(views: Sequence[ViewStack], *parts: int) -> tuple[ViewStack, ...]:
+    """The pixels that show some parts (position of a tooth, GUMS, CAVITY); views without any are left out."""
+    return _cut(views, [np.isin(_parts(view).shown, parts) for view in views])
+
+
+def without(views: Sequence[ViewStack], teeth: Sequence[int]) -> tuple[ViewStack, ...]:
+    """The pixels that show none of these teeth."""
+    return _cut(views, [~np.isin(_parts(view).shown, teeth) for view in views])
+
+
+def fitted_pixels(views: Sequence[ViewStack]) -> int:
+    """Pixels with a measurement that the fit may use, over all views."""
+    return sum(int(view.fitted.any(axis=0).sum()) for view in views)
+
+
+def _parts(view: ViewStack) -> PixelParts:
+    assert view.parts is not None
+    return view.parts
+
+
+def _cut(views: Sequence[ViewStack], chosen: Sequence[NDArray[np.bool_]]) -> tuple[ViewStack, ...]:
+    return tuple(view.of(pixels) for view, pixels in zip(views, chosen, strict=True) if pixels.any())

@@ -1,0 +1,188 @@
+"""What the stages of every fit share: the solver's loop through the journal, a report after each step, the errors and curvature at the end."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic
+
+from services.core.records import JobSpec
+from services.fit.evaluate import Evaluation, Shown, evaluate
+from services.fit.journal import Journal
+from services.fit.observations import ChannelFiles, Level
+from services.fit.optics.domain import Domain, similar_tissue
+from services.fit.optics.parameters import Mouth, Optics, Tissue
+from services.fit.passes import Passes, StackProblem
+from services.fit.solve import adam, gauss_newton
+from services.fit.solve.gauss_newton import Options, Solution, State
+from services.fit.solve.normal_equations import NormalEquations
+
+IMAGE_TOLERANCE = 0.004
+"""A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
+
+LEAST_SAMPLES = 4
+"""Paths per pixel, however many pixels there are."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """One step, for whoever watches."""
+
+    channel: str
+    stage: str
+    step: int
+    stage_step: int
+    loss: float
+    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below what the step's samples resolve."""
+    fit_error: float | None
+    held_out_error: float | None
+    held_out_se: float | None
+    """Monte Carlo standard error of ``held_out_error``."""
+    parameters: dict[str, float]
+    samples: int
+    verdict: str
+    tooth: int | None = None
+    """FDI number, while a jaw's fit looks at one tooth alone."""
+
+
+@dataclass(frozen=True)
+class ChannelFit(Generic[Optics]):
+    """A channel's result."""
+
+    tissue: Optics
+    domain: Domain
+    solution: Solution
+    equations: NormalEquations
+    fit_error: float
+    held_out_error: float | None
+    steps: int
+    evaluation: Evaluation
+
+
+@dataclass(kw_only=True)
+class Stages(ABC, Generic[Optics]):
+    """Runs stages of one channel's fit; everything costly goes through the journal, under keys that begin with the seeds' channel."""
+
+    files: ChannelFiles
+    passes: Passes
+    spec: JobSpec
+    journal: Journal
+    report: Callable[[StepReport, Evaluation], None]
+    pause: Callable[[], None]
+    """Called between steps; raises when the job is cancelled."""
+    shown: Shown = ()
+    steps: int = 0
+    """Taken so far, those of earlier fits that are counted with this one included."""
+    tooth: int | None = None
+    """FDI number of the one tooth of a jaw that this fit is about."""
+
+    @property
+    @abstractmethod
+    def media(self) -> tuple[str, ...]:
+        """Media that reports of steps list."""
+
+    @abstractmethod
+    def _others(self, tissue: Optics) -> dict[str, float]:
+        """What they list beside media."""
+
+    @property
+    def scope(self) -> str:
+        """Begins the journal's keys of this fit."""
+        return self.passes.seeds.channel
+
+    def options(self, level: Level) -> Options:
+        """Limits of a stage on images of this resolution; it has converged within ``IMAGE_TOLERANCE``."""
+        most = self.spec.max_samples_per_pixel
+        samples = self.fewer(most) if level is self.files.full else most
+        return Options(max_steps=self.spec.max_steps, max_samples=samples, tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal)
+
+    def short(self, steps: int) -> Options:
+        """Limits of a stage that only prepares the next: so many steps, few samples."""
+        options = self.options(self.files.coarse)
+        samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
+        return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
+
+    def at_full_resolution(self) -> Options:
+        """Go on with full images; returns the limits there."""
+        self.passes = replace(self.passes, blocks=self.files.full.blocks)
+        return self.options(self.files.full)
+
+    def fewer(self, samples: int) -> int:
+        """Paths per pixel of full images, for as many in all as ``samples`` are per pixel of coarse ones."""
+        return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
+
+    def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int) -> tuple[Optics, Solution]:
+        solver = gauss_newton.GaussNewton(problem.domain, options)
+        return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
+
+    def _run(self, solver: Any, kind: Any, problem: StackProblem[Optics], samples: int, burst: int = 1) -> tuple[Optics, Solution]:
+        # A solver's loop; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
+        def advance(state: Any) -> Any:
+            for _ in range(burst):
+                state = state if solver.terminate(state) else solver.step(problem, state)
+            return kind.state_record(state)
+
+        state = solver.init(problem.domain.x_of(problem.base), samples)
+        while not solver.terminate(state):
+            self.pause()
+            entry, is_new = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))
+            self.steps -= state.step
+            state = kind.state_from(entry)
+            self.steps += state.step
+            if is_new:
+                self._tell(problem, state)
+        solution = solver.finish(state)
+        return problem.domain.tissue_at(solution.x, problem.base), solution
+
+    def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
+        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
+        samples = max(solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)))
+        equations = solution.equations
+        if equations is None:
+            self.pause()
+            stored, _ = self.journal.once(f"{self.scope}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
+            equations = NormalEquations.of(stored)
+        evaluation = self._evaluate("final", problem.base, self.fewer(self.spec.max_samples_per_pixel), self.files.full)
+        fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
+        return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
+
+    def _solve(self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float) -> tuple[Optics, Solution]:
+        # A stage in similar media.
+        problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
+        return self._iterate(problem, options, samples)
+
+    def _evaluate(self, label: str, tissue: Tissue | Mouth, samples: int, level: Level) -> Evaluation:
+        passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
+        return evaluate(passes, label, tissue, samples, self.shown)
+
+    def _tell(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
+        stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
+        shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
+        self._announce(stage, state.step, tissue, state.samples, state.verdict, shown)
+
+    def _announce(self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None) -> None:
+        # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
+        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse)
+        fitted, held_out = evaluation.fitted, evaluation.held_out
+        leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
+        values = {f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves} | self._others(tissue)
+        loss = fitted.loss or 0.0
+        self.report(
+            StepReport(
+                self.files.channel,
+                stage,
+                self.steps,
+                stage_step,
+                loss,
+                fitted.resolved_error,
+                held_out.resolved_error,
+                held_out.error_se,
+                values,
+                samples,
+                verdict,
+                self.tooth,
+            ),
+            evaluation,
+        )

@@ -1,0 +1,149 @@
+"""A jaw's fit through the service's door: all teeth with gums and wall, one that fails, one that is hidden, and what is written of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.core.errors import CaptureInputError, DentineError, InputError, SettingsError
+from services.core.records import FitReport, JobSpec
+from services.core.stage import LocalContext, StageEvent
+from services.core.store import open_stage
+from services.fit.jaw_schedule import TIED_SD
+from services.fit.stage import export, run
+from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
+
+FAKE = "tests.support.fake_mouth:FakeMouthEngine"
+FITTED, FAILED, TIED = ("11", "12"), "21", "22"
+
+
+def spec_for(root: Path, **options: Any) -> JobSpec:
+    return jaw_spec(root, **({"samples_per_pixel": 64, "max_samples_per_pixel": 1024} | options))
+
+
+def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **options: Any) -> FitReport:
+    return run(spec_for(root, **options), LocalContext(root, attempt, events.append if events is not None else None), engine=FAKE)
+
+
+def without_time(report: FitReport) -> dict[str, Any]:
+    return report.model_dump(exclude={"seconds"})
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport, list[StageEvent]]:
+    root, events = tmp_path_factory.mktemp("jaw"), list[StageEvent]()
+    write_prepared_jaw(root, FAKE, dark=(21,), hidden=(22,))
+    return root, fit(root, events=events), events
+
+
+def test_teeth_that_are_seen_are_found_within_their_errors(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    _, report, _ = finished
+    for fdi in FITTED:
+        tooth = report.teeth[fdi]
+        assert (tooth.state, tooth.sentence) == ("fitted", "")
+        assert tooth.held_out_error["green"] < 0.02
+        for part in ("enamel", "dentin"):
+            for leaf in ("sigma_s_reduced", "alpha_reduced"):
+                estimate = tooth.parameters["green"][f"{part}.{leaf}"]
+                truth = getattr(TRUE_TEETH[int(fdi)].medium(part), leaf)
+                assert estimate.se is not None
+                # One fit at one seed: 4.5 of its own standard errors.
+                assert abs(estimate.value - truth) < 4.5 * estimate.se, (fdi, part, leaf, estimate)
+    table = report.parameters["green"]
+    for name, truth in (("gums.alpha_reduced", TRUE_GUMS.alpha_reduced), ("cavity.reflectance", TRUE_REFLECTANCE)):
+        assert abs(table[name].value - truth) < 4.5 * (table[name].se or 0.0), (name, table[name])
+
+
+def test_a_failed_tooth_does_not_sink_the_jaw(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    _, report, _ = finished
+    assert report.converged, report.advice
+    tooth = report.teeth[FAILED]
+    assert tooth.state == "failed"
+    assert "Tooth 21 is dark" in tooth.sentence
+    assert tooth.sentence in report.advice
+    assert "green" not in tooth.fit_error
+
+
+def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    _, report, _ = finished
+    assert report.teeth[TIED].state == "tied"
+    assert "hidden in every image" in report.teeth[TIED].sentence
+    for fdi in (TIED, FAILED):
+        for part in ("enamel", "dentin"):
+            sigma = report.teeth[fdi].parameters["green"][f"{part}.sigma"]
+            others = [np.log(report.teeth[other].parameters["green"][f"{part}.sigma"].value) for other in FITTED]
+            # No fitted pixel of the formula depends on them: their prior alone speaks, the median of two front teeth as the last stage found them.
+            assert np.log(sigma.value) == pytest.approx(np.mean(others), abs=TIED_SD["sigma"])
+            assert not sigma.determined
+            assert sigma.se == pytest.approx(TIED_SD["sigma"] * sigma.value, rel=0.01)
+
+
+def test_steps_of_single_teeth_come_before_those_of_the_whole(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    root, report, events = finished
+    steps = [e.data for e in events if e.kind == "step"]
+    assert [s["step"] for s in steps] == list(range(1, report.steps + 1))
+    teeth = [s["tooth"] for s in steps]
+    assert set(teeth) == {11, 12, None}
+    assert teeth.index(None) == len(teeth) - teeth[::-1].index(12)
+    assert {s["stage"] for s in steps if s["tooth"] is None} == {"start.0", "start.1", "start.2", "joint", "exact"}
+    folder, stored = open_stage(root, "fit", FitReport)
+    assert stored == report
+    assert len(json.loads((folder / "history.json").read_text())) == report.steps
+    assert all(e.done is None or 0 <= e.done <= 1 for e in events)
+
+
+def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    root, report, _ = finished
+    manifest = export(spec_for(root), LocalContext(root))
+    assert {f"teeth/{fdi}/{part}.ply" for fdi in FDI for part in ("outer", "dentin")} | {"gums.ply", "cavity.ply", "scene_green.xml"} <= set(manifest.files)
+    parameters = json.loads((root / "parameters.json").read_text())["green"]
+    assert parameters["12.dentin.sigma"] == report.teeth["12"].parameters["green"]["dentin.sigma"].model_dump()
+    assert {"gums.sigma", "cavity.reflectance"} <= parameters.keys()
+    assert json.loads((root / "errors.json").read_text())["teeth"]["21"]["state"] == "failed"
+    page = (root / "report.html").read_text()
+    assert "Jaw of 4 teeth" in page
+    assert report.teeth[FAILED].sentence in page
+
+
+def test_interrupted_fit_resumes_and_ends_with_the_same_answer(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+    _, report, _ = finished
+    write_prepared_jaw(tmp_path, FAKE, dark=(21,), hidden=(22,))
+    joint = next(e.data["step"] for e in finished[2] if e.kind == "step" and e.data["tooth"] is None)
+
+    class StoppedError(Exception):
+        pass
+
+    for attempt, stop_at in enumerate((3, joint), start=1):
+
+        def stop(event: StageEvent, stop_at: int = stop_at) -> None:
+            if event.kind == "step" and event.data["step"] == stop_at:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            run(spec_for(tmp_path), LocalContext(tmp_path, attempt, stop), engine=FAKE)
+    events: list[StageEvent] = []
+    assert without_time(fit(tmp_path, attempt=3, events=events)) == without_time(report)
+    assert min(e.data["step"] for e in events if e.kind == "step") == joint + 1
+
+
+@pytest.mark.parametrize(
+    ("prepared", "options", "kind", "words"),
+    [
+        ({"fdi": (11,)}, {}, CaptureInputError, "at least two teeth"),
+        ({"fdi": (11, 12)}, {"kind": "tooth"}, CaptureInputError, "set kind to 'jaw'"),
+        ({"fdi": (11, 12)}, {"lobes": 2}, SettingsError, "one lobe"),
+        ({"fdi": (11, 12), "dark": (11, 12)}, {}, InputError, "No tooth of the jaw can be fitted"),
+    ],
+)
+def test_what_cannot_be_a_jaw_is_refused_in_one_sentence(
+    tmp_path: Path, prepared: dict[str, Any], options: dict[str, Any], kind: type[DentineError], words: str
+) -> None:  # fmt: skip
+    write_prepared_jaw(tmp_path, FAKE, **prepared)
+    with pytest.raises(kind) as caught:
+        fit(tmp_path, **options)
+    assert words in caught.value.message
+    assert caught.value.message.count(". ") == 0
