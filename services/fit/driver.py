@@ -71,11 +71,13 @@ class FitDriver:
     def _schedule(
         self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]
     ) -> ChannelSchedule:
-        attempt, expected = self.attempt, self.attempt.spec.max_steps + 10
+        attempt, spec = self.attempt, self.attempt.spec
+        media = 2 * spec.adam_steps if spec.solver == "adam" else spec.max_steps + 10
+        expected = 2 * media if spec.stains else media
         return ChannelSchedule(
             files=files,
             passes=attempt.passes(run_on, files, files.channel),
-            spec=attempt.spec,
+            spec=spec,
             journal=journal,
             has_dentin=True,
             modes=0,

@@ -41,12 +41,12 @@ def spec_for(root: Path) -> JobSpec:
     )  # fmt: skip
 
 
-def fit_once(root: Path, engine: str) -> None:
+def fit_once(root: Path, engine: str, **options: Any) -> None:
     """What the pipeline's stage task does: a higher attempt each time it is run."""
     lease = root / "fit.lease"
     attempt = int(lease.read_text()) + 1 if lease.exists() else 1
     (root / "driver.pid").write_text(str(os.getpid()))
-    run(spec_for(root), LocalContext(root, attempt), engine=engine)
+    run(spec_for(root).model_copy(update=options), LocalContext(root, attempt), engine=engine)
 
 
 def answer(root: Path) -> dict[str, Any]:
@@ -82,6 +82,17 @@ def test_a_cluster_gives_the_answer_of_one_process(undisturbed: Path, tmp_path: 
     write_prepared(tmp_path)
     run(spec_for(tmp_path), LocalContext(tmp_path), engine=FAKE)
     assert answer(tmp_path) == answer(undisturbed)
+
+
+@pytest.mark.parametrize("options", [{"stains": True, "loss": "robust"}, {"solver": "adam", "adam_steps": 20}])
+def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(client: Client, tmp_path: Path, options: dict[str, Any]) -> None:
+    # Photographs too uneven for media alone: stains and weights have something to say.
+    for name in ("cluster", "here"):
+        write_prepared(tmp_path / name, uneven=0.2, shadowed=0.05)
+    client.submit(fit_once, tmp_path / "cluster", FAKE, pure=False, **options).result(timeout=200)
+    fit_once(tmp_path / "here", FAKE, **options)
+    assert answer(tmp_path / "cluster") == answer(tmp_path / "here")
+    assert {row["kind"] for row in trace(tmp_path / "cluster")} >= {"stain" if "stains" in options else "gradient" if "solver" in options else "image"}
 
 
 def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
 
 
 def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
-    options = {"solver": "adam", "adam_steps": 150}
+    options = {"solver": "adam", "adam_steps": 80}
     write_prepared(tmp_path / "whole")
     report = fit(tmp_path / "whole", **options)
     # A constant rate of 0.05 leaves densities wandering by 3 % a step, several times that where enamel and dentin trade places.

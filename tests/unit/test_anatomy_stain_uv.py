@@ -8,7 +8,6 @@ import trimesh
 
 from services.core.geometry import Mesh
 from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.stain_paint import painted_depth
 from services.fit.anatomy.stain_uv import REACH, TEXEL_MM, StainLayout, bilinear_texels, stain_layout, texel_edge_mm
 
 TEXEL = 0.75
@@ -86,14 +85,3 @@ def test_textures_and_depths_are_the_same_thing(layout: StainLayout) -> None:
 def test_texels_follow_the_pixels_within_limits() -> None:
     assert texel_edge_mm(0.4) == pytest.approx(0.6)
     assert (texel_edge_mm(0.01), texel_edge_mm(5.0)) == TEXEL_MM
-
-
-def test_painted_stains_are_plausible(layout: StainLayout) -> None:
-    depth = painted_depth(layout, seed=1)
-    assert (depth >= 0).all()
-    assert depth.max() < 1.5
-    low = layout.points_mm[:, 2] < np.quantile(layout.points_mm[:, 2], 0.2)
-    assert depth[low].mean() > depth[~low].mean()
-    np.testing.assert_array_equal(painted_depth(layout, 1), depth)
-    np.testing.assert_allclose(painted_depth(layout, 1, strength=0.5), 0.5 * depth)
-    assert (painted_depth(layout, 2) != depth).any()

@@ -70,7 +70,7 @@ def test_converges_under_noise() -> None:
 
 
 def test_a_fit_that_still_moves_says_so() -> None:
-    solver, state = Adam(DOMAIN), solve(NoisyQuadratic(np.eye(4)), Options(rate=1e-3, max_steps=120), BEST + 1.0)
+    solver, state = Adam(DOMAIN), solve(NoisyQuadratic(np.eye(4)), Options(rate=1e-3, max_steps=200), BEST + 1.0)
     solution = solver.finish(state)
     assert not solution.result.converged
     assert solution.advice == ADVICE_MORE_STEPS

@@ -53,7 +53,7 @@ class Options:
     epsilon: float = 1e-8
     """Relative to the largest gradient seen, because the loss has no natural unit."""
     max_steps: int = 300
-    window: int = 20
+    window: int = 40
     still: float = 2.0
     """Steady progress would part the two means by 2 ``window`` rates."""
 
