@@ -134,7 +134,11 @@ class Stages(ABC, Generic[Optics]):
         return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation, problem, samples)
 
     def _close(
-        self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int  # noqa: ARG002 - of a fit that measures
+        self,
+        problem: StackProblem[Optics],
+        solution: Solution,
+        equations: NormalEquations,
+        samples: int,  # noqa: ARG002 - of a fit that measures
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
         # How sure the answer is, of what is known already; a fit may measure more, and move once more by it.
         return problem, solution, uncertainty(problem.domain, solution.x, equations)
