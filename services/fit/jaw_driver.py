@@ -68,6 +68,9 @@ class JawDriver:
         observations = read_observations(attempt.context.root, spec)
         observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
         dentins = [known_dentin(tooth) for tooth in observations.teeth]
+        for tooth in observations.teeth if spec.dentin != "none" else ():
+            if tooth.dentin is None:
+                attempt.log(f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh.")
         channels = []
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
@@ -81,10 +84,12 @@ class JawDriver:
 
 
 def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> Tooth:
-    """A jaw's tooth with its dentin: the given one, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
+    """A jaw's tooth with its dentin: the given one if any, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
 
-    A tooth whose mesh allows none is homogeneous.
+    A tooth whose mesh allows no such shape is homogeneous.
     """
+    if spec.dentin == "known":
+        return tooth
     try:
         shape = dentin_shape(tooth, cameras, spec)
     except TOOTH_FAULTS:

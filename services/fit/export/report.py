@@ -91,7 +91,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         channels=list(report.parameters),
         parameters=_parameter_rows(report.parameters),
         teeth=_tooth_rows(report.teeth),
-        tooth_sentences=[tooth.sentence for tooth in report.teeth.values() if tooth.sentence],
+        tooth_sentences=[(fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()],
         thickness=_thickness(pictures),
         thickness_bar=_gradient(SEQUENTIAL),
         stains=_stains(pictures),
