@@ -18,7 +18,7 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
-from services.fit.identifiability import correlation, told
+from services.fit.identifiability import NOTHING, correlation, told
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, read_channel, read_observations, write_channel
 from services.fit.passes import Passes, TraceRow
@@ -74,7 +74,7 @@ class FitDriver:
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
-                if spec.advise and number == 0:
+                if spec.advise and number == 0 and fits[channel].solution.result.converged:
                     next_capture = schedule.next_capture(fits[channel], folder / "inputs")
         report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
@@ -124,16 +124,18 @@ class FitDriver:
         off = {c: max(fit.fit_error, fit.held_out_error or 0.0) for c, fit in fits.items()}
         unexplained = [c for c, error in off.items() if error > UNEXPLAINED]
         advice += [f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples." for c in unexplained]
+        converged = not unexplained and all(fit.solution.result.converged for fit in fits.values())
+        correlations = {c: correlation(known[c]) for c in fits}
         return FitReport(
-            converged=not unexplained and all(fit.solution.result.converged for fit in fits.values()),
+            converged=converged,
             advice=" ".join(advice),
             parameters=tables,
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
             steps=sum(fit.steps for fit in fits.values()),
             shape=fits[first].tissue.shape,
-            correlations=(correlations := {c: correlation(known[c]) for c in fits}),
-            told=told(tables, correlations),
+            correlations=correlations,
+            told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )
 
