@@ -15,7 +15,7 @@ from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_
 from services.fit.attempt import Attempt, judge
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
-from services.fit.identifiability import correlation, told
+from services.fit.identifiability import NOTHING, correlation, told
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.optics.parameters import Tissue
@@ -59,7 +59,7 @@ class FitDriver:
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
-                if spec.advise and number == 0:
+                if spec.advise and number == 0 and fits[channel].solution.result.converged:
                     next_capture = schedule.next_capture(fits[channel], attempt.inputs)
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if layout is not None and textures:
@@ -99,6 +99,7 @@ class FitDriver:
         known = {c: fit.known for c, fit in fits.items()}
         tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         converged, advice = judge(fits)
+        correlations = {c: correlation(known[c]) for c in fits}
         return FitReport(
             converged=converged,
             advice=" ".join(advice),
@@ -107,8 +108,8 @@ class FitDriver:
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
             steps=sum(fit.steps for fit in fits.values()),
             shape=fits[first].tissue.shape,
-            correlations=(correlations := {c: correlation(known[c]) for c in fits}),
-            told=told(tables, correlations),
+            correlations=correlations,
+            told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )
 

@@ -10,6 +10,7 @@ import numpy as np
 from services.core.records import Correlation, Estimate
 from services.fit.solve.covariance import Uncertainty
 
+NOTHING = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
 QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
 COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}
 """What grows with a coordinate, and the sign of that."""
@@ -20,10 +21,11 @@ EXCHANGEABLE = 0.9
 
 
 def correlation(known: Uncertainty) -> Correlation:
-    """Correlation of the fitted coordinates; one without any error has none with others."""
-    errors = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
+    """Correlation of the fitted coordinates' errors, but for what is left of the step to the minimum; one without any error has none with others."""
+    covariance = known.covariance if known.sandwich is None else known.sandwich.covariance
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(errors > 0, errors, np.inf)
-    matrix = np.clip(known.covariance / np.outer(scale, scale), -1.0, 1.0)
+    matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
     return Correlation(names=known.domain.names, matrix=tuple(tuple(float(v) for v in row) for row in matrix))
 

@@ -107,22 +107,29 @@ def advice(
 
 
 def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidates: Sequence[Candidate]) -> str:
-    """The best candidate in words, judged by the quantity whose relative error is largest now."""
+    """The best candidate in words, judged by the quantity whose relative error is largest now; by the next one where that stays out of every reach."""
     before = relative_errors(estimates(tissue, parts, known))
     if not before or not candidates:
         return ""
-    worst = max(before, key=lambda name: before[name])
+    names = sorted(before, key=lambda name: -before[name])
+    found = [(candidate, predicted(tissue, parts, known, candidate)) for candidate in candidates]
+    for name in names:
+        candidate, (after, unsure) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
+        if after + unsure <= (1 - WORTH) * min(before[name], 1.0):
+            was = _percent(before[name]) if before[name] <= 1 else "more than 100 %"
+            return f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to {_percent(after)}."
+    return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(names[0])} by more than a tenth."
 
-    def after(added: Addition) -> float:
+
+def predicted(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate) -> dict[str, tuple[float, float]]:
+    """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice, differ by noise alone."""
+
+    def after(added: Addition) -> dict[str, float]:
         assert known.sandwich is not None
-        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added))))[worst]
+        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added))))
 
-    # Half the pixels, counted twice, predict the same but for noise; the difference tells how sure the whole is.
-    predicted = [(after(c.whole), 0.5 * abs(after(c.halves[0].scaled(2)) - after(c.halves[1].scaled(2))), c.words) for c in candidates]
-    best, unsure, words = min(predicted, key=lambda entry: entry[0] + entry[1])
-    if best + unsure > (1 - WORTH) * before[worst]:
-        return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(worst)} by more than a tenth."
-    return f"{words} would help most: it would cut the error of {in_words(worst)} from {_percent(before[worst])} to {_percent(best)}."
+    whole, *halves = (after(added) for added in (candidate.whole, *(half.scaled(2) for half in candidate.halves)))
+    return {name: (value, 0.5 * abs(halves[0][name] - halves[1][name])) for name, value in whole.items()}
 
 
 def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:

@@ -5,9 +5,9 @@ python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --out honest_err
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --out honest_errors_formula.json
 
 Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
-six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits
-hold; with more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
-``--formula`` puts a formula in place of light transport, in which similar media are not alike either: seconds per fit, and errors of the solver alone.
+six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits hold; with
+more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
+``--formula`` puts a formula in place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
 """
 
 from __future__ import annotations

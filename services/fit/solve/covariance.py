@@ -58,6 +58,12 @@ class Sandwich:
     misfit: float
     """Factor s by which residuals exceed the measurements' noise."""
 
+    @property
+    def covariance(self) -> Array:
+        """Of x, (F, F)."""
+        half = self.transform @ self.inverse
+        return np.asarray(half @ self.meat @ half.T)
+
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -171,8 +177,9 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: Clos
     # What is left of the step counts as error along what is not open.
     rest = t @ inverse @ left / domain.scale
     rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
-    covariance = t @ inverse @ meat @ inverse.T @ t.T + np.outer(rest, rest)
-    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, Sandwich(t, inverse, meat, misfit))
+    sandwich = Sandwich(t, inverse, meat, misfit)
+    covariance = sandwich.covariance + np.outer(rest, rest)
+    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich)
 
 
 def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:
