@@ -191,6 +191,7 @@ def phantom(
     dentin: Annotated[Path | None, typer.Option(help="Dentin surface to use instead of the procedural one.")] = None,
     highlights: Annotated[bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")] = False,
     gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
+    subject: Annotated[int | None, typer.Option(min=0, help="Seed of a random subject's optics; default: typical ones.")] = None,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
     from services.fit.anatomy.phantom import write_phantom
@@ -208,6 +209,7 @@ def phantom(
         dentin=dentin,
         highlights=highlights,
         gums=gums,
+        subject=subject,
     )
     print(f"phantom: {out}")
 
@@ -274,22 +276,25 @@ _BENCHMARKS = MappingProxyType(
     {
         "slab": "services.fit.bench.slab:run",
         "stability": "services.fit.bench.stability:run",
+        "tooth": "services.fit.bench.tooth:run",
         "transport-gradient": "services.fit.bench.transport_gradient:run",
         "transport-lights": "services.fit.bench.transport_lights:run",
         "transport-skip": "services.fit.bench.transport_skip:run",
         "transport-stack": "services.fit.bench.transport_stack:run",
     }
 )
-"""Name -> ``module:function``; the function takes ``quick`` and returns JSON values."""
+"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and ``keep``, which stores unfinished rows."""
 
 
 def bench(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run, or all; without it they are listed.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file, and a picture of it beside it.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A smaller case, for a check.")] = False,
+    case: Annotated[str | None, typer.Option(help="Which case of a benchmark that has several.")] = None,
 ) -> None:
     """Measure speed with its error beside it."""
     import importlib
+    import inspect
 
     if name is None:
         print("\n".join(_BENCHMARKS))
@@ -301,7 +306,16 @@ def bench(
     for one in names:
         address, function = _BENCHMARKS[one].split(":")
         modules[one] = importlib.import_module(address)
-        results[one] = getattr(modules[one], function)(quick=quick)
+        measure = getattr(modules[one], function)
+        accepted = inspect.signature(measure).parameters
+        options: dict[str, Any] = {"quick": quick}
+        if case is not None:
+            if "case" not in accepted:
+                raise InputError(f"Benchmark {one} has only one case; leave out --case.")
+            options["case"] = case
+        if "keep" in accepted and json_file is not None and name != "all":
+            options["keep"] = lambda rows: json_file.write_text(json.dumps(rows, indent=1) + "\n")
+        results[one] = measure(**options)
     text = json.dumps(results if name == "all" else results[name], indent=1)
     print(text)
     if json_file is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from services.core.store import write_atomic, write_record
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.anatomy.subjects import subject_tissues
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, View, single_tooth
@@ -51,6 +53,7 @@ def write_phantom(
     renderer: Renderer = "engine",
     highlights: bool = False,
     gums: bool = False,
+    subject: int | None = None,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``teeth/11``) and ``truth.json`` with its optics.
 
@@ -65,6 +68,7 @@ def write_phantom(
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
         highlights: add the surface's reflection of each light; also written alone to ``highlights/<camera>_<light>.npy``.
         gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
+        subject: seed of a random subject's optics; None for those of ``TRUE_TISSUE``.
 
     Raises:
         InputError: impossible combination of options.
@@ -73,6 +77,7 @@ def write_phantom(
     tooth, collar = _tooth(outer, dentin)
     shown_gums = collar if gums else None
     names = CHANNELS[channels]
+    tissues = TRUE_TISSUE if subject is None else subject_tissues(subject, names)
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, (tooth.outer,))
     _write_meshes(out, tooth, shown_gums)
@@ -80,7 +85,10 @@ def write_phantom(
     entries = []
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
-        stacks = [_render(out, tooth, camera, rig_lights, c, name, surface, boundary, renderer, samples, seed + 7919 * number) for c, name in enumerate(names)]
+        stacks = [
+            _render(out, tooth, camera, rig_lights, c, tissues[name], surface, boundary, renderer, samples, seed + 7919 * number)
+            for c, name in enumerate(names)
+        ]
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
         share = surface.enamel_share[None, ..., None]
         mean, variance = mean * share + surface.gums, variance * share**2
@@ -94,7 +102,7 @@ def write_phantom(
                 _write_image(out / "highlights" / f"{stem}.npy", surface.highlight[n])
             held_out = n % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
             entries.append(ImageEntry(camera=camera.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy", held_out=held_out))
-    truth = _truth(names, boundary, renderer, samples, seed, highlights, gums)
+    truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums)
     write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
     write_record(out / "capture.json", FolderCapture(units="mm", channels=names, cameras=rig_cameras, lights=rig_lights, images=tuple(entries)))
 
@@ -157,7 +165,7 @@ def _render(
     camera: Camera,
     lights: tuple[Light, ...],
     channel: int,
-    name: str,
+    tissue: Tissue,
     surface: Reflection,
     boundary: Boundary,
     renderer: Renderer,
@@ -167,7 +175,7 @@ def _render(
     """Radiance (L, H, W) from inside the tooth, and the variance of its mean."""
     prepare_device()
     if renderer == "mitsuba":
-        return _render_mitsuba(out, tooth, camera, lights, channel, TRUE_TISSUE[name], samples, seed)
+        return _render_mitsuba(out, tooth, camera, lights, channel, tissue, samples, seed)
     from services.fit.transport.engine import Engine
 
     recipe = single_tooth(
@@ -179,7 +187,7 @@ def _render(
         ior=IOR,
     )
     pixels = np.argwhere(surface.enamel_pixels)[:, ::-1].astype(np.int32)
-    estimate = Engine(recipe).images(TRUE_TISSUE[name], View(camera, pixels), samples=samples, seed=seed)
+    estimate = Engine(recipe).images(tissue, View(camera, pixels), samples=samples, seed=seed)
     width, height = camera.size
     images = np.zeros((2, len(lights), height, width))
     # Single estimates of almost no light may come out below zero; a photograph's cannot.
@@ -210,20 +218,20 @@ def _write_image(path: Path, image: NDArray[np.float64]) -> None:
     np.save(path, image.astype(np.float32))
 
 
-def _truth(names: tuple[str, ...], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
-    tissues = {
+def _truth(tissues: Mapping[str, Tissue], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
+    optics = {
         name: {
             part: {field: getattr(medium, field) for field in MEDIUM_FIELDS}
             | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced}
             for part, medium in parts
         }
-        for name, parts in ((name, (("enamel", TRUE_TISSUE[name].enamel), ("dentin", TRUE_TISSUE[name].dentin))) for name in names)
+        for name, parts in ((name, (("enamel", tissue.enamel), ("dentin", tissue.dentin))) for name, tissue in tissues.items())
     }
     surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
     return {
         "boundary": boundary,
         "ior": IOR if boundary == "thin" else 1.0,
-        "channels": tissues,
+        "channels": optics,
         "highlights": surface,
         "gums": gums,
         "renderer": renderer,
