@@ -4,7 +4,7 @@ python -m tests.benchmarks.fit_table --cases homogeneous,known --out fit_table.j
 python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --out starts.json
 
 Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the truth's Monte Carlo noise taken out,
-and are not below what the photographs' noise resolves. Fits run in this process; ``seconds`` is its processor time.
+and are not below what the photographs' noise resolves. Fits run in this process, on one thread; ``seconds`` is its processor time.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from services.fit.bench.tooth_capture import PreparedTooth, prepared_tooth, tiss
 from services.fit.optics.parameters import Tissue
 from services.fit.schedule import ChannelSchedule
 from services.fit.stage import fitted_tooth, run
+from services.fit.transport.platform import prepare_device
 from tests.support.truths import SIDE_LIGHTS, Truth, write_capture
 
 LAYERED = ("central-incisor", "canine", "premolar")
@@ -235,6 +236,7 @@ def main() -> None:
     parser.add_argument("--options", default="{}", help="options of every fit's job, JSON")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
+    prepare_device(threads=1)
     rows: list[dict[str, Any]] = []
     for name in arguments.cases.split(","):
         with tempfile.TemporaryDirectory() as folder:

@@ -4,7 +4,7 @@ Everyone fits the same noisy photographs of five lights, from nothing to paramet
 and kernels compiled on the clock. At marks along the way everyone's parameters are judged alike, off the clock: three held-out lights, exact media,
 1,024 paths per pixel and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
 
-Seconds are processor time of all threads of this process, which other jobs on the machine hardly move. The peer chooses one of three learning rates, five
+Everyone has one thread, and seconds are its processor time, which other jobs on the machine hardly move. The peer chooses one of three learning rates, five
 minutes each, by its error on the fitted images; the best one goes on until 40 minutes, of which those five count. Its ratio is its time to the target over
 ours; the target is our last error times ``MARGIN``, or what the photographs' noise resolves where that is more. A peer that never got there has a lower
 bound.
@@ -25,6 +25,7 @@ from services.fit.bench import Row
 from services.fit.bench.stock_fit import StockFit
 from services.fit.bench.tooth_capture import PreparedTooth, smallest_case, tissue_of
 from services.fit.optics.parameters import Tissue
+from services.fit.transport.platform import prepare_device
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,6 +90,7 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
         from services.fit.bench.tooth_scale import run as run_scale
 
         return run_scale(quick=quick, keep=keep)
+    prepare_device(threads=1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tooth = smallest_case(folder, pixel_step=3 if quick else 1)
