@@ -206,7 +206,7 @@ def phantom(
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
-    of_jaw = {"--subject": subject is not None, "--scan": scan is not None}
+    of_jaw = {"--scan": scan is not None}
     of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--highlights": highlights, "--gums": gums, "--stains": stains}
     for option, given in (of_tooth if jaw else of_jaw).items():
         if given:
@@ -220,7 +220,7 @@ def phantom(
     else:
         from services.fit.anatomy.phantom import write_phantom
 
-        write_phantom(out, outer=outer, dentin=dentin, highlights=highlights, gums=gums, stains=stains, **rig)
+        write_phantom(out, outer=outer, dentin=dentin, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
     print(f"phantom: {out}")
 
 
@@ -286,22 +286,25 @@ _BENCHMARKS = MappingProxyType(
     {
         "slab": "services.fit.bench.slab:run",
         "stability": "services.fit.bench.stability:run",
+        "tooth": "services.fit.bench.tooth:run",
         "transport-gradient": "services.fit.bench.transport_gradient:run",
         "transport-lights": "services.fit.bench.transport_lights:run",
         "transport-skip": "services.fit.bench.transport_skip:run",
         "transport-stack": "services.fit.bench.transport_stack:run",
     }
 )
-"""Name -> ``module:function``; the function takes ``quick`` and returns JSON values."""
+"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and ``keep``, which stores unfinished rows."""
 
 
 def bench(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run, or all; without it they are listed.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file, and a picture of it beside it.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A smaller case, for a check.")] = False,
+    case: Annotated[str | None, typer.Option(help="Which case of a benchmark that has several.")] = None,
 ) -> None:
     """Measure speed with its error beside it."""
     import importlib
+    import inspect
 
     if name is None:
         print("\n".join(_BENCHMARKS))
@@ -313,7 +316,16 @@ def bench(
     for one in names:
         address, function = _BENCHMARKS[one].split(":")
         modules[one] = importlib.import_module(address)
-        results[one] = getattr(modules[one], function)(quick=quick)
+        measure = getattr(modules[one], function)
+        accepted = inspect.signature(measure).parameters
+        options: dict[str, Any] = {"quick": quick}
+        if case is not None:
+            if "case" not in accepted:
+                raise InputError(f"Benchmark {one} has only one case; leave out --case.")
+            options["case"] = case
+        if "keep" in accepted and json_file is not None and name != "all":
+            options["keep"] = lambda rows: json_file.write_text(json.dumps(rows, indent=1) + "\n")
+        results[one] = measure(**options)
     text = json.dumps(results if name == "all" else results[name], indent=1)
     print(text)
     if json_file is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.anatomy.stain_paint import painted_stains
 from services.fit.anatomy.stain_uv import ToothStains
+from services.fit.anatomy.subjects import subject_tissues
 from services.fit.export.stains import keep_stains, write_textures
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
@@ -51,6 +53,7 @@ def write_phantom(
     gums: bool = False,
     stains: bool = False,
     held_out: int | None = None,
+    subject: int | None = None,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``teeth/11``) and ``truth.json`` with its optics.
 
@@ -65,6 +68,7 @@ def write_phantom(
         gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
         stains: paint stains on the enamel; also written as ``stains.npz``.
         held_out: how many lights are marked as held out; default every fourth.
+        subject: seed of a random subject's optics; None for those of ``TRUE_TISSUE``.
 
     Raises:
         InputError: impossible combination of options.
@@ -74,18 +78,20 @@ def write_phantom(
     tooth, collar = _tooth(outer, dentin)
     shown_gums = collar if gums else None
     names = CHANNELS[channels]
+    tissues = TRUE_TISSUE if subject is None else subject_tissues(subject, names)
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, (tooth.outer,))
     _write_meshes(out, tooth, shown_gums)
     painted = painted_stains(tooth.outer, names, seed) if stains else None
     if painted is not None:
         keep_stains(out, painted)
+    stained = {name: tissues[name] if painted is None else replace(tissues[name], stain=painted.textures[name]) for name in names}
 
     entries, kept = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
-            _render(out, tooth, camera, rig_lights, c, name, surface, boundary, renderer, samples, seed + 7919 * number, painted)
+            _render(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples, seed + 7919 * number, painted)
             for c, name in enumerate(names)
         ]  # fmt: skip
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
@@ -97,7 +103,7 @@ def write_phantom(
         if highlights:
             for n, light in enumerate(rig_lights):
                 write_image(out / "highlights" / f"{camera.name}_{light.name}.npy", surface.highlight[n])
-    truth = _truth(names, boundary, renderer, samples, seed, highlights, gums) | {"stains": stains}
+    truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums) | {"stains": stains}
     write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
@@ -141,7 +147,7 @@ def _render(
     camera: Camera,
     lights: tuple[Light, ...],
     channel: int,
-    name: str,
+    tissue: Tissue,
     surface: Reflection,
     boundary: Boundary,
     renderer: Renderer,
@@ -159,9 +165,9 @@ def _render(
         if painted is not None:
             shell = folder / "stained.ply"
             write_mapped_mesh(shell, tooth.outer, painted.corners_uv)
-            pictures = {str(tooth.fdi): write_textures(folder, painted)[name]}
+            pictures = {str(tooth.fdi): tuple(write_textures(folder, painted).values())[channel]}
         files = {str(tooth.fdi): (shell, folder / "dentin.ply" if tooth.dentin is not None else None)}
-        scene = nested_scene(files, TRUE_TISSUE[name], (camera,), lights[0].position_mm, 1.0, stains=pictures)
+        scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=pictures)
         return render_mitsuba(scene, lights, channel, samples, seed)
     from services.fit.transport.engine import Engine
 
@@ -173,20 +179,18 @@ def _render(
         boundary=boundary,
         ior=IOR,
     )
-    tissue = TRUE_TISSUE[name]
     if painted is not None:
         recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=painted.corners_uv),))
-        tissue = replace(tissue, stain=painted.textures[name])
     return render_engine(Engine(recipe), tissue, camera, surface.enamel_pixels, samples, seed)
 
 
-def _truth(names: tuple[str, ...], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
-    tissues = {name: {"enamel": medium_truth(TRUE_TISSUE[name].enamel), "dentin": medium_truth(TRUE_TISSUE[name].dentin)} for name in names}
+def _truth(tissues: Mapping[str, Tissue], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
+    optics = {name: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)} for name, tissue in tissues.items()}
     surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
     return {
         "boundary": boundary,
         "ior": IOR if boundary == "thin" else 1.0,
-        "channels": tissues,
+        "channels": optics,
         "highlights": surface,
         "gums": gums,
         "renderer": renderer,

@@ -1,0 +1,125 @@
+"""Prepared captures of one tooth for benchmarks of its fit, and the judge of what everyone makes of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.records import JobSpec
+from services.core.stage import LocalContext
+from services.core.store import is_published
+from services.fit.evaluate import ErrorSums, error_sums
+from services.fit.observations import Observations, ViewStack, read_channel, read_observations
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import View, single_tooth
+
+REAL_TOOTH = Path("shared") / "data" / "tooth-ur1-truth"
+"""A scanned incisor, where this data lies beside the checkout; elsewhere a phantom takes its place."""
+CAMERA, CHANNEL = "c0", "green"
+NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
+"""Sensor noise: of the value, and of the image's maximum."""
+PHANTOM_SAMPLES = 256
+
+
+def real_tooth() -> Path | None:
+    """The scanned incisor's capture, if this machine has it."""
+    folder = Path(__file__).resolve().parents[4] / REAL_TOOTH
+    return folder if folder.is_dir() else None
+
+
+def sensor_noise(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Variance that a camera adds; none off the tooth."""
+    return np.where(image > 0, (NOISE_RELATIVE * image) ** 2 + (NOISE_FLOOR * image.max()) ** 2, 0.0)
+
+
+def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> None:
+    """Copy one camera of a folder capture and add sensor noise."""
+    shutil.copytree(source / "teeth", target / "teeth")
+    description = json.loads((source / "capture.json").read_text())
+    description["cameras"] = [one for one in description["cameras"] if one["name"] == camera]
+    description["images"] = [image for image in description["images"] if image["camera"] == camera]
+    (target / "capture.json").write_text(json.dumps(description))
+    random = np.random.default_rng(seed)
+    for image in description["images"]:
+        mean, variance = (np.load(source / image[key]).astype(np.float64) for key in ("file", "variance_file"))
+        added = sensor_noise(mean)
+        np.save(target / image["file"], (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32))
+        np.save(target / image["variance_file"], (variance + added).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class PreparedTooth:
+    """A prepared capture in one channel, and what judges a fit of it: exact media, the same for everyone measured."""
+
+    job: Path
+    """Folder with the stage ``prepared``."""
+    spec: JobSpec
+    observations: Observations
+    views: tuple[ViewStack, ...]
+    engine: Engine
+
+    def errors(self, tissue: Tissue, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
+        """On fitted and on held-out images, by two renders of so many paths per pixel."""
+        fitted, held_out = ErrorSums(), ErrorSums()
+        for number, view in enumerate(self.views):
+            seen = View(view.camera, view.pixels)
+            first, second = (self.engine.images(tissue, seen, samples=samples, seed=7919 * number + 2 * seed + k).mean for k in range(2))
+            held = view.held_out[:, None]
+            fitted += error_sums(first, second, view.reference, view.variance, view.valid & ~held)
+            held_out += error_sums(first, second, view.reference, view.variance, view.valid & held)
+        return fitted, held_out
+
+    def resolution(self, held_out: bool = True) -> float:
+        """The error that the photographs' own noise can look like, one standard deviation."""
+        chosen = [view.valid & (view.held_out[:, None] == held_out) for view in self.views]
+        reference, variance = (
+            np.concatenate([getattr(view, name)[one] for view, one in zip(self.views, chosen, strict=True)]) for name in ("reference", "variance")
+        )
+        return float((2 * variance @ variance) ** 0.25 / np.sqrt(reference @ reference - variance.sum()))
+
+
+def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
+    """Prepare a capture below ``job``, unless that is done, and build its scene."""
+    from services.fit.driver import dentin_shape
+    from services.fit.transport.platform import prepare_device
+    from services.preprocess.stage import run as prepare
+
+    prepare_device()
+    if not is_published(job, "prepared"):
+        prepare(spec, LocalContext(job))
+    observations = read_observations(job, spec)
+    dentin = dentin_shape(observations.tooth, observations.manifest.cameras, spec)
+    recipe = single_tooth(observations.tooth.outer, dentin, observations.light_positions_mm, observations.light_intensities(channel), spec.boundary, spec.ior)
+    return PreparedTooth(job, spec, observations, read_channel(observations, channel, spec), Engine(recipe))
+
+
+def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> PreparedTooth:
+    """Write and prepare the smallest real case below ``folder``: one view, five lights to fit and those its capture holds out."""
+    source = real_tooth()
+    if source is None:
+        from services.fit.anatomy.phantom import write_phantom
+
+        source = folder / "phantom"
+        write_phantom(source, cameras=1, samples=PHANTOM_SAMPLES, renderer="mitsuba", subject=1)
+    write_noisy(source, folder / "capture", seed)
+    options = {"capture": folder / "capture", "boundary": "matched", "dentin": "known", "pixel_step": pixel_step, "seed": seed}
+    return prepared_tooth(folder / "job", JobSpec.model_validate(options))
+
+
+def tissue_of(values: Mapping[str, float]) -> Tissue:
+    """Of the parameters that a fit reports; a tooth without dentin is enamel throughout."""
+
+    def medium(part: str) -> Medium:
+        sigma, alpha, beta, g1, g2 = (values[f"{part}.{leaf}"] for leaf in MEDIUM_FIELDS)
+        return Medium(sigma, alpha, beta, g1, g2)
+
+    enamel = medium("enamel")
+    shape = tuple(values[name] for name in sorted(values) if name.startswith("shape."))
+    return Tissue(enamel, medium("dentin") if "dentin.sigma" in values else enamel, shape)
