@@ -15,6 +15,7 @@ from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.anatomy.blend import dentin_blend_shape
+from services.fit.anatomy.dimensions import upper_tooth
 from services.fit.anatomy.jaw import build_jaw
 from services.fit.anatomy.jaw_optics import GUMS_IOR, jaw_mouth
 from services.fit.anatomy.phantom import IOR
@@ -74,7 +75,7 @@ def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSur
         middle = sum(SCAN_DENTIN) / 2
         c = (middle,) * 3 if subject is None else tuple(np.random.default_rng((subject, _DENTIN, tooth.fdi)).uniform(*SCAN_DENTIN, 3).tolist())
         try:
-            shape = dentin_blend_shape(tooth.outer, frame)
+            shape = dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
         except MeshError:
             # A crown too thin for any dentin is enamel throughout.
             teeth.append(tooth)

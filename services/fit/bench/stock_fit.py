@@ -38,7 +38,7 @@ class StockFit:
         self.rate, self.rounds, self.seconds, self._samples = rate, 0, 0.0, samples
         begun = time.process_time()
         files = folder / "outer.ply", folder / "dentin.ply"
-        seen, tooth, (view,) = case.observations, case.observations.tooth, case.views
+        seen, (tooth,), (view,) = case.observations, case.observations.teeth, case.views
         assert tooth.dentin is not None
         for file, mesh in zip(files, (tooth.outer, tooth.dentin), strict=True):
             write_mesh(file, mesh)

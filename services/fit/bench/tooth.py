@@ -108,6 +108,7 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
 def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothRow]:
     """The product's own fit stage in this process, judged after every step of its solver and at its end."""
     from services.core.store import StageWriter
+    from services.fit.attempt import Attempt
     from services.fit.driver import FitDriver
     from services.fit.stage import ENGINE
 
@@ -125,7 +126,7 @@ def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothR
     (folder / "prepared").symlink_to(judge.case.job / "prepared")
     context = LocalContext(folder, listener=listen)
     started = time.process_time()
-    report = FitDriver(spec, context, StageWriter(folder, "fit", 1), ENGINE).run(time.time())
+    report = FitDriver(Attempt(spec, context, StageWriter(folder, "fit", 1), ENGINE)).run(time.time())
     seconds = time.process_time() - started - paused
     values = {name: estimate.value for name, estimate in report.parameters["green"].items()}
     rows.append(judge.row(peer, seconds, tissue_of(values), "final"))

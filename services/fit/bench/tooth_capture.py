@@ -95,8 +95,9 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
     if not is_published(job, "prepared"):
         prepare(spec, LocalContext(job))
     observations = read_observations(job, spec)
-    dentin = dentin_shape(observations.tooth, observations.manifest.cameras, spec)
-    recipe = single_tooth(observations.tooth.outer, dentin, observations.light_positions_mm, observations.light_intensities(channel), spec.boundary, spec.ior)
+    (tooth,) = observations.teeth
+    dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
+    recipe = single_tooth(tooth.outer, dentin, observations.light_positions_mm, observations.light_intensities(channel), spec.boundary, spec.ior)
     return PreparedTooth(job, spec, observations, read_channel(observations, channel, spec), Engine(recipe))
 
 
