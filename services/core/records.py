@@ -110,6 +110,7 @@ class JobSpec(Record):
     max_samples_per_pixel: int = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
     max_steps: int = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
     search_candidates: int = Field(default=50_000, ge=100, description="table-search points per channel")
+    advise: bool = Field(default=True, description="say at the end which further light or view would help most")
     sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
     workers: int = Field(default=2, ge=1, le=1024, description="processes of a local run")
@@ -186,10 +187,18 @@ class ToothReport(Record):
 
     state: Literal["fitted", "tied", "failed"] = Field(description="from its own pixels; held near other teeth for lack of them; or its own fit raised")
     sentence: str = Field(description="why it is tied or failed, or what is wrong with it; may be empty")
+    told: str = Field(default="", description="in plain words, what the capture tells of it and what it cannot")
     pixels: int = Field(description="pixels that show it and enter the fit, over all views")
     parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
     fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
     held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
+
+
+class Correlation(Record):
+    """How errors go together, between -1 and 1."""
+
+    names: tuple[str, ...] = Field(description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)")
+    matrix: tuple[tuple[float, ...], ...]
 
 
 class FitReport(Record):
@@ -203,6 +212,9 @@ class FitReport(Record):
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
     teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
+    correlations: dict[str, Correlation] = Field(default={}, description="per channel: correlation of the fitted coordinates")
+    told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
+    next_capture: str = Field(default="", description="in plain words, which further light or view would help most; empty where none was looked for")
     seconds: float
 
 
@@ -211,4 +223,5 @@ class AssetManifest(Record):
 
     files: tuple[str, ...]
     held_out_error: float = Field(description="mean over channels")
+    converged: bool = Field(default=True, description="whether the fit behind it did")
     centre_mm: Vector3 = (0.0, 0.0, 0.0)

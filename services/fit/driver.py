@@ -15,12 +15,13 @@ from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_
 from services.fit.attempt import Attempt, judge
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
+from services.fit.identifiability import NOTHING, correlation, told
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.optics.parameters import Tissue
 from services.fit.pictures import shown_images
 from services.fit.schedule import ChannelSchedule
-from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
+from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.stages import ChannelFit
 from services.fit.transport.recipe import DentinShape
 
@@ -49,7 +50,7 @@ class FitDriver:
         modes = len(dentin.modes_mm) if dentin is not None else 0
         order = sorted(channels, key=lambda c: -files[c].quality)
         fits: dict[str, ChannelFit[Tissue]] = {}
-        shape: tuple[float, ...] = ()
+        shape, next_capture = tuple[float, ...](), ""
         with attempt.workers() as run_on:
             for number, channel in enumerate(order):
                 attempt.log(f"{channel}: renderers start, then the table is searched.")
@@ -58,10 +59,14 @@ class FitDriver:
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
                 shape = fits[channel].tissue.shape
+                if spec.advise and number == 0 and fits[channel].solution.result.converged:
+                    next_capture = schedule.next_capture(fits[channel], attempt.inputs)
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if layout is not None and textures:
             keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
-        return self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+        report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+        where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
+        return report.model_copy(update={"next_capture": where + next_capture})
 
     def _schedule(
         self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]
@@ -91,16 +96,20 @@ class FitDriver:
         seconds: float,
     ) -> FitReport:
         self.attempt.write_records(journal, observations, {c: fit.evaluation for c, fit in fits.items()}, views)
-        known = {c: uncertainty(fit.domain, fit.solution.x, fit.equations) for c, fit in fits.items()}
+        known = {c: fit.known for c, fit in fits.items()}
+        tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         converged, advice = judge(fits)
+        correlations = {c: correlation(known[c]) for c in fits}
         return FitReport(
             converged=converged,
             advice=" ".join(advice),
-            parameters={c: self._table(fit, known[c], known[first]) for c, fit in fits.items()},
+            parameters=tables,
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
             steps=sum(fit.steps for fit in fits.values()),
             shape=fits[first].tissue.shape,
+            correlations=correlations,
+            told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )
 

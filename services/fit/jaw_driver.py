@@ -68,6 +68,9 @@ class JawDriver:
         observations = read_observations(attempt.context.root, spec)
         observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
         dentins = [known_dentin(tooth) for tooth in observations.teeth]
+        for tooth in observations.teeth if spec.dentin != "none" else ():
+            if tooth.dentin is None:
+                attempt.log(f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh.")
         channels = []
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
@@ -76,16 +79,17 @@ class JawDriver:
         begun, _ = journal.once("begun", lambda: started_s)
         with attempt.workers() as run_on:
             fits = {c.name: _ChannelRun(attempt, observations, dentins, c, journal, run_on, (n, len(channels))).fit() for n, c in enumerate(channels)}
-        evaluations = {c: jaw.fit.evaluation for c, jaw in fits.items()}
-        attempt.write_records(journal, observations, evaluations, {channel.name: channel.views for channel in channels})
-        return report(fits, [dentin is not None for dentin in dentins], time.time() - begun)
+        attempt.write_records(journal, observations, {c: jaw.fit.evaluation for c, jaw in fits.items()}, {c: jaw.views for c, jaw in fits.items()})
+        return report(fits, time.time() - begun)
 
 
 def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> Tooth:
-    """A jaw's tooth with its dentin: the given one, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
+    """A jaw's tooth with its dentin: the given one if any, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
 
-    A tooth whose mesh allows none is homogeneous.
+    A tooth whose mesh allows no such shape is homogeneous.
     """
+    if spec.dentin == "known":
+        return tooth
     try:
         shape = dentin_shape(tooth, cameras, spec)
     except TOOTH_FAULTS:
@@ -126,10 +130,9 @@ class _ChannelRun:
 
         # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so the jaw's does not hold it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
-        files = self.channel.files
+        files, dentins = self.channel.files, [None if s.drops_dentin else d for s, d in zip(starts, self.dentins, strict=True)]
         if failed:
-            scene = channel_scene(observations, self.channel.name, self.dentins, self.attempt.spec)
-            views = without(views, failed)
+            scene, views = channel_scene(observations, self.channel.name, dentins, self.attempt.spec), without(views, failed)
             files = write_channel(self.attempt.inputs, scene, self.channel.name, views)
         self.attempt.log(f"{self.channel.name}: all {len(starts)} teeth together.")
         schedule = JawSchedule(
@@ -143,9 +146,9 @@ class _ChannelRun:
             steps=self.steps,
             start=mouth,
             teeth=starts,
-            dentin=[dentin is not None for dentin in self.dentins],
+            dentin=tuple(dentin is not None for dentin in dentins),
         )
-        return JawFit(tuple(starts), schedule.run())
+        return JawFit(tuple(starts), tuple(schedule.dentin), schedule.run(), views)
 
     def _alone(self, k: int, views: tuple[ViewStack, ...]) -> Tissue:
         tooth = self.observations.teeth[k]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from services.core.errors import InputError, NonFiniteError
+from services.core.errors import InputError, MeshError, NonFiniteError
 from services.fit.optics.domain import to_dual, to_natural
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
@@ -33,6 +33,8 @@ class ToothStart:
     pixels: int
     tissue: Tissue | None
     """None where it has to take the others'."""
+    drops_dentin: bool = False
+    """Its surfaces cannot bound media together, so it counts as homogeneous."""
 
     @property
     def is_front(self) -> bool:
@@ -48,7 +50,8 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
     try:
         return ToothStart(fdi, "fitted", "", pixels, fit())
     except TOOTH_FAULTS as problem:
-        return ToothStart(fdi, "failed", f"Tooth {fdi} could not be fitted and takes the optics of the other teeth: {problem.message}", pixels, None)
+        sentence = f"Tooth {fdi} could not be fitted and takes the optics of the other teeth: {problem.message}"
+        return ToothStart(fdi, "failed", sentence, pixels, None, drops_dentin=isinstance(problem, MeshError))
 
 
 def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:

@@ -103,6 +103,8 @@ class ChannelFiles:
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
     evaluation_recipe: StoredFile
+    weight: float
+    """Mean weight of a fitted measurement."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
 
@@ -126,9 +128,9 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
     if spec.kind == "jaw" and len(manifest.fdi) < 2:
         raise CaptureInputError("A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set kind to 'tooth'.")
     teeth = read_teeth(folder, manifest.fdi)
-    for tooth in teeth:
-        if spec.dentin == "known" and tooth.dentin is None:
-            raise SettingsError(f"dentin = 'known' but tooth {tooth.fdi} has no dentin.ply; add it, or set dentin to 'fit' or 'none'.")
+    if spec.dentin == "known" and not any(tooth.dentin is not None for tooth in teeth):
+        whose = f"tooth {teeth[0].fdi}" if len(teeth) == 1 else "no tooth"
+        raise SettingsError(f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to 'fit' or 'none'.")
     for channel in spec.channels or ():
         if channel not in manifest.channels:
             raise SettingsError(f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}.")
@@ -277,6 +279,7 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
         full=level(None),
         search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
         evaluation_recipe=recipe(seen),
+        weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),
     )
 

@@ -68,10 +68,10 @@ class BlockTask:
 
 @dataclass(frozen=True)
 class Residual:
-    """Render minus reference of one block (L, N), with the render's variance."""
+    """Render minus reference of one block (L, N), from two seeds."""
 
-    residual: Array
-    variance: Array
+    first: Array
+    second: Array
     trace: TraceRow
 
 
@@ -107,11 +107,12 @@ class Products:
     trace: tuple[TraceRow, ...]
 
 
-def image_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
-    """Render a block and subtract the reference."""
+def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Residual:
+    """Render a block twice, each time with half the samples, and subtract the reference."""
     start, block = time.time(), read_block(task.block)
-    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed)
-    return Residual(stack.mean - block.reference, stack.variance, trace_row("image", task, start))
+    half = max(task.samples // 2, 1)
+    stacks: list[StackEstimate] = [host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds]
+    return Residual(stacks[0].mean - block.reference, stacks[1].mean - block.reference, trace_row("image", task, start))
 
 
 def jacobian_task(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> JacobianBlock:
@@ -125,8 +126,9 @@ def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual,
     """Multiply where the Jacobian lies."""
     start, block = time.time(), read_block(jacobian.task.block)
     j1, j2 = jacobian.derivatives(host)
-    r, spread, sensor, weight = (a.reshape(-1) for a in (residual.residual, residual.variance, block.variance, block.fit_weight))
-    equations = normal_equations(j1, j2, r, spread, sensor, weight, None if near is None else _regions(block, near))
+    r1, r2, variance, weight = (a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight))
+    regions = None if near is None else _regions(block, near)
+    equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions)
     return Products(equations, (residual.trace, jacobian.trace, trace_row("products", jacobian.task, start)))
 
 
@@ -211,12 +213,12 @@ class StackProblem(Generic[Optics]):
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
         run, label = self.passes.executor, f"{self._prefix}-{step}"
-        tissue, similar, parameters, chain = self._jacobian_media(x)
-        seeds = self._seed(step, "jacobian-1"), self._seed(step, "jacobian-2")
+        tissue, similar, parameters, chain = self.jacobian_media(x)
+        seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
         pending = []
         for task in self.passes.tasks(label, tissue, samples):
             jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, seeds)
-            image = run.submit(f"{label}-image-{task.index}", image_task, task, self._seed(step, "image"))
+            image = run.submit(f"{label}-image-{task.index}", image_task, task, (self.seed(step, "image-1"), self.seed(step, "image-2")))
             pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, self.near))
         products: list[Products] = run.gather(pending)
         self.passes.record([row for p in products for row in p.trace])
@@ -227,8 +229,8 @@ class StackProblem(Generic[Optics]):
 
     def gradient(self, x: Array, *, samples: int, step: int) -> Gradient:
         """See adam.Problem: one task per block, summed in block order."""
-        tissue, similar, parameters, chain = self._jacobian_media(x)
-        seeds = self._seed(step, "image"), self._seed(step, "jacobian")
+        tissue, similar, parameters, chain = self.jacobian_media(x)
+        seeds = self.seed(step, "image"), self.seed(step, "jacobian")
         parts = self.passes.run(f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, parameters, chain, seeds)
         self.passes.record([row for _, row in parts])
         total: Gradient = parts[0][0]
@@ -240,7 +242,7 @@ class StackProblem(Generic[Optics]):
         """See Problem: half the samples per seed, summed in block order."""
         label = f"{self._prefix}-{step}-trial-{trial}"
         old, new = self._image_media(x_old), self._image_media(x_new)
-        seeds = self._seed(step, "compare-1", trial), self._seed(step, "compare-2", trial)
+        seeds = self.seed(step, "compare-1", trial), self.seed(step, "compare-2", trial)
         parts = self.passes.run(label, old, max(samples // 2, 1), compare_task, new, seeds)
         self.passes.record([row for _, row in parts])
         total: LossChange = parts[0][0]
@@ -252,8 +254,8 @@ class StackProblem(Generic[Optics]):
         tissue = self.domain.tissue_at(x, self.base)
         return tissue if self.image_g is None else similar_tissue(tissue, self.image_g)
 
-    def _jacobian_media(self, x: Array) -> tuple[Optics, Optics, tuple[str, ...], Array]:
-        # Media of the image and of the derivatives, the parameters to differentiate, and d parameter / d x.
+    def jacobian_media(self, x: Array) -> tuple[Optics, Optics, tuple[str, ...], Array]:
+        """Media of the image and of the derivatives, the parameters to differentiate, and d parameter / d x."""
         if self.jacobian_g is None:
             return self._image_media(x), self.domain.tissue_at(x, self.base), self.domain.parameters, self.domain.chain(x)
         names = tuple(dict.fromkeys(n for p in self.domain.parameters for n in _similar_parameters(p)))
@@ -271,7 +273,8 @@ class StackProblem(Generic[Optics]):
     def _prefix(self) -> str:
         return f"{self.passes.seeds.channel}-{self.stage}"
 
-    def _seed(self, step: int, *purpose: str | int) -> int:
+    def seed(self, step: int, *purpose: str | int) -> int:
+        """Seed of a pass of this stage."""
         return self.passes.seeds(self.stage, step, *purpose)
 
 

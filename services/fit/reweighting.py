@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.core.records import Loss
-from services.fit.blocks import StoredFile, write_block
+from services.fit.blocks import StoredFile, read_block, write_block
+from services.fit.engine_host import EngineHost
 from services.fit.journal import Journal
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import Passes, Residual, image_task
+from services.fit.passes import BlockTask, Passes, TraceRow, trace_row
 from services.fit.solve.losses import weights
+from services.fit.transport.recipe import StackEstimate
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Render minus reference of one block, and the render's variance, (L, N)."""
+
+    residual: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    trace: TraceRow
+
+
+def residual_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
+    """Render a block and subtract the reference."""
+    start, block = time.time(), read_block(task.block)
+    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed)
+    return Residual(stack.mean - block.reference, stack.variance, trace_row("weights", task, start))
 
 
 def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, samples: int, stage: str) -> Passes:
@@ -21,7 +41,7 @@ def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, 
 
     def compute() -> list[tuple[str, str]]:
         seed = passes.seeds(stage, "weights")
-        residuals: list[Residual] = passes.run(f"{passes.seeds.channel}-{stage}-weights", tissue, samples, image_task, seed)
+        residuals: list[Residual] = passes.run(f"{passes.seeds.channel}-{stage}-weights", tissue, samples, residual_task, seed)
         passes.record([r.trace for r in residuals])
         blocks = passes.read_blocks()
 

@@ -25,17 +25,26 @@ is nearly invisible, so its exponent carries a prior two decades wide.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from services.core.errors import SettingsError
 from services.fit.anatomy.stain_uv import StainLayout
+from services.fit.closing import measure_closing
+from services.fit.next_capture import Sensor, advice
 from services.fit.optics.domain import Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import HELD_G, SHAPE, WEAK, Priors, priors_of
 from services.fit.passes import StackProblem, orders_task
 from services.fit.reweighting import reweighted
 from services.fit.solve import adam, table_search
-from services.fit.solve.gauss_newton import Options, Solution
+from services.fit.solve.closing import ClosingSums
+from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
+from services.fit.solve.gauss_newton import Options, Result, Solution
 from services.fit.solve.losses import is_reweighted
+from services.fit.solve.normal_equations import NormalEquations
 from services.fit.stages import ChannelFit, Stages
 from services.fit.stain_passes import StainStage
 
@@ -95,6 +104,14 @@ class ChannelSchedule(Stages[Tissue]):
 
     def _others(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
+
+    def next_capture(self, fit: ChannelFit[Tissue], folder: Path) -> str:
+        """The light or view that would help this channel most, in one sentence."""
+        self.pause()
+        sensor = Sensor(self.spec.sensor_noise_relative, self.spec.sensor_noise_floor)
+        given = folder, self.media, sensor, self.files.weight, fit.samples, self.spec.pixel_step
+        found, _ = self.journal.once(f"{self.scope}/next-capture", lambda: advice(fit.problem, fit.known, *given)[0])
+        return str(found)
 
     def _stages(self) -> Fitted:
         # The media, and the dentin's shape, by Gauss-Newton.
@@ -239,6 +256,30 @@ class ChannelSchedule(Stages[Tissue]):
         self.pause()
         best, _ = self.journal.once(f"{self.scope}/starts", compute)
         return ends[best]
+
+    def _close(
+        self, problem: StackProblem[Tissue], solution: Solution, equations: NormalEquations, samples: int
+    ) -> tuple[StackProblem[Tissue], Solution, Uncertainty]:
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.
+        domain, x = problem.domain, solution.x
+        if problem.jacobian_g is None or solution.result is Result.STALLED:
+            return super()._close(problem, solution, equations, samples)
+        known = whitening(domain, equations)
+        held = {part: WEAK[f"{part}.g1"] for part in self.media if f"{part}.g1" not in domain.parameters}
+
+        def compute() -> dict[str, Any]:
+            sums = measure_closing(problem, x, known.transform, held, samples)
+            step = closing_step(domain, x, equations, sums)
+            mean, precision = domain.prior
+            compared = problem.compare(x, x + step, samples=samples, step=0, trial=0)
+            change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+            return {"sums": sums.record(), "step": (0.0 * step if change > Options().sure_z * compared.se else step).tolist()}
+
+        self.pause()
+        entry, _ = self.journal.once(f"{self.scope}/closing", compute)
+        step = np.array(entry["step"])
+        measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
+        return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:
         # A second lobe starts at its prior's centre, the first keeps the mean cosine.

@@ -108,7 +108,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     held_out = list((report.held_out_error or report.fit_error).values())
     corners = [corner for tooth in teeth for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))]
     centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
-    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), centre_mm=(float(centre[0]), float(centre[1]), float(centre[2])))
+    place = float(centre[0]), float(centre[1]), float(centre[2])
+    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), converged=report.converged, centre_mm=place)
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
     context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))
@@ -123,7 +124,9 @@ def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpe
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":
-        return tuple(fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth)
+        fitted = [fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth]
+        layered = {fdi for fdi, tooth in report.teeth.items() if all("dentin.sigma" in table for table in tooth.parameters.values())}
+        return tuple(tooth if str(tooth.fdi) in layered else replace(tooth, dentin=None) for tooth in fitted)
     (tooth,) = teeth
     dentin = dentin_shape(tooth, prepared.cameras, spec)
     return (replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(report.shape), dentin.base.faces)),)

@@ -16,6 +16,7 @@ from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
+from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.gauss_newton import Options, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 
@@ -55,10 +56,15 @@ class ChannelFit(Generic[Optics]):
     domain: Domain
     solution: Solution
     equations: NormalEquations
+    known: Uncertainty
     fit_error: float
     held_out_error: float | None
     steps: int
     evaluation: Evaluation
+    problem: StackProblem[Optics]
+    """At the solution."""
+    samples: int
+    """Paths per pixel of the last measurement."""
 
 
 @dataclass(kw_only=True)
@@ -144,9 +150,20 @@ class Stages(ABC, Generic[Optics]):
             self.pause()
             stored, _ = self.journal.once(f"{self.scope}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
             equations = NormalEquations.of(stored)
+        problem, solution, known = self._close(problem, solution, equations, samples)
         evaluation = self._evaluate("final", problem.base, self.fewer(self.spec.max_samples_per_pixel), self.files.full)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
-        return ChannelFit(problem.base, problem.domain, solution, equations, fitted, held_out, self.steps, evaluation)
+        return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation, problem, samples)
+
+    def _close(
+        self,
+        problem: StackProblem[Optics],
+        solution: Solution,
+        equations: NormalEquations,
+        samples: int,  # noqa: ARG002 - of a fit that measures
+    ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
+        # How sure the answer is, of what is known already; a fit may measure more, and move once more by it.
+        return problem, solution, uncertainty(problem.domain, solution.x, equations)
 
     def _solve(self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float) -> tuple[Optics, Solution]:
         # A stage in similar media.

@@ -143,7 +143,8 @@ def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path
         root = tmp_path / name
         write_prepared_jaw(root, SLOW_MOUTH, (11, 12), hidden=(12,), samples=64)
         future = client.submit(fit_jaw_once, root, pure=False, retries=len(kills))
-        for count in kills:
+        for attempt, count in enumerate(kills, start=1):
+            await_attempt(root, attempt)
             await_entries(root, count)
             os.kill(int((root / "driver.pid").read_text()), signal.SIGKILL)
         future.result(timeout=200)
@@ -177,6 +178,15 @@ def await_entries(root: Path, count: int) -> int:
             return found
         time.sleep(0.05)
     pytest.fail("the fit recorded nothing")
+
+
+def await_attempt(root: Path, attempt: int) -> None:
+    deadline, lease = time.monotonic() + 120, root / "fit.lease"
+    while time.monotonic() < deadline:
+        if lease.exists() and lease.read_text() == str(attempt):
+            return
+        time.sleep(0.05)
+    pytest.fail(f"attempt {attempt} did not begin")
 
 
 def _children(dask_worker: Any) -> int | None:

@@ -22,6 +22,8 @@ from tests.support.shared_data import shared_path
 
 SUBJECT = 1
 FRONT = (11, 12, 21)
+BLOCK_PX = 4
+"""Of so few paths a single pixel's batches are skewed, differently by the two renderers, which moves its z; sums over blocks are not."""
 
 
 def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, block: int) -> np.ndarray:
@@ -45,10 +47,10 @@ def test_front_teeth_in_their_gums_look_as_in_mitsuba(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_whole_jaw_looks_as_in_mitsuba(tmp_path: Path) -> None:
-    require_same_pictures(scores(jaw_surfaces(SUBJECT), tmp_path, pixel_mm=1.0, samples=512, block=1), least=1500)
+    require_same_pictures(scores(jaw_surfaces(SUBJECT), tmp_path, pixel_mm=1.0, samples=512, block=BLOCK_PX), least=120)
 
 
 @pytest.mark.slow
 def test_a_real_arch_whose_teeth_touch_looks_as_in_mitsuba(tmp_path: Path) -> None:
     jaw = jaw_surfaces(SUBJECT, shared_path("data/intraoral-arch/Example_01.vtp"))
-    require_same_pictures(scores(jaw, tmp_path, pixel_mm=1.0, samples=512, block=1), least=1500)
+    require_same_pictures(scores(jaw, tmp_path, pixel_mm=1.0, samples=512, block=BLOCK_PX), least=120)

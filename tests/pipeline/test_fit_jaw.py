@@ -14,7 +14,8 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.jaw_schedule import TIED_SD
-from services.fit.stage import export, run
+from services.fit.stage import ENGINE, export, run
+from services.fit.transport.platform import prepare_device
 from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
 
 FAKE = "tests.support.fake_mouth:FakeMouthEngine"
@@ -104,6 +105,14 @@ def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEve
     assert parameters["12.dentin.sigma"] == report.teeth["12"].parameters["green"]["dentin.sigma"].model_dump()
     assert {"gums.sigma", "cavity.reflectance"} <= parameters.keys()
     assert json.loads((root / "errors.json").read_text())["teeth"]["21"]["state"] == "failed"
+    prepare_device()
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono")
+    scene = mi.load_file(str(root / "asset" / "scene_green.xml"), optimize=False)
+    image = np.array(mi.render(scene, sensor=0, spp=16))
+    assert np.isfinite(image).all()
+    assert image.mean() > 0
     page = (root / "report.html").read_text()
     assert "Jaw of 4 teeth" in page
     assert report.teeth[FAILED].sentence in page
@@ -128,6 +137,26 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(finished: tuple[P
     events: list[StageEvent] = []
     assert without_time(fit(tmp_path, attempt=3, events=events)) == without_time(report)
     assert min(e.data["step"] for e in events if e.kind == "step") == joint + 1
+
+
+def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
+    # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
+    write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
+    spec = jaw_spec(tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=6, search_candidates=1600)
+    report = run(spec, LocalContext(tmp_path))
+    found = {name: report.parameters["green"][name] for name in ("gums.sigma_s_reduced", "gums.alpha_reduced", "cavity.reflectance")}
+    truth = {"gums.sigma_s_reduced": TRUE_GUMS.sigma_s_reduced, "gums.alpha_reduced": TRUE_GUMS.alpha_reduced, "cavity.reflectance": TRUE_REFLECTANCE}
+    for fdi in ("11", "12"):
+        for leaf in ("sigma_s_reduced", "alpha_reduced"):
+            found[f"{fdi}.{leaf}"] = report.teeth[fdi].parameters["green"][f"enamel.{leaf}"]
+            truth[f"{fdi}.{leaf}"] = getattr(TRUE_TEETH[int(fdi)].enamel, leaf)
+    for name, estimate in found.items():
+        assert estimate.determined, (name, estimate)
+        assert estimate.se is not None
+        # One fit at one seed: 4.5 of its own standard errors, which are small enough to mean something.
+        assert abs(estimate.value - truth[name]) < 4.5 * estimate.se, (name, truth[name], estimate)
+        assert estimate.se < 0.15 * estimate.value, (name, estimate)
+    assert report.held_out_error["green"] < 0.05
 
 
 @pytest.mark.parametrize(

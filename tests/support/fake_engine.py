@@ -33,6 +33,11 @@ SCORE_NOISE = 1.0
 class FakeEngine:
     """Same methods as the real engine."""
 
+    directness = 0.0
+    """By how much the mean cosine adds to what enamel seems to scatter: media of equal reduced quantities then differ."""
+    shared_noise = 0.0
+    """Part of the noise's variance that all lights of a pixel share, as those of one walk do."""
+
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
         self.recipe = recipe
 
@@ -94,7 +99,7 @@ class FakeEngine:
         direction = np.abs(self.recipe.light_positions_mm[:, :1]).astype(float) / 1000
         cosine = 0.35 + 0.6 * np.abs(np.cos(0.12 * x + direction * 3.0 + 0.1 * y))
         enamel, dentin = tissue.enamel, tissue.dentin
-        through = np.exp(-enamel.sigma_s_reduced * thickness)
+        through = np.exp(-enamel.sigma_s_reduced * (1 + self.directness * enamel.mean_cosine) * thickness)
         near = cosine * (1 - through) * enamel.alpha_reduced**1.5
         deep = np.sqrt(cosine) * through * dentin.alpha_reduced**1.5 * (1 - np.exp(-dentin.sigma_s_reduced * cosine**2))
         image = np.asarray(near + deep + 0.05 + 0.0 * lights)
@@ -107,9 +112,14 @@ class FakeEngine:
         return image
 
     def _normal(self, view: View, seed: int, stream: int) -> Array:
+        own, shared = self._numbers(view, seed, stream, by_light=True), self._numbers(view, seed, stream, by_light=False)
+        return np.sqrt(1 - self.shared_noise) * own + np.sqrt(self.shared_noise) * shared if self.shared_noise else own
+
+    def _numbers(self, view: View, seed: int, stream: int, *, by_light: bool) -> Array:
         # A counter-based number per (seed, stream, light, pixel): block and order do not matter.
         lights = np.arange(len(self.recipe.light_positions_mm), dtype=np.uint64)[:, None]
-        pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None] + np.uint64(2**40) * lights
+        place = lights if by_light else np.full_like(lights, 1000)
+        pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None] + np.uint64(2**40) * place
         key = np.uint64((seed * 131 + stream * 7919 + sum(view.camera.name.encode())) % 2**63)
         u = _uniform(pixel ^ _mix(np.full_like(pixel, key)))
         v = _uniform(_mix(pixel + np.uint64(0x9E3779B9)) ^ _mix(np.full_like(pixel, key + np.uint64(1))))
@@ -126,6 +136,13 @@ def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _uniform(z: NDArray[np.uint64]) -> Array:
     return (_mix(z) >> np.uint64(11)).astype(np.float64) / 2.0**53 + 2.0**-54
+
+
+class DirectFakeEngine(FakeEngine):
+    """Similar media are not alike here, and the lights of a pixel share noise."""
+
+    directness = 0.5
+    shared_noise = 0.3
 
 
 class SlowFakeEngine(FakeEngine):

@@ -51,10 +51,12 @@ def write_prepared(
     shadowed: float = 0.0,
     stain_uv: NDArray[np.float64] | None = None,
     seed: int = 5,
+    engine: type[FakeEngine] = FakeEngine,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
     Args:
+        engine: whose formula the photographs follow.
         shadowed: share of every photograph that loses nine tenths of its light, which no medium explains either.
         stain_uv: texture coordinates of the outer surface, for a truth with stains.
         uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
@@ -75,7 +77,7 @@ def write_prepared(
     recipe = single_tooth(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
     recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=stain_uv),))
     for c, one in enumerate(cameras):
-        image = FakeEngine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
+        image = engine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
         image[::2] *= 1 + uneven
         image = np.where(rng.uniform(size=(*image.shape[:-1], 1)) < shadowed, 0.1 * image, image) if shadowed else image

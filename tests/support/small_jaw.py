@@ -43,13 +43,14 @@ def cameras() -> tuple[Camera, ...]:
     return tuple(camera.model_copy(update={"name": f"c{k}"}) for k, camera in enumerate(views))
 
 
-def recipe(fdi: tuple[int, ...] = FDI) -> SceneRecipe:
+def recipe(fdi: tuple[int, ...] = FDI, *, dentin: bool = True) -> SceneRecipe:
     """The scene with its teeth in the order given."""
 
     def tooth(number: int) -> ToothSurfaces:
         centre = (PLACES_MM[number], 0.0, 0.0)
         core = revolved((2.3, 3.4), centre)
-        return ToothSurfaces(revolved((3.0, 4.0), centre), DentinShape(core, np.zeros((0, len(core.vertices_mm), 3))))
+        known = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
+        return ToothSurfaces(revolved((3.0, 4.0), centre), known if dentin else None)
 
     box = trimesh.creation.box((28.0, 9.0, 5.0)).subdivide_to_size(4.0)
     gums = Mesh(np.asarray(box.vertices) + np.array([0, 0, -5.0]), np.asarray(box.faces, dtype=np.int32))
@@ -77,6 +78,7 @@ def write_prepared_jaw(
     engine: str,
     fdi: tuple[int, ...] = FDI,
     *,
+    dentin: bool = True,
     hidden: tuple[int, ...] = (),
     dark: tuple[int, ...] = (),
     samples: int = 1024,
@@ -87,11 +89,12 @@ def write_prepared_jaw(
 
     Args:
         engine: who makes the photographs, as ``module:class``.
+        dentin: whether teeth have any.
         hidden: teeth that are masked in all images.
         dark: teeth that are black in all photographs.
         noise: of the sensor, relative.
     """
-    scene, rng = recipe(fdi), np.random.default_rng(seed)
+    scene, rng = recipe(fdi, dentin=dentin), np.random.default_rng(seed)
     writer = StageWriter(root, "prepared", 1)
     shape = (2, len(LIGHTS_MM), SIZE, SIZE)
     store, axes = writer.folder / "prepared.zarr", ("camera", "light", "y", "x")
@@ -114,16 +117,16 @@ def write_prepared_jaw(
         variance[c] = (spread**2 + monte_carlo)[..., None].astype(np.float32)
         valid[c] = np.broadcast_to(np.where((shown < 0) | masked, MaskBit.OUTSIDE, 0).astype(np.uint16), shape[1:])
     for number, tooth in zip(fdi, scene.teeth, strict=True):
-        assert tooth.dentin is not None
         write_mesh(writer.folder / "teeth" / str(number) / "outer.ply", tooth.outer)
-        write_mesh(writer.folder / "teeth" / str(number) / "dentin.ply", tooth.dentin.base)
+        if tooth.dentin is not None:
+            write_mesh(writer.folder / "teeth" / str(number) / "dentin.ply", tooth.dentin.base)
     for part, mesh in (("gums", scene.gums), ("cavity", scene.cavity)):
         assert mesh is not None
         write_mesh(writer.folder / f"{part}.ply", mesh)
     lights = tuple(Light(name=f"l{k}", position_mm=place, intensity=(1e6,)) for k, place in enumerate(LIGHTS_MM))
     manifest = PreparedManifest(
         channels=("green",), cameras=cameras(), lights=lights, held_out=tuple((f"c{c}", f"l{HELD_OUT_LIGHT}") for c in range(2)), fdi=fdi,
-        dentin_known=fdi, median_motion_px=None, valid_fraction=0.9,
+        dentin_known=fdi if dentin else (), median_motion_px=None, valid_fraction=0.9,
     )  # fmt: skip
     writer.publish(manifest)
 

@@ -82,11 +82,11 @@ def task(tmp_path: Path) -> BlockTask:
 
 def test_every_task_of_the_fit_asks_for_fitted_lights_alone(task: BlockTask) -> None:
     host = Recorder()
-    image_task(host, task, 1)
+    image_task(host, task, (1, 2))
     jacobian_task(host, task, ("enamel.sigma",), np.ones((1, 1)), (1, 2))
     compare_task(host, task, task.tissue, (1, 2))
     orders_task(host, task, np.array([0, 2, 9]), 1)
-    assert host.asked == [(1, 2)] * 8
+    assert host.asked == [(1, 2)] * 9
 
 
 def test_the_evaluation_adds_what_is_held_out(task: BlockTask) -> None:

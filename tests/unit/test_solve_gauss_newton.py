@@ -102,6 +102,37 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
     assert accepted <= 22
 
 
+def test_thousand_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
+    # A third each ill-conditioned, indefinite and nothing but noise, the comparison itself noisy. A step that is taken while truly worse is a false alarm
+    # at z = 3: 1.35e-3 of all comparisons at most. The count of these is Poisson; beyond its mean by four standard deviations, plus one, is one in 10,000.
+    # The last step, onto the minimum of all that is known, is refused only when surely worse, so it may lose up to what the comparison cannot see: with
+    # 3 standard errors to refuse and one in 150,000 to be missed, 7.5 of them.
+    rng, worse, compared = np.random.default_rng(5), 0, 0
+    for case in range(1000):
+        problem, domain, x = _random_problem(rng)
+        if case % 3 == 1:
+            problem.a = problem.a - 0.3 * float(np.abs(problem.a).max()) * np.eye(len(x))
+        if case % 3 == 2:
+            problem.a = np.zeros_like(problem.a)
+        problem.seed, size = case, max(float(np.abs(problem.a).max()), 1.0)
+        problem.gradient_noise, problem.hessian_noise, problem.loss_noise = size * 10.0 ** rng.uniform(-3, 2, 3)
+        solver = GaussNewton(domain, Options(max_steps=6, max_samples=256))
+        state = solver.init(x, 64)
+        while not solver.terminate(state):
+            before, samples = state, state.samples
+            state = solver.step(problem, state)
+            assert np.isfinite(state.x).all()
+            assert state.memory is None or np.isfinite(state.memory.gradient).all()
+            change = problem.loss(state.x) - problem.loss(before.x)
+            if state.accepted > before.accepted:
+                worse += change > 0
+            else:
+                assert change <= 7.5 * problem.loss_noise / np.sqrt(samples)
+        compared += sum(kind == "compare" for kind, _ in problem.calls)
+    expected = 1.35e-3 * compared
+    assert worse <= expected + 4 * np.sqrt(expected) + 1
+
+
 def test_converges_on_a_well_posed_problem_with_noise() -> None:
     # At the end the error of x is that of the gradient: noise / sqrt(pooled samples) / curvature; 5 sigma.
     a = np.diag([4.0, 1.0, 9.0, 2.0])

@@ -7,22 +7,20 @@ import numpy as np
 from services.fit.solve.normal_equations import NormalEquations, loss_change, normal_equations, pool
 
 ROUNDS = 3000
-MEASUREMENTS = 40
+MEASUREMENTS, LIGHTS = 160, 4
 
 
 def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
+    # Lights of a pixel share half of their noise's variance, as those of one walk do.
     j, r, weight = _problem()
-    spread = 0.8
-    variance, reference = np.full(MEASUREMENTS, 0.3), np.full(MEASUREMENTS, 0.05)
+    reference = np.full(MEASUREMENTS, 0.05)
+
+    def noise(*shape: int) -> np.ndarray:
+        shared = np.tile(rng.standard_normal((*shape, MEASUREMENTS // LIGHTS)), LIGHTS)
+        return np.sqrt(0.5) * (shared + rng.standard_normal((*shape, MEASUREMENTS)))
+
     return tuple(
-        normal_equations(
-            j + spread * rng.standard_normal(j.shape),
-            j + spread * rng.standard_normal(j.shape),
-            r + np.sqrt(variance) * rng.standard_normal(MEASUREMENTS),
-            variance,
-            reference,
-            weight,
-        )
+        normal_equations(*(j + 0.8 * noise(3) for _ in range(2)), *(r + np.sqrt(0.6) * noise() for _ in range(2)), reference, weight, LIGHTS)
         for _ in range(ROUNDS)
     )
 

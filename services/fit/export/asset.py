@@ -4,11 +4,13 @@
 
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
-    gums.ply, cavity.ply       of a jaw; gums hold the roots, so they are in no scene: stock media cannot overlap
+    gums.ply, cavity.ply       of a jaw
+    surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
     teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer surface's u, v
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
-    errors.json                fitted and held-out image error, of a jaw's teeth too
+    errors.json                fitted and held-out image error, whether the fit converged, correlations, what the capture tells; of a jaw's teeth too
+    NOT-CONVERGED.txt          only where it did not: what to do
     render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for boundary thin
 """
 
@@ -24,11 +26,14 @@ from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
 from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.export.mitsuba_scene import nested_scene
+from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.export.scene_xml import SceneParameter, write_scene
 from services.fit.export.stains import write_textures
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
+NOT_CONVERGED = "NOT-CONVERGED.txt"
+"""Lies in the asset of a fit that did not converge, with what to do about it."""
 
 
 def write_asset(
@@ -54,7 +59,7 @@ def write_asset(
         stains: of a single tooth.
 
     Raises:
-        CaptureInputError: a camera that Mitsuba cannot render.
+        CaptureInputError: a camera that Mitsuba cannot render. MeshError: surfaces of a jaw that cannot be cut along each other.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
@@ -70,6 +75,8 @@ def write_asset(
     for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
         if mesh is not None:
             write_mesh(folder / name, mesh)
+    cut = write_mouth_surfaces(folder / "surfaces", teeth, gums, cavity) if report.teeth else {}
+    surfaces = {name: path.relative_to(folder) for name, path in cut.items()}
 
     textures = {}
     if stains is not None:
@@ -80,12 +87,14 @@ def write_asset(
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
-        table = report.parameters[channel]
-        tissue = {fdi: tissue_of(tooth.parameters[channel]) for fdi, tooth in report.teeth.items()} or tissue_of(table)
-        wall = None if cavity is None else (Path("cavity.ply"), table["cavity.reflectance"].value)
-        stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
-        surroundings: dict[str, Any] = {"wall": wall, "stains": stained}
-        scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=SceneParameter("spp", 256), **surroundings)
+        samples = SceneParameter("spp", 256)
+        if report.teeth:
+            numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
+            scene = mouth_scene(surfaces, numbers, mouth, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples)
+        else:
+            tissue = tissue_of(report.parameters[channel])
+            stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
+            scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained)
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {
@@ -98,6 +107,8 @@ def write_asset(
     _write_json(folder / "rig.json", rig)
     _write_json(folder / "parameters.json", parameters_json(report))
     _write_json(folder / "errors.json", errors_json(report))
+    if not report.converged:
+        write_atomic(folder / NOT_CONVERGED, f"The fit did not converge. {report.advice}\n".encode())
     for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
         write_atomic(folder / name, (SHIPPED / name).read_bytes())
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
@@ -105,11 +116,20 @@ def write_asset(
 
 def tissue_of(table: dict[str, Estimate]) -> Tissue:
     """The tissue that a table of estimates describes; a part that was not modelled is empty."""
-    parts = {}
-    for part in ("enamel", "dentin"):
-        values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
-        parts[part] = Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
-    return Tissue(parts["enamel"], parts["dentin"])
+    return Tissue(_medium_of(table, "enamel"), _medium_of(table, "dentin"))
+
+
+def mouth_of(report: FitReport, channel: str) -> Mouth:
+    """The mouth that a jaw's report describes, teeth in its order."""
+    table = report.parameters[channel]
+    gums = _medium_of(table, "gums") if "gums.sigma" in table else None
+    reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
+    return Mouth(tuple(tissue_of(tooth.parameters[channel]) for tooth in report.teeth.values()), gums, reflectance)
+
+
+def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
+    values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
+    return Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
 
 
 def parameters_json(report: FitReport) -> dict[str, Any]:
@@ -129,6 +149,9 @@ def errors_json(report: FitReport) -> dict[str, Any]:
         "held_out_error": report.held_out_error,
         "converged": report.converged,
         "advice": report.advice,
+        "told": report.told,
+        "next_capture": report.next_capture,
+        "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},
     }
     teeth = {fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"}) for fdi, tooth in report.teeth.items()}
     return errors | ({"teeth": teeth} if teeth else {})

@@ -88,7 +88,7 @@ TeethFiles = Mapping[str, tuple[Path, Path | None]]
 
 def nested_scene(
     teeth: TeethFiles,
-    tissue: Tissue | Mapping[str, Tissue],
+    tissue: Tissue,
     cameras: tuple[Camera, ...],
     light_mm: Sequence[Any],
     intensity: Any,
@@ -96,35 +96,28 @@ def nested_scene(
     boundary: Boundary = "matched",
     ior: float = 1.631,
     samples: Any = 64,
-    wall: tuple[Path, float] | None = None,
     stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
-    """Scene of teeth under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
+    """Scene of teeth of one tissue under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
 
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
 
     Args:
-        tissue: of all teeth, or of each by name.
-        wall: PLY file and diffuse reflectance of the wall behind the teeth.
         stains: by name of the tooth, as in ``boundary_dict``; its outer PLY then has texture coordinates.
     """
     scene: SceneDict = {
         "type": "scene",
         "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
+        "medium_enamel": medium_dict(tissue.enamel),
         "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
     }
+    if any(dentin is not None for _, dentin in teeth.values()):
+        scene["medium_dentin"] = medium_dict(tissue.dentin)
+    enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        own, ending = (tissue, "") if isinstance(tissue, Tissue) else (tissue[name], f"_{name}")
-        enamel, inner = {"type": "ref", "id": f"medium_enamel{ending}"}, {"type": "ref", "id": f"medium_dentin{ending}"}
-        shell = _surface(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
-        scene |= {f"medium_enamel{ending}": medium_dict(own.enamel), f"outer_{name}": shell}
+        scene[f"outer_{name}"] = _surface(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
         if dentin is not None:
-            around = {"interior": inner, "exterior": enamel}
-            scene |= {f"medium_dentin{ending}": medium_dict(own.dentin), f"dentin_{name}": _surface(dentin, {"type": "null"}) | around}
-    if wall is not None:
-        path, reflectance = wall
-        bsdf = {"type": "twosided", "side": {"type": "diffuse", "reflectance": reflectance}}
-        scene["wall"] = _surface(path, bsdf)
+            scene[f"dentin_{name}"] = _surface(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
 
 

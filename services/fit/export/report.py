@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Estimate, FitReport, ToothReport
+from services.core.records import Correlation, Estimate, FitReport, ToothReport
 from services.core.store import write_atomic
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import DIVERGING, SEQUENTIAL, ColourStops, Picture, data_uri, enlarge, scalar_map, signed_map, tone_map, white_level
@@ -76,6 +76,9 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         title=context.get("title", "Fit"),
         converged=report.converged,
         advice=report.advice,
+        told=report.told,
+        next_capture=report.next_capture,
+        correlations=_correlations(report.correlations),
         held_out=_error_rows(report.held_out_error),
         fitted=_error_rows(report.fit_error),
         steps=report.steps,
@@ -88,7 +91,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         channels=list(report.parameters),
         parameters=_parameter_rows(report.parameters),
         teeth=_tooth_rows(report.teeth),
-        tooth_sentences=[tooth.sentence for tooth in report.teeth.values() if tooth.sentence],
+        tooth_sentences=[(fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()],
         thickness=_thickness(pictures),
         thickness_bar=_gradient(SEQUENTIAL),
         stains=_stains(pictures),
@@ -194,6 +197,28 @@ def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
         for fdi, tooth in teeth.items()
         for channel, table in tooth.parameters.items()
     ]
+
+
+def _correlations(correlations: dict[str, Correlation]) -> list[dict[str, Any]]:
+    # Of one coordinate alone there is nothing to show. Blue goes together, orange against each other, on either ground.
+    def cell(value: float, own: bool) -> tuple[str, str]:
+        colour = "80, 140, 220" if value > 0 else "230, 140, 60"
+        return ("1", "none") if own else (f"{value:+.2f}".replace("-", "−"), f"rgba({colour}, {0.45 * abs(value):.2f})")
+
+    tables = []
+    for channel, found in correlations.items():
+        if len(found.names) > 1:
+            labels = [_symbol(name) for name in found.names]
+            rows = [(label, [cell(v, a == b) for b, v in enumerate(row)]) for a, (label, row) in enumerate(zip(labels, found.matrix, strict=True))]
+            tables.append({"channel": channel, "labels": labels, "rows": rows})
+    return tables
+
+
+def _symbol(name: str) -> str:
+    part, _, leaf = name.partition(".")
+    if part == "shape":
+        return f"c {SHAPE_LABELS[int(leaf)]}" if leaf.isdigit() and int(leaf) < len(SHAPE_LABELS) else name
+    return f"{part} {LEAF_LABELS.get(leaf, leaf).rpartition(' ')[2]}"
 
 
 def _order(name: str) -> tuple[int, int]:

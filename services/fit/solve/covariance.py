@@ -1,8 +1,17 @@
 """What the data fix, and how well: sandwich covariance, undetermined directions, derived quantities by the delta method.
 
-Cov(x) = H^-1 (s J'W Sigma W J + C_mc + Lambda) H^-1 with H = J'WJ + Lambda; Sigma is the measurements' variance, s >= 1 the factor by which residuals
-exceed it (model misfit), C_mc the Monte Carlo covariance of the final gradient and Lambda the weak prior's precision, which alone speaks in directions
-where the data are silent.
+In coordinates y, x = T y, in which the believed curvature J~'WJ~ + Lambda is the identity,
+
+    Cov(y) = M^-1 (s D + C + Lambda + S + N) M^-T + r r'
+
+=======  ==========================================================================================================================
+D        J~'W Sigma W J~, the noise of the measurements; s >= 1 is the factor by which residuals exceed it (model misfit)
+C        Monte Carlo covariance of the final gradient, by pixels (``normal_equations``)
+Lambda   the weak prior's precision, which alone speaks where the data are silent
+M        the response of the answer, 1 where Jacobians are the images' own; S, shifts by a held mean cosine (``solve.closing``)
+N        what noise in M does to steps p that were taken by it, diag(sum_b var(M_ab) p_b^2)
+r        what is left of the step to the minimum, where the fit ended short of it: M^-1 (gradient + Lambda (x - mean))
+=======  ==========================================================================================================================
 """
 
 from __future__ import annotations
@@ -17,6 +26,7 @@ from numpy.typing import NDArray
 from services.core.records import Estimate
 from services.fit.optics.domain import UNITS, Domain, kind_of, natural_derivative
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
+from services.fit.solve.closing import ClosingSums, Response, response
 from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
@@ -39,6 +49,23 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
 
 
 @dataclass(frozen=True)
+class Sandwich:
+    """Cov(x) = T M^-1 meat M^-T T', each (F, F)."""
+
+    transform: Array
+    inverse: Array
+    meat: Array
+    misfit: float
+    """Factor s by which residuals exceed the measurements' noise."""
+
+    @property
+    def covariance(self) -> Array:
+        """Of x, (F, F)."""
+        half = self.transform @ self.inverse
+        return np.asarray(half @ self.meat @ half.T)
+
+
+@dataclass(frozen=True)
 class Uncertainty:
     """Covariance (F, F) of x, and the scaled directions (F, K) that the data leave open."""
 
@@ -48,6 +75,8 @@ class Uncertainty:
     open_directions: Array
     posterior: Array
     """(J'WJ + Lambda)^-1, (F, F)."""
+    sandwich: Sandwich | None = None
+    """What the covariance is made of, but for r r'."""
 
     def standard_error(self, slope: Array) -> float:
         """One standard error of a quantity with gradient ``slope`` (F,) to x."""
@@ -70,25 +99,87 @@ class Uncertainty:
         return along_open < 0.1 * size and float((scaled[on_bound] ** 2).sum()) < 0.1 * size and prior_share < 1 - LEAST_DATA_SHARE
 
 
-def uncertainty(domain: Domain, x: Array, equations: NormalEquations) -> Uncertainty:
-    """Uncertainty at a solution from the normal equations there."""
+@dataclass(frozen=True)
+class Whitening:
+    """Coordinates y, x = T y, of unit curvature, and the scaled directions (F, K) whose curvature drowns in its own noise."""
+
+    transform: Array
+    open_directions: Array
+
+
+def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
+    """Judge the curvature by its noise. Open directions keep only their noise level, so that they show a large error instead of a negative variance."""
     _, precision = domain.prior
     scale = domain.scale
-    misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
-
-    # Directions whose data curvature drowns in its own noise, in scaled coordinates.
     eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
     noise = equations.eigenvalue_noise(scale[:, None] * vectors)
-    is_open = eigenvalues < np.maximum(NOISE_FACTOR * noise, 1e-12 * abs(eigenvalues).max())
+    tiny = 1e-12 * float(abs(eigenvalues).max()) + 1e-300
+    is_open = eigenvalues < np.maximum(NOISE_FACTOR * noise, tiny)
+    believed = np.where(is_open, np.maximum(noise, tiny), eigenvalues)
+    curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
+    return Whitening(scale[:, None] * axes / np.sqrt(np.maximum(curvature, tiny)), vectors[:, is_open])
 
-    # Curvature for the inverse: open directions keep only their noise level, so that they show a large error instead of a negative variance.
-    believed = np.where(is_open, np.maximum(noise, 1e-12 * abs(eigenvalues).max() + 1e-300), eigenvalues)
-    data = (vectors * believed) @ vectors.T
-    prior = np.diag(precision * scale**2)
-    inverse = np.linalg.pinv(data + prior, hermitian=True)
-    meat = (misfit * _positive(equations.data_noise) + _positive(equations.gradient_noise)) * np.outer(scale, scale) + prior
-    covariance = inverse @ meat @ inverse * np.outer(scale, scale)
-    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), vectors[:, is_open], inverse * np.outer(scale, scale))
+
+@dataclass(frozen=True)
+class Pooled:
+    """Gradient of the data in whitened coordinates (F,), its Monte Carlo covariance (F, F), and how far (F,) it was carried by an assumed response."""
+
+    gradient: Array
+    noise: Array
+    carried: Array
+
+
+def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
+    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise.
+    carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
+    known, known_noise = t.T @ equations.gradient + solved.excess @ carried, t.T @ equations.gradient_noise @ t
+    first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
+    share = first / (first + second)
+    return Pooled((1 - share) * known + share * sums.gradient, (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise, (1 - share) * carried)
+
+
+def closing_step(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> Array:
+    """The last Newton step by the measured response: along what is not open, no longer than one scale, inside the bounds."""
+    mean, precision = domain.prior
+    known = whitening(domain, equations)
+    t = known.transform
+    solved = response(sums, t.T @ np.diag(precision) @ t)
+    gradient = _pooled(t, equations, sums, solved).gradient + t.T @ (precision * (x - mean))
+    scaled = -t @ solved.inverse @ gradient / domain.scale
+    scaled = scaled - known.open_directions @ (known.open_directions.T @ scaled)
+    low, high = domain.bounds
+    return np.asarray(np.clip(x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled))), low, high) - x)
+
+
+def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None) -> Uncertainty:
+    """Uncertainty at a solution from the normal equations there.
+
+    Args:
+        sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where Jacobians are the images' own.
+        step: what the fit moved after it.
+    """
+    mean, precision = domain.prior
+    misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
+    known = whitening(domain, equations)
+    t, count = known.transform, len(x)
+    prior = t.T @ np.diag(precision) @ t
+    meat = misfit * _positive(t.T @ equations.data_noise @ t) + prior
+    if sums is None:
+        inverse = np.eye(count)
+        meat = meat + _positive(t.T @ equations.gradient_noise @ t)
+        left = t.T @ (equations.gradient + precision * (x - mean))
+    else:
+        solved, moved = response(sums, prior), np.linalg.solve(t, np.zeros(count) if step is None else step)
+        pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
+        meat = meat + _positive(pooled.noise) + sums.shift_covariance + np.diag(solved.variance @ (moved + pooled.carried) ** 2)
+        left = pooled.gradient + t.T @ (precision * (x - mean)) + np.linalg.solve(inverse, moved) - prior @ moved
+
+    # What is left of the step counts as error along what is not open.
+    rest = t @ inverse @ left / domain.scale
+    rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
+    sandwich = Sandwich(t, inverse, meat, misfit)
+    covariance = sandwich.covariance + np.outer(rest, rest)
+    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich)
 
 
 def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:

@@ -87,9 +87,14 @@ class CurvatureNoise:
         return CurvatureNoise(tuple(parts))
 
 
-def curvature_noise(mean: Array, difference: Array, weight: Array, coordinates: Sequence[int]) -> NoisePart:
+def per_pixel(terms: Array, lights: int) -> Array:
+    """Sums (F, N) over the lights of a pixel of terms (F, lights x N): what is of one pixel is of the same walks, what is of two is independent."""
+    return np.asarray(terms.reshape(len(terms), lights, -1).sum(axis=1))
+
+
+def curvature_noise(mean: Array, difference: Array, weight: Array, coordinates: Sequence[int], lights: int = 1) -> NoisePart:
     """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded estimates of j."""
     m, d = mean[list(coordinates)], difference[list(coordinates)]
     first, second = np.triu_indices(len(m))
-    entries = 0.5 * (m[first] * d[second] + d[first] * m[second]) * weight
+    entries = per_pixel(0.5 * (m[first] * d[second] + d[first] * m[second]) * weight, lights)
     return NoisePart(tuple(coordinates), entries @ entries.T)

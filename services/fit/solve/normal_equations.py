@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
+from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise, per_pixel
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class NormalEquations:
     hessian: Array
     """sum w j j', (F, F), from two independent seeds; may be indefinite."""
     gradient: Array
-    """sum w j r, (F,), residual from a third seed."""
+    """sum w j r, (F,), residual from a third and a fourth seed."""
     hessian_noise: CurvatureNoise
     gradient_noise: Array
     """Monte Carlo covariance of the gradient, (F, F)."""
@@ -36,6 +36,8 @@ class NormalEquations:
     """sum w (r^2 - its Monte Carlo variance)."""
     expected_squares: float = 0.0
     """sum w var_ref: what ``squares`` would be if only the measurements' noise were left."""
+    carried: Array | float = 0.0
+    """How far (F,) the gradient was carried by this curvature since it was measured, mean over its samples."""
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         return NormalEquations(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -62,12 +64,13 @@ class NormalEquations:
             self.data_noise * quadratic,
             self.squares * linear,
             self.expected_squares * linear,
+            self.carried * linear,
         )
 
     def moved(self, step: Array) -> NormalEquations:
         """The quadratic model seen from ``step`` further on; the curvature's noise enters the gradient."""
-        carried = self.hessian_noise.of_product(step)
-        return replace(self, gradient=self.gradient + self.hessian @ step, gradient_noise=self.gradient_noise + carried)
+        noise = self.gradient_noise + self.hessian_noise.of_product(step)
+        return replace(self, gradient=self.gradient + self.hessian @ step, gradient_noise=noise, carried=self.carried + step)
 
     def step_noise(self, step: Array) -> float:
         """Standard deviation of the change g'p + p'Hp/2 that the model predicts for a step p."""
@@ -84,37 +87,43 @@ Region = tuple[Sequence[int], NDArray[np.bool_]]
 
 
 def normal_equations(
-    j1: Array, j2: Array, residual: Array, residual_variance: Array, reference_variance: Array, weight: Array, regions: Sequence[Region] | None = None
+    j1: Array, j2: Array, r1: Array, r2: Array, reference_variance: Array, weight: Array, lights: int = 1, regions: Sequence[Region] | None = None
 ) -> NormalEquations:
     """Sum one block of measurements.
 
+    Images of a pixel under all lights, and their derivatives, are of the same walks: their errors are correlated. So noise is that of sums over the
+    lights of a pixel, pixels being independent. With halves of differences d of J and s of r, the sum of w m r over a pixel's lights has the covariance
+    [sum w m s][..]' + [sum w r d][..]' - [sum w d s][..]': the last term is what the first two both count.
+
     Args:
         j1, j2: derivatives (F, M) from two independent seeds.
-        residual: render minus reference (M,), third seed.
-        residual_variance: Monte Carlo variance of the render (M,).
+        r1, r2: render minus reference (M,), from two other seeds.
         reference_variance: variance of the reference (M,).
         weight: (M,), 0 where a measurement does not count.
+        lights: M = lights x pixels, light by light.
         regions: which together hold all measurements; None for one of all coordinates.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
+    residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
 
     # Curvature, and its noise from the products of mean and difference.
     weighted = weight * mean
     hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
     regions = regions if regions is not None else ((range(len(mean)), np.ones(len(weight), dtype=bool)),)
-    noise = [CurvatureNoise((curvature_noise(mean[:, chosen], difference[:, chosen], weight[chosen], near),)) for near, chosen in regions]
+    noise = [CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights),)) for near, chosen in regions]
 
-    # Gradient; its noise is the Jacobian's seen through the residual plus the residual's seen through the Jacobian.
-    through_residual = weight * residual * difference
-    image = weight**2 * residual_variance
+    # Gradient, and its noise by pixels.
+    by_image, by_jacobian, by_both = (
+        per_pixel(terms, lights) for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
+    )
     sensor = weight**2 * reference_variance
     return NormalEquations(
         hessian=hessian,
         gradient=weighted @ residual,
         hessian_noise=sum(noise[1:], start=noise[0]),
-        gradient_noise=0.25 * through_residual @ through_residual.T + (image * mean) @ mean.T,
+        gradient_noise=by_image @ by_image.T + by_jacobian @ by_jacobian.T - by_both @ by_both.T,
         data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * difference) @ difference.T,
-        squares=float(weight @ (residual**2 - residual_variance)),
+        squares=float(weight @ (residual**2 - spread**2)),
         expected_squares=float(weight @ reference_variance),
     )
 

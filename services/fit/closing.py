@@ -1,0 +1,96 @@
+"""The last measurement of a fit whose Jacobians were those of similar media (see ``solve.closing``): one task per block, on any worker."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.blocks import read_block
+from services.fit.engine_host import EngineHost
+from services.fit.optics.domain import kind_of, similar_medium, to_natural
+from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.passes import BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.solve.closing import ClosingSums, closing_sums
+
+Array = NDArray[np.float64]
+
+SHIFT_SAMPLES = 2
+"""Images of changed media have so many times fewer paths: they enter a variance, not the answer."""
+
+
+def measure_closing(problem: StackProblem[Tissue], x: Array, whiten: Array, held: dict[str, tuple[float, float]], samples: int) -> ClosingSums:
+    """Sums at x, in block order.
+
+    Args:
+        whiten: T (F, F), x = T y.
+        held: parts whose mean cosine was held, with the mean and standard deviation of its prior in the unbounded domain.
+        samples: paths per pixel and seed.
+    """
+    run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
+    tissue, similar, parameters, chain = problem.jacobian_media(x)
+    first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
+    images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
+    exact = tuple(name for name in problem.domain.parameters if kind_of(name) != "shape")
+    rows = [k for k, name in enumerate(problem.domain.parameters) if name in exact]
+    borrowed = np.array([kind_of(name) == "shape" for name in problem.domain.names])
+    ends = tuple((_with_cosine(tissue, part, mean - sd), _with_cosine(tissue, part, mean + sd)) for part, (mean, sd) in held.items())
+    pending = []
+    for task in problem.passes.tasks(label, tissue, samples):
+        jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, first)
+        arguments = (whiten, exact, problem.domain.chain(x)[rows], borrowed, second, images, ends)
+        pending.append(run.submit(f"{label}-{task.index}", closing_task, task, jacobian, *arguments))
+    parts: list[tuple[ClosingSums, tuple[TraceRow, ...]]] = run.gather(pending)
+    problem.passes.record([row for _, trace in parts for row in trace])
+    total = parts[0][0]
+    for sums, _ in parts[1:]:
+        total = total + sums
+    return total
+
+
+def closing_task(
+    host: EngineHost,
+    task: BlockTask,
+    jacobian: JacobianBlock,
+    whiten: Array,
+    exact: tuple[str, ...],
+    chain: Array,
+    borrowed: NDArray[np.bool_],
+    seeds: tuple[int, int],
+    image_seeds: tuple[int, int],
+    ends: tuple[tuple[Tissue, Tissue], ...],
+) -> tuple[ClosingSums, tuple[TraceRow, ...]]:
+    """One block's share. ``chain`` (P, F) maps the rendered exact derivatives onto coordinates."""
+    start, block = time.time(), read_block(task.block)
+    view = block.fitted_view
+
+    def slopes(seed: int) -> Array:
+        natural = host.call("jacobian", task.recipe, task.tissue, view, exact, samples=task.samples, seed=seed).jacobian
+        return np.asarray(chain.T @ np.asarray(natural, dtype=np.float64).reshape(len(exact), -1))
+
+    def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:
+        return np.asarray(host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64).reshape(-1)
+
+    renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
+    few = max(task.samples // SHIFT_SAMPLES, 1)
+    moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
+    sums = closing_sums(
+        whiten,
+        jacobian.derivatives(host),
+        (slopes(seeds[0]), slopes(seeds[1])),
+        borrowed,
+        (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
+        np.array(moved).reshape(len(ends), 2, -1),
+        block.fit_weight.reshape(-1),
+        len(block.reference),
+    )
+    return sums, (jacobian.trace, trace_row("closing", task, start))
+
+
+def _with_cosine(tissue: Tissue, part: str, dual: float) -> Tissue:
+    cosine = to_natural("g1", dual)
+    if part == "enamel":
+        return replace(tissue, enamel=similar_medium(tissue.enamel, cosine))
+    return replace(tissue, dentin=similar_medium(tissue.dentin, cosine))

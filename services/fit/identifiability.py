@@ -1,0 +1,100 @@
+"""What a capture tells of a tooth and what it cannot, in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from services.core.records import Correlation, Estimate
+from services.fit.solve.covariance import Uncertainty
+
+NOTHING = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
+QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
+COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}
+"""What grows with a coordinate, and the sign of that."""
+TOLD = 0.5
+"""A quantity is told when the data fix it and its standard error is at most this part of it."""
+EXCHANGEABLE = 0.9
+"""Correlation from which two quantities can stand in for each other."""
+
+
+def correlation(known: Uncertainty) -> Correlation:
+    """Correlation of the fitted coordinates' errors, but for what is left of the step to the minimum; one without any error has none with others."""
+    covariance = known.covariance if known.sandwich is None else known.sandwich.covariance
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale = np.where(errors > 0, errors, np.inf)
+    matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
+    np.fill_diagonal(matrix, 1.0)
+    return Correlation(names=known.domain.names, matrix=tuple(tuple(float(v) for v in row) for row in matrix))
+
+
+def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:
+    """One or two sentences: what is known with unit and standard error, what is not and between which limits, and what looks alike."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for channel, table in tables.items():
+        groups.setdefault(tuple(name for name in _quantities(table) if _is_told(table[name])), []).append(channel)
+    sentences = [_sentence(seen, channels, tables, alone=len(tables) == 1) for seen, channels in groups.items()]
+    alike = _alike(correlations)
+    return " ".join(sentences + ([alike] if alike else []))
+
+
+def in_words(name: str) -> str:
+    """``enamel.sigma_a`` as *enamel absorption*."""
+    part, _, leaf = name.rpartition(".")
+    return f"{part} {QUANTITIES[leaf]}"
+
+
+def _quantities(table: Mapping[str, Estimate]) -> list[str]:
+    return [f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in QUANTITIES if f"{part}.{leaf}" in table]
+
+
+def _is_told(estimate: Estimate) -> bool:
+    return estimate.determined and estimate.se is not None and estimate.se <= TOLD * abs(estimate.value)
+
+
+def _sentence(seen: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool) -> str:
+    def values(name: str, what: str) -> str:
+        found = [(channel, tables[channel][name]) for channel in channels]
+        texts = [("" if len(found) == 1 else f"{channel} ") + (_value(e) if what == "value" else _limits(e)) for channel, e in found]
+        return ", ".join(texts)
+
+    opening = "This capture" if alone else f"In {_listed(channels)} this capture"
+    unseen = [name for name in _quantities(tables[channels[0]]) if name not in seen]
+    known = _listed([f"{in_words(name)} ({values(name, 'value')})" for name in seen])
+    open_ = _listed([f"{in_words(name)} ({values(name, 'limits')} fits)" for name in unseen], "or")
+    if not seen:
+        return f"{opening} does not tell {open_}."
+    return f"{opening} tells {known}" + (f", but not {open_}." if unseen else ".")
+
+
+def _value(estimate: Estimate) -> str:
+    assert estimate.se is not None
+    digits = int(np.clip(1 - np.floor(np.log10(estimate.se)), 0, 6)) if estimate.se > 0 else 4
+    return f"{estimate.value:.{digits}f} ± {estimate.se:.{digits}f} per mm"
+
+
+def _limits(estimate: Estimate) -> str:
+    # 95 % limits; none of these quantities is negative.
+    if estimate.se is None or not np.isfinite(estimate.se):
+        return "anything"
+    low, high = max(estimate.value - 2 * estimate.se, 0.0), estimate.value + 2 * estimate.se
+    return f"anything from {low:.2g} to {high:.2g} per mm" if low > 0 else f"anything up to {high:.2g} per mm"
+
+
+def _alike(correlations: Mapping[str, Correlation]) -> str:
+    # The pair whose errors go together most, over all channels.
+    found: list[tuple[float, str]] = []
+    for one in correlations.values():
+        for a, b in combinations(range(len(one.names)), 2):
+            (part_a, _, leaf_a), (part_b, _, leaf_b) = one.names[a].rpartition("."), one.names[b].rpartition(".")
+            if leaf_a in COORDINATES and leaf_b in COORDINATES and abs(one.matrix[a][b]) >= EXCHANGEABLE:
+                (word_a, sign_a), (word_b, sign_b) = COORDINATES[leaf_a], COORDINATES[leaf_b]
+                less = one.matrix[a][b] * sign_a * sign_b < 0
+                found.append((abs(one.matrix[a][b]), f"More {part_a} {word_a} with {'less' if less else 'more'} {part_b} {word_b} would look almost the same."))
+    return max(found)[1] if found else ""
+
+
+def _listed(items: Sequence[str], last: str = "and") -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} {last} {items[-1]}" if items else ""

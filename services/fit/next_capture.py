@@ -1,0 +1,223 @@
+"""Which further light or view would help most: Jacobians of images that were not taken, on a few hundred pixels, beside what the fit knows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera
+from services.core.records import Estimate
+from services.fit.blocks import Block, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.engine_host import EngineHost
+from services.fit.identifiability import QUANTITIES, in_words
+from services.fit.optics.parameters import Tissue
+from services.fit.passes import BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
+from services.fit.solve.information import Addition, addition, covariance_with
+from services.fit.transport.recipe import SceneRecipe, View
+
+Array = NDArray[np.float64]
+
+PIXELS = 200
+"""Of each view, spread evenly."""
+VIEW_ANGLE = np.radians(60)
+WORTH = 0.1
+"""A candidate is named when it cuts the error by more than this part, and by more than the prediction is unsure of."""
+LIGHTS = {
+    "at the left": (-1, 0, 0), "at the right": (1, 0, 0), "above": (0, 1, 0), "below": (0, -1, 0), "beside the camera": (0, 0, 1),
+    "behind the tooth": (0, 0, -1), "at the left behind the tooth": (-1, 0, -1), "at the right behind the tooth": (1, 0, -1),
+    "above, behind the tooth": (0, 1, -1),
+}  # fmt: skip
+"""Directions from the tooth in the first camera's image: right, up, towards the camera."""
+VIEWS = {"60° further to the left": (0, -1, 0), "60° further to the right": (0, 1, 0), "60° higher": (-1, 0, 0)}
+"""Axes, right, up, towards the camera, about which the first camera is turned around the tooth."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An image that was not taken; halves are two predictions from different pixels."""
+
+    words: str
+    halves: tuple[Addition, Addition]
+
+    @property
+    def whole(self) -> Addition:
+        """From all pixels."""
+        return self.halves[0] + self.halves[1]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Expected noise of an image: a share of the value, and of the image's maximum."""
+
+    relative: float
+    floor: float
+
+    def variance(self, image: Array) -> Array:
+        """Of images (L, N)."""
+        return np.asarray((self.relative * image) ** 2 + (self.floor * image.max(axis=-1, keepdims=True)) ** 2)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A view of images that were not taken, stored as a block, and how many times more measurements the fit would have of it."""
+
+    block: StoredFile
+    words: tuple[str, ...]
+    """Candidate that each light belongs to, '' for those that do not count."""
+    ratio: float
+
+
+def advice(
+    problem: StackProblem[Tissue], known: Uncertainty, folder: Path, parts: Sequence[str], sensor: Sensor, weight: float, samples: int, pixel_step: int = 1
+) -> tuple[str, tuple[Candidate, ...]]:
+    """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where none would.
+
+    Args:
+        problem: at the solution, which is its base.
+        known: uncertainty there.
+        folder: for the scenes and blocks of what was not taken.
+        weight: of a measurement in the fit.
+        samples: paths per pixel and seed, those of the fit's last measurement.
+        pixel_step: every n-th pixel is fitted.
+    """
+    assert known.sandwich is not None
+    recipe, probes = probes_of(problem, folder, pixel_step)
+    _, similar, parameters, chain = problem.jacobian_media(known.x)
+    seeds = problem.seed(0, "advice-1"), problem.seed(0, "advice-2")
+    images = problem.seed(0, "advice-image-1"), problem.seed(0, "advice-image-2")
+    run, label, pending = problem.passes.executor, f"{problem.passes.seeds.channel}-advice", []
+    for index, probe in enumerate(probes):
+        task = BlockTask(probe.block, index, recipe, label, similar, samples)
+        jacobian = run.submit(f"{label}-jacobian-{index}", jacobian_task, task, parameters, chain, seeds)
+        pending.append(run.submit(f"{label}-{index}", advice_task, task, jacobian, known.sandwich, images, probe, sensor, weight))
+    parts_found: list[tuple[dict[str, tuple[Addition, Addition]], TraceRow]] = run.gather(pending)
+    problem.passes.record([row for _, row in parts_found])
+    sums: dict[str, tuple[Addition, Addition]] = {}
+    for found, _ in parts_found:
+        for words, (first, second) in found.items():
+            sums[words] = (sums[words][0] + first, sums[words][1] + second) if words in sums else (first, second)
+    candidates = tuple(Candidate(words, halves) for words, halves in sums.items())
+    return sentence(problem.base, parts, known, candidates), candidates
+
+
+def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidates: Sequence[Candidate]) -> str:
+    """The best candidate in words, judged by the quantity whose relative error is largest now; by the next one where that stays out of every reach."""
+    before = relative_errors(estimates(tissue, parts, known))
+    if not before or not candidates:
+        return ""
+    names = sorted(before, key=lambda name: -before[name])
+    found = [(candidate, predicted(tissue, parts, known, candidate)) for candidate in candidates]
+    for name in names:
+        candidate, (after, unsure) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
+        if after + unsure <= (1 - WORTH) * min(before[name], 1.0):
+            was = _percent(before[name]) if before[name] <= 1 else "more than 100 %"
+            return f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to {_percent(after)}."
+    return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(names[0])} by more than a tenth."
+
+
+def predicted(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate) -> dict[str, tuple[float, float]]:
+    """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice, differ by noise alone."""
+
+    def after(added: Addition) -> dict[str, float]:
+        assert known.sandwich is not None
+        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added))))
+
+    whole, *halves = (after(added) for added in (candidate.whole, *(half.scaled(2) for half in candidate.halves)))
+    return {name: (value, 0.5 * abs(halves[0][name] - halves[1][name])) for name, value in whole.items()}
+
+
+def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
+    """Standard errors over values of what a report leads with."""
+    return {name: e.se / abs(e.value) for name, e in table.items() if name.rpartition(".")[2] in QUANTITIES and e.se is not None and e.se > 0 and e.value != 0}
+
+
+def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) -> tuple[StoredFile, tuple[Probe, ...]]:
+    """The scene with the candidate lights added, and views to probe: the fit's own under these lights, further ones under the lights there are."""
+    blocks, recipe = problem.passes.read_blocks(), read_recipe(problem.passes.recipe)
+    cameras = {block.view.camera.name: block.view.camera for block in blocks}
+    first, lights = next(iter(cameras.values())), len(recipe.light_positions_mm)
+    vertices = recipe.teeth[0].outer.vertices_mm
+    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    distance = float(np.median(np.linalg.norm(recipe.light_positions_mm - centre, axis=1)))
+    axes = np.asarray(first.camera_from_world)[:3, :3] * np.array([[1.0], [-1.0], [-1.0]])
+    added = np.array([centre + distance * (np.asarray(d, dtype=float) / np.linalg.norm(d)) @ axes for d in LIGHTS.values()])
+    more = replace(
+        recipe,
+        light_positions_mm=np.vstack([recipe.light_positions_mm, added]),
+        light_intensities=np.concatenate([recipe.light_intensities, np.full(len(added), np.median(recipe.light_intensities))]),
+    )
+    light_words = tuple(f"A light {words}" for words in LIGHTS)
+    probes = []
+    for name, camera in cameras.items():
+        pixels = np.concatenate([block.view.pixels for block in blocks if block.view.camera.name == name])
+        probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words))
+    for words, axis in VIEWS.items():
+        camera = turned(first, centre, np.asarray(axis, dtype=float) @ axes)
+        pixels = seen_pixels(camera, more, pixel_step)
+        if len(pixels):
+            probes.append(_probe(folder, camera, pixels, (f"A camera {words}",) * lights + ("",) * len(added)))
+    return write_recipe(folder, more), tuple(probes)
+
+
+def _probe(folder: Path, camera: Camera, pixels: NDArray[np.int32], words: tuple[str, ...]) -> Probe:
+    chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
+    shape = (len(words), len(chosen))
+    counted = np.array([word != "" for word in words])
+    block = Block(View(camera, chosen), np.zeros(shape), np.ones(shape), np.where(counted[:, None], np.ones(shape), 0.0), np.zeros(shape, dtype=bool))
+    return Probe(write_block(folder, block), words, len(pixels) / len(chosen))
+
+
+def turned(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
+    """The camera carried around a point about an axis, still looking at it as before."""
+    # Rodrigues' formula.
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + np.sin(VIEW_ANGLE) * cross + (1 - np.cos(VIEW_ANGLE)) * cross @ cross
+    pose = np.asarray(camera.camera_from_world)
+    moved = np.eye(4)
+    moved[:3, :3] = pose[:3, :3] @ rotation.T
+    moved[:3, 3] = pose[:3, 3] + pose[:3, :3] @ centre_mm - moved[:3, :3] @ centre_mm
+    return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, moved.tolist()))})
+
+
+def seen_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.int32]:
+    """Every ``step``-th pixel (N, 2) in whose cell some point of the tooth's surface appears."""
+    outer = recipe.teeth[0].outer
+    corners = outer.vertices_mm[outer.faces]
+    weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
+    points, depth = camera.project(np.einsum("wc,fcx->wfx", weights, corners).reshape(-1, 3))
+    cells = np.unique(np.floor(points[depth > 0] / step).astype(np.int64), axis=0)
+    inside = ((cells >= 0) & (cells * step < np.asarray(camera.size))).all(axis=1)
+    return (cells[inside] * step).astype(np.int32)
+
+
+def advice_task(
+    host: EngineHost, task: BlockTask, jacobian: JacobianBlock, known: Sandwich, seeds: tuple[int, int], probe: Probe, sensor: Sensor, weight: float
+) -> tuple[dict[str, tuple[Addition, Addition]], TraceRow]:
+    """What one view adds by candidate, from its even and its odd pixels."""
+    start, view = time.time(), read_block(task.block).fitted_view
+    half = max(task.samples // 2, 1)
+    images = [np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64) for seed in seeds]
+    slopes = [flat.reshape(len(flat), *images[0].shape) for flat in jacobian.derivatives(host)]
+    variance = sensor.variance(0.5 * (images[0] + images[1]))
+    out = {}
+    for words in dict.fromkeys(word for word in probe.words if word):
+        lights = np.array([word == words for word in probe.words])
+        halves = []
+        for odd in (0, 1):
+            first, second = (rows[:, lights, odd::2].reshape(len(rows), -1) for rows in slopes)
+            renders = [image[lights, odd::2].reshape(-1) for image in images]
+            one = addition(known, (first, second), (renders[0], renders[1]), variance[lights, odd::2].reshape(-1), weight)
+            halves.append(one.scaled(probe.ratio))
+        out[words] = (halves[0], halves[1])
+    return out, trace_row("advice", task, start)
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.1f} %"

@@ -1,0 +1,157 @@
+"""What is measured once, where a fit ends: how its answer really responds, and what holding g cost it.
+
+A fit with Jacobians J~ of similar media solves J~'W r(x) + Lambda (x - m) = 0, an estimating equation whose instruments J~ are not the derivatives J of
+its images. Its answer moves with the data by M^-1 J~'W, M = J~'W J + Lambda, and not by the inverse of J~'W J~ + Lambda (generalised method of moments,
+Hansen 1982). And with another mean cosine of the media, at equal reduced scattering and absorption, images change by dC and the answer by M^-1 J~'W dC.
+
+All sums are in coordinates y, x = T y, in which the curvature that is believed is the identity. There M = 1 + E. Exact derivatives are noisy, and the
+inverse of a noisy matrix is worthless long before the matrix is, so E is shrunk to what stands out of its noise: with entries of variance tau^2 about 0,
+and noise v, E tau^2 / (tau^2 + v) (Efron and Morris 1973), tau^2 such that sum E^2 / (tau^2 + v) is its expectation (Paule and Mandel 1982).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.solve.curvature_noise import per_pixel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ClosingSums:
+    """Sums over measurements in whitened coordinates y (F,); blocks add."""
+
+    gradient: Array
+    """(F,)"""
+    gradient_noise: Array
+    """Its Monte Carlo covariance, (F, F)."""
+    response: Array
+    """J~'W J, (F, F)."""
+    response_variance: Array
+    """Monte Carlo variance of each entry, (F, F)."""
+    shifts: Array
+    """J~'W dC for K changes of the media, each by one standard deviation of what is held, (K, F)."""
+    shift_noise: Array
+    """Monte Carlo covariance of each, (K, F, F)."""
+
+    def __add__(self, other: ClosingSums) -> ClosingSums:
+        return ClosingSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
+
+    @staticmethod
+    def of(record: dict[str, Any]) -> ClosingSums:
+        """From ``record``."""
+        sums = ClosingSums(**{name: np.array(value, dtype=np.float64) for name, value in record.items()})
+        count = len(sums.gradient)
+        return replace(sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count))
+
+    @property
+    def shift_covariance(self) -> Array:
+        """Covariance (F, F) of the gradient by the changes, sum of b b', each shortened to the length that it has without noise."""
+        total = np.zeros_like(self.response)
+        for shift, noise in zip(self.shifts, self.shift_noise, strict=True):
+            square = float(shift @ shift)
+            total += max(0.0, 1 - float(np.trace(noise)) / max(square, 1e-300)) * np.outer(shift, shift)
+        return total
+
+
+def closing_sums(
+    whiten: Array,
+    similar: tuple[Array, Array],
+    exact: tuple[Array, Array],
+    borrowed: NDArray[np.bool_],
+    residuals: tuple[Array, Array],
+    moved: Array,
+    weight: Array,
+    lights: int,
+) -> ClosingSums:
+    """Sum one block of measurements, M = lights x pixels.
+
+    Args:
+        whiten: T (F, F).
+        similar: J~ (F, M) from two seeds.
+        exact: J (F, M) from two more.
+        borrowed: rows of J (F,) that are not rendered and taken from J~.
+        residuals: render minus reference (M,) from two more.
+        moved: changes of the render (K, 2, M), by change and seed.
+        weight: (M,)
+    """
+    mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
+    true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
+    true, true_spread = np.where(borrowed[:, None], mean, true), np.where(borrowed[:, None], spread, true_spread)
+    own = np.where(borrowed[:, None], spread, 0.0)
+    m, d, e, f, o = (whiten.T @ rows for rows in (mean, spread, true, true_spread, own))
+
+    # Sums of J~ with something, and their noise by pixels, as in the normal equations.
+    def with_noise(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        value, half = weight * 0.5 * (pair[0] + pair[1]), weight * 0.5 * (pair[0] - pair[1])
+        first, second, both = (per_pixel(terms, lights) for terms in (m * half, d * value, d * half))
+        return m @ value, first @ first.T + second @ second.T - both @ both.T
+
+    gradient, gradient_noise = with_noise(residuals)
+    shifts = [with_noise((change[0], change[1])) for change in moved]
+
+    # Response; where J is borrowed the noise that both sides share is taken off.
+    response = (weight * m) @ e.T - (weight * d) @ o.T
+    variance = np.zeros_like(response)
+    for terms, rest, sign in ((m, f, 1.0), (d, e, 1.0), (d, f, -1.0)):
+        for a in range(len(m)):
+            variance[a] += sign * (per_pixel(weight * terms[a] * rest, lights) ** 2).sum(axis=1)
+    return ClosingSums(
+        gradient=gradient,
+        gradient_noise=gradient_noise,
+        response=response,
+        response_variance=np.maximum(variance, 0.0),
+        shifts=np.array([shift for shift, _ in shifts]).reshape(-1, len(m)),
+        shift_noise=np.array([noise for _, noise in shifts]).reshape(-1, len(m), len(m)),
+    )
+
+
+@dataclass(frozen=True)
+class Response:
+    """M = 1 + E in whitened coordinates: its inverse (F, F) and the variance (F, F) that is left in each entry of M."""
+
+    inverse: Array
+    variance: Array
+    excess: Array
+    """E (F, F), shrunk."""
+
+
+def response(sums: ClosingSums, prior: Array) -> Response:
+    """Shrink the measured response towards the believed curvature.
+
+    Args:
+        prior: whitened precision T' Lambda T, which joins the measured data.
+    """
+    excess = sums.response + prior - np.eye(len(prior))
+    noise = np.maximum(sums.response_variance, 1e-30)
+    between = _between_variance(excess, noise)
+    shrunk, left = excess * between / (between + noise), noise * between / (between + noise)
+
+    # A singular value that noise could have made is not believed to be smaller than noise.
+    u, values, v = np.linalg.svd(np.eye(len(prior)) + shrunk)
+    floor = 2 * np.sqrt(len(prior) * float(left.mean()))
+    inverse = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
+    return Response(np.asarray(inverse), left, shrunk)
+
+
+def _between_variance(values: Array, noise: Array) -> float:
+    # Root of sum values^2 / (tau^2 + noise) = count, which falls with tau^2.
+    def excess(between: float) -> float:
+        return float((values**2 / (between + noise)).sum()) - values.size
+
+    if excess(0.0) <= 0:
+        return 0.0
+    low, high = 0.0, float((values**2).max()) * values.size
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return 0.5 * (low + high)

@@ -1,0 +1,60 @@
+"""What one more image would teach: the covariance of a fit that had it, from the image's Jacobian alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.solve.covariance import Sandwich
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Addition:
+    """What further measurements add in whitened coordinates y (F,), each (F, F); blocks add."""
+
+    information: Array
+    """J'WJ"""
+    meat: Array
+    """Covariance of J'W r by the noise of the measurements and of the renders."""
+
+    def __add__(self, other: Addition) -> Addition:
+        return Addition(self.information + other.information, self.meat + other.meat)
+
+    def scaled(self, factor: float) -> Addition:
+        """Of ``factor`` times as many measurements of the same kind."""
+        return Addition(factor * self.information, factor * self.meat)
+
+
+def addition(known: Sandwich, slopes: tuple[Array, Array], renders: tuple[Array, Array], variance: Array, weight: float) -> Addition:
+    """Sum measurements that have not been made, with as many paths as the fit's last measurement.
+
+    Args:
+        known: of the fit without them.
+        slopes: J (F, M) from two seeds.
+        renders: images (M,) from two more.
+        variance: the measurements' expected variance (M,).
+        weight: what the fit would give each of them.
+    """
+    m, d = (known.transform.T @ (0.5 * (slopes[0] + sign * slopes[1])) for sign in (1, -1))
+    render_variance = 0.25 * (renders[0] - renders[1]) ** 2
+
+    # Gradient noise as in the normal equations, with residuals that are noise alone.
+    data = (variance * m) @ m.T - (variance * d) @ d.T
+    monte_carlo = (render_variance * m) @ m.T + (variance * d) @ d.T
+    return Addition(weight * (m @ m.T - d @ d.T), weight**2 * (known.misfit * data + monte_carlo))
+
+
+def covariance_with(known: Sandwich, added: Addition) -> Array:
+    """Covariance (F, F) of x in a fit with the further measurements; negative information, which noise alone makes, counts as none."""
+    information, meat = (_positive(matrix) for matrix in (added.information, added.meat))
+    inverse = np.linalg.inv(np.linalg.inv(known.inverse) + information)
+    return np.asarray(known.transform @ inverse @ (known.meat + meat) @ inverse.T @ known.transform.T)
+
+
+def _positive(matrix: Array) -> Array:
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,0 +1,166 @@
+"""Whether a fit's ± is true: many small fits of known teeth, how many of the 95 % intervals hold the truth, and the z-scores.
+
+python -m tests.benchmarks.honest_errors --fits 100 --out honest_errors.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --out honest_errors_drawn.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --out honest_errors_formula.json
+
+Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
+six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits hold; with
+more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
+``--formula`` puts a formula in place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from services.core.records import JobSpec
+from services.core.stage import LocalContext
+from services.fit.optics.domain import to_natural
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.schedule import PRIORS
+from services.fit.stage import ENGINE, run
+from services.fit.transport.platform import prepare_device
+from tests.support.fake_engine import DirectFakeEngine
+from tests.support.prepared import write_prepared
+from tests.support.rendered_capture import rendered_tooth
+
+CENTRE = {"enamel": (0.9, 0.01), "dentin": (2.4, 0.03)}
+"""Reduced scattering and absorption, per mm."""
+FORMULA = "tests.support.fake_engine:DirectFakeEngine"
+LEAVES = ("sigma_s_reduced", "alpha_reduced")
+INTERVAL = 1.959964
+
+
+def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> Tissue:
+    """Media of given reduced scattering and absorption, per mm, and mean cosine."""
+    media = {}
+    for part, (scattering, absorption) in reduced.items():
+        sigma = scattering / (1 - g[part]) + absorption
+        media[part] = Medium(sigma, 1 - absorption / sigma, g1=g[part])
+    return Tissue(media["enamel"], media["dentin"])
+
+
+def drawn_tissue(rng: np.random.Generator) -> Tissue:
+    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits."""
+    mean, sd = PRIORS["g1"]
+    reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
+    return tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part in CENTRE})
+
+
+class Subject(Protocol):
+    """What can be photographed."""
+
+    def photograph(self, root: Path, seed: int) -> None:
+        """Publish ``prepared`` in ``root`` with the sensor's noise drawn anew."""
+
+
+@dataclass(frozen=True)
+class FormulaTooth:
+    """Images by the formula of ``DirectFakeEngine``."""
+
+    truth: Tissue
+
+    def photograph(self, root: Path, seed: int) -> None:
+        """See Subject."""
+        write_prepared(root, truth=self.truth, seed=seed, engine=DirectFakeEngine)
+
+
+def fit_rows(tooth: Subject, truth: Tissue, seed: int, options: dict[str, object], engine: str = ENGINE) -> Iterator[dict[str, object]]:
+    """One fit's quantities with what they should be."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        tooth.photograph(root, seed)
+        spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "known", "seed": seed, **options})
+        report = run(spec, LocalContext(root), engine=engine)
+        last = json.loads((root / "fit" / "history.json").read_text())[-1]
+    for part in CENTRE:
+        for leaf in LEAVES:
+            estimate, true = report.parameters["green"][f"{part}.{leaf}"], float(getattr(getattr(truth, part), leaf))
+            yield {
+                "fit": seed,
+                "quantity": f"{part}.{leaf}",
+                "truth": true,
+                "value": estimate.value,
+                "se": estimate.se,
+                "z": (estimate.value - true) / estimate.se if estimate.se else None,
+                "determined": estimate.determined,
+                "converged": report.converged,
+                "steps": report.steps,
+                "samples": last["samples"],
+                "verdict": last["verdict"],
+                "g": [truth.enamel.g1, truth.dentin.g1],
+            }
+
+
+def summary(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+    """Per quantity: intervals that hold the truth, mean and rms of z, median relative standard error."""
+    found = []
+    for name in dict.fromkeys(str(row["quantity"]) for row in rows):
+        mine = [row for row in rows if row["quantity"] == name]
+        z = np.array([row["z"] for row in mine], dtype=float)
+        relative = [float(str(row["se"])) / float(str(row["truth"])) for row in mine]
+        found.append(
+            {
+                "quantity": name,
+                "fits": len(mine),
+                "held": int((np.abs(z) <= INTERVAL).sum()),
+                "mean_z": float(z.mean()),
+                "rms_z": float(np.sqrt(np.mean(z**2))),
+                "largest_z": float(np.abs(z).max()),
+                "median_relative_se": float(np.median(relative)),
+                "determined": sum(bool(row["determined"]) for row in mine),
+            }
+        )
+    return found
+
+
+def main() -> None:
+    """Run the study and print its summary."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fits", type=int, default=100)
+    parser.add_argument("--truths", type=int, default=1)
+    parser.add_argument("--formula", action="store_true", help="a formula in place of light transport")
+    parser.add_argument("--paths", type=int, default=65536, help="of the truth, per pixel")
+    parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
+    parser.add_argument("--samples", type=int, default=32)
+    parser.add_argument("--max-samples", type=int, default=256)
+    parser.add_argument("--max-steps", type=int, default=8)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    prepare_device(arguments.threads)
+    options: dict[str, object] = {
+        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000,
+        "advise": False,
+    }  # fmt: skip
+    rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
+    held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})
+    truths = [held] if arguments.truths == 1 else [drawn_tissue(rng) for _ in range(arguments.truths)]
+    teeth: dict[int, Subject] = {}
+    for number in range(arguments.first, arguments.first + arguments.fits):
+        which = number % len(truths)
+        if which not in teeth:
+            rendered = {"samples": arguments.paths, "seed": 770_000 + which, "pixels": arguments.pixels}
+            teeth[which] = FormulaTooth(truths[which]) if arguments.formula else rendered_tooth(truths[which], **rendered)
+        began_s = time.process_time()
+        fresh = list(fit_rows(teeth[which], truths[which], number, options, FORMULA if arguments.formula else ENGINE))
+        rows += fresh
+        print(number, f"{time.process_time() - began_s:.1f} s", fresh[0]["verdict"], [f"{row['z']:+.1f}" for row in fresh], flush=True)
+        arguments.out.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
+    for line in summary(rows):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Pieces of a jaw's fit: starts, neighbours along the arch, the wall's colour, the domain of a mouth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from services.core.errors import CaptureInputError, InputError, JobCancelledError, MeshError
+from services.fit.jaw_schedule import arch_place, nearby
+from services.fit.jaw_starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
+from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
+from services.fit.optics.half_space import half_space_reflectance
+from services.fit.optics.parameters import Medium, Mouth, Tissue
+
+
+def tissue(sigma: float, alpha: float = 0.99) -> Tissue:
+    return Tissue(Medium(sigma, alpha, g1=0.8), Medium(2 * sigma, alpha, g1=0.8))
+
+
+def fitted(fdi: int, own: Tissue) -> ToothStart:
+    return ToothStart(fdi, "fitted", "", 100, own)
+
+
+def test_the_wall_reflects_like_an_isotropic_half_space() -> None:
+    # Spherical albedo from Chandrasekhar's H function, itself by iterating its integral equation at 200 Gauss points (rounding only).
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    mu, weights = (nodes + 1) / 2, weights / 2
+    for albedo in (0.05, 0.5, 0.9, 0.99, 0.999):
+        h = np.ones_like(mu)
+        for _ in range(500):
+            h = 1 / (math.sqrt(1 - albedo) + 0.5 * albedo * ((weights * mu * h) / (mu[:, None] + mu)).sum(axis=1))
+        exact = 1 - 2 * math.sqrt(1 - albedo) * float((weights * mu * h).sum())
+        # The fit's own error is at most 0.0021; similarity is exact for what is isotropic.
+        assert half_space_reflectance(Medium(3.0, albedo)) == pytest.approx(exact, abs=0.0022)
+    forward = Medium(10.0, 0.99, g1=0.9)
+    assert half_space_reflectance(forward) == pytest.approx(half_space_reflectance(Medium(1.0, forward.alpha_reduced)), rel=1e-12)
+
+
+def test_hidden_teeth_are_tied_and_faults_of_their_own_are_told() -> None:
+    def broken() -> Tissue:
+        raise MeshError("Its dentin sticks out; repair it.")
+
+    hidden = start_tooth(17, LEAST_TOOTH_PIXELS - 1, broken)
+    assert (hidden.state, hidden.tissue, hidden.drops_dentin) == ("tied", None, False)
+    failed = start_tooth(11, LEAST_TOOTH_PIXELS, broken)
+    assert (failed.state, failed.drops_dentin) == ("failed", True)
+    assert "Its dentin sticks out" in failed.sentence
+
+    def dark() -> Tissue:
+        raise CaptureInputError("Tooth 11 is dark; light it.")
+
+    assert not start_tooth(11, 100, dark).drops_dentin
+
+    def cancelled() -> Tissue:
+        raise JobCancelledError("Cancelled.")
+
+    with pytest.raises(JobCancelledError):
+        start_tooth(11, 100, cancelled)
+
+
+def test_others_follow_the_median_of_the_front_teeth() -> None:
+    starts = [fitted(11, tissue(2.0)), fitted(12, tissue(8.0)), fitted(16, tissue(100.0)), ToothStart(17, "tied", "Hidden.", 0, None)]
+    mouth = start_mouth(starts, Medium(8.0, 0.96, g1=0.8), has_cavity=True)
+    # The median of two in ln sigma; the molar does not count.
+    assert mouth.teeth[3].enamel.sigma == pytest.approx(4.0)
+    assert mouth.teeth[2].enamel.sigma == pytest.approx(100.0)
+    assert mouth.reflectance == pytest.approx(half_space_reflectance(Medium(8.0, 0.96, g1=0.8)))
+    assert typical([starts[2]], [tissue(5.0)]).enamel.sigma == pytest.approx(5.0)
+    with pytest.raises(InputError, match=r"No tooth of the jaw can be fitted.*Hidden"):
+        start_mouth([starts[3]], None, has_cavity=False)
+
+
+def test_neighbours_are_those_along_the_arch() -> None:
+    assert sorted((11, 17, 21, 27, 12), key=arch_place) == [17, 12, 11, 21, 27]
+    assert sorted((31, 41, 48, 38), key=arch_place) == [48, 41, 31, 38]
+    names = [f"{k}.enamel.sigma" for k in range(4)] + ["gums.sigma", "cavity.reflectance"]
+    domain = Domain(tuple(Coordinate((name,)) for name in names))
+    # Teeth 11, 12, 21, 22 in a manifest's order stand as 12, 11, 21, 22.
+    assert nearby((11, 12, 21, 22), domain) == ((0, 1, 2, 4, 5), (0, 1, 4, 5), (0, 2, 3, 4, 5), (2, 3, 4, 5))
+
+
+def test_a_mouth_has_coordinates_like_a_tooth() -> None:
+    mouth = Mouth((tissue(2.0), tissue(3.0)), Medium(8.0, 0.96, g1=0.8), 0.3)
+    domain = Domain(tuple(Coordinate((name,)) for name in ("1.dentin.sigma", "gums.alpha", "cavity.reflectance")))
+    x = domain.x_of(mouth)
+    np.testing.assert_allclose(x, [math.log(6.0), -math.log10(0.04), math.log(0.3 / 0.7)])
+    moved = domain.tissue_at(x + np.array([math.log(2), 1.0, 0.0]), mouth)
+    assert (moved.teeth[1].dentin.sigma, moved.value("gums.alpha"), moved.reflectance) == pytest.approx((12.0, 0.996, 0.3))
+    assert moved.teeth[0] == mouth.teeth[0]
+    assert [kind_of(name) for name in ("3.shape.1", "0.enamel.g1", "cavity.reflectance")] == ["shape", "g1", "reflectance"]
+    similar = similar_tissue(mouth, 0.0)
+    assert similar.reflectance == mouth.reflectance
+    for part in ("0.enamel", "1.dentin", "gums"):
+        assert similar.medium(part).sigma_s_reduced == pytest.approx(mouth.medium(part).sigma_s_reduced)
+        assert similar.medium(part).mean_cosine == 0.0

@@ -1,0 +1,117 @@
+"""A fit with other Jacobians than its images' own states the errors it has, once its response is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.fit.optics.domain import Coordinate, Domain
+from services.fit.solve.closing import ClosingSums, closing_sums, response
+from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
+from services.fit.solve.normal_equations import NormalEquations, normal_equations
+from tests.support.z_scores import rms_bounds
+
+ROUNDS, LIGHTS, PIXELS = 200, 4, 100
+DOMAIN = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "dentin.sigma", "dentin.alpha")))
+FLAT = np.zeros(3, dtype=bool)
+SENSOR, IMAGE, SLOPE = 0.05, 0.05, 0.15
+"""Standard deviations of noise: of a measurement, of a render and of a derivative."""
+
+
+class Linear:
+    """Images J x with the instruments ``similar`` in place of J, and noise of which the lights of a pixel share half."""
+
+    def __init__(self, seed: int, held: bool = False) -> None:
+        rng = np.random.default_rng(1)
+        count = LIGHTS * PIXELS
+        self.similar = 0.1 * rng.standard_normal((3, count)) + 0.1 * rng.standard_normal(count)
+        self.exact = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]]) @ self.similar + 0.03 * rng.standard_normal((3, count))
+        self.direction = held * (0.02 * rng.standard_normal(count) + 0.1 * self.similar[0])
+        self.rng = np.random.default_rng([seed, 2])
+        self.weight = np.full(count, 1 / SENSOR**2)
+        self.truth = np.array([1.0, 2.0, 2.0])
+
+    def noise(self, spread: float, *shape: int) -> np.ndarray:
+        shared = np.tile(self.rng.standard_normal((*shape, PIXELS)), LIGHTS)
+        return spread * np.sqrt(0.5) * (shared + self.rng.standard_normal((*shape, LIGHTS * PIXELS)))
+
+    def photograph(self, offset: float) -> np.ndarray:
+        return self.truth @ self.exact + offset * self.direction + SENSOR * self.rng.standard_normal(LIGHTS * PIXELS)
+
+    def pair(self, mean: np.ndarray, spread: float) -> tuple[np.ndarray, np.ndarray]:
+        return mean + self.noise(spread, *mean.shape[:-1]), mean + self.noise(spread, *mean.shape[:-1])
+
+    def equations(self, x: np.ndarray, photo: np.ndarray) -> NormalEquations:
+        j1, j2 = self.pair(self.similar, SLOPE)
+        r1, r2 = self.pair(x @ self.exact - photo, IMAGE)
+        return normal_equations(j1, j2, r1, r2, np.full(len(photo), SENSOR**2), self.weight, LIGHTS)
+
+    def closing(self, x: np.ndarray, photo: np.ndarray, transform: np.ndarray) -> ClosingSums:
+        residuals = self.pair(x @ self.exact - photo, IMAGE)
+        moved = np.array([self.pair(self.direction, IMAGE)])
+        return closing_sums(transform, self.pair(self.similar, SLOPE), self.pair(self.exact, SLOPE), FLAT, residuals, moved, self.weight, LIGHTS)
+
+
+def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarray, Uncertainty]:
+    # A Newton step by the instruments' own curvature, carried there, then the closing measurement.
+    photo = problem.photograph(offset)
+    start = problem.truth + 0.05
+    equations = problem.equations(start, photo)
+    step = -np.linalg.solve(equations.hessian, equations.gradient)
+    x, equations = start + step, equations.moved(step)
+    if not measured:
+        return x, uncertainty(DOMAIN, x, equations)
+    sums = problem.closing(x, photo, whitening(DOMAIN, equations).transform)
+    last = closing_step(DOMAIN, x, equations, sums)
+    return x + last, uncertainty(DOMAIN, x + last, equations, sums, last)
+
+
+def rms(*, measured: bool, held: bool) -> np.ndarray:
+    rng, z = np.random.default_rng(7), []
+    for seed in range(ROUNDS):
+        problem = Linear(seed, held)
+        x, known = fitted(problem, measured=measured, offset=float(rng.standard_normal()) if held else 0.0)
+        z.append((x - problem.truth) / np.sqrt(np.diag(known.covariance)))
+    return np.sqrt(np.mean(np.square(z), axis=0))
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
+    # The rule of tables, an rms of 0.8 to 1.25; an honest one of 200 strays beyond in fewer than one of a thousand cases.
+    low, high = rms_bounds(ROUNDS)
+    found = rms(measured=True, held=held)
+    assert (found > low).all(), found
+    assert (found < high).all(), found
+
+
+def test_without_the_measurement_they_are_not() -> None:
+    assert rms(measured=False, held=True).max() > 1.5
+
+
+def test_a_response_that_noise_explains_is_not_believed() -> None:
+    rng = np.random.default_rng(3)
+    noise = np.full((3, 3), 0.09)
+    sums = ClosingSums(np.zeros(3), np.eye(3), np.eye(3) + 0.1 * rng.standard_normal((3, 3)), noise, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    found = response(sums, np.zeros((3, 3)))
+    np.testing.assert_allclose(found.inverse, np.eye(3))
+    np.testing.assert_allclose(found.variance, 0.0)
+
+
+def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
+    truth = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]])
+    sums = ClosingSums(np.zeros(3), np.eye(3), truth, np.full((3, 3), 1e-8), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    np.testing.assert_allclose(response(sums, np.zeros((3, 3))).inverse, np.linalg.inv(truth), atol=1e-5)
+
+
+def test_a_shift_within_its_noise_adds_no_error() -> None:
+    shift, zero = np.array([[1.0, 0.5, -0.2]]), np.zeros(3)
+    for noise, expected in ((0.0, np.outer(shift[0], shift[0])), (1.0, np.zeros((3, 3)))):
+        sums = ClosingSums(zero, np.eye(3), np.eye(3), np.eye(3), shift, noise * np.eye(3)[None])
+        np.testing.assert_allclose(sums.shift_covariance, expected)
+
+
+def test_the_measurement_survives_the_journal() -> None:
+    problem = Linear(1)
+    sums = problem.closing(problem.truth, problem.photograph(0.0), np.eye(3))
+    assert ClosingSums.of(sums.record()).record() == sums.record()
+    assert (sums + sums).response == pytest.approx(2 * sums.response)

@@ -1,0 +1,39 @@
+"""What further images would teach is what they do teach."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.fit.optics.domain import Coordinate, Domain
+from services.fit.solve.covariance import uncertainty
+from services.fit.solve.information import Addition, addition, covariance_with
+from services.fit.solve.normal_equations import NormalEquations, normal_equations
+
+DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",), 2.3, 1.0), Coordinate(("dentin.sigma",))))
+X = np.array([1.0, 2.3, 2.0])
+NOISE = 0.05
+
+
+def _equations(slopes: np.ndarray) -> NormalEquations:
+    count = slopes.shape[1]
+    zero = np.zeros(count)
+    return normal_equations(slopes, slopes, zero, zero, np.full(count, NOISE**2), np.full(count, NOISE**-2))
+
+
+def test_predicted_is_what_a_fit_with_both_states() -> None:
+    rng = np.random.default_rng(1)
+    first, second = 0.1 * rng.standard_normal((3, 40)), 0.1 * rng.standard_normal((3, 15))
+    known = uncertainty(DOMAIN, X, _equations(first))
+    assert known.sandwich is not None
+    zero = np.zeros(15)
+    added = addition(known.sandwich, (second, second), (zero, zero), np.full(15, NOISE**2), NOISE**-2)
+    both = uncertainty(DOMAIN, X, _equations(np.hstack([first, second])))
+    np.testing.assert_allclose(covariance_with(known.sandwich, added), both.covariance, rtol=1e-9)
+    np.testing.assert_allclose(covariance_with(known.sandwich, added.scaled(0.0)), known.covariance, rtol=1e-9)
+
+
+def test_noise_that_looks_like_negative_information_is_none() -> None:
+    known = uncertainty(DOMAIN, X, _equations(0.1 * np.random.default_rng(2).standard_normal((3, 40))))
+    assert known.sandwich is not None
+    nothing = Addition(-0.5 * np.eye(3), np.zeros((3, 3)))
+    np.testing.assert_allclose(covariance_with(known.sandwich, nothing), known.covariance, rtol=1e-9)
