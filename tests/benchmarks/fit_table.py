@@ -195,7 +195,7 @@ CASES: dict[str, Row] = {"homogeneous": homogeneous, "known": known, "free": fre
 def thickness_mm(fit: Fit) -> NDArray[np.float64]:
     """Enamel's fitted thickness (N,) at the pixels of the middle camera that see the incisal half of the crown."""
     observations = fit.prepared.observations
-    found = fitted_tooth(observations.folder, observations.tooth.fdi, observations.manifest.cameras, fit.prepared.spec, fit.report)
+    found = fitted_tooth(observations.folder, observations.teeth[0].fdi, observations.manifest.cameras, fit.prepared.spec, fit.report)
     assert found.dentin is not None
     camera = observations.manifest.cameras[1]
     return np.asarray(thickness_image(found.outer, found.dentin, camera)[_incisal_half(fit)])
