@@ -61,6 +61,8 @@ EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
+CLOSING_TRIALS = 2
+"""Lengths tried of the step after the closing measurement."""
 START_STEPS = 2
 START_SHAPE = 0.4
 IMAGE_TOLERANCE = 0.004
@@ -256,11 +258,14 @@ class ChannelSchedule:
 
         def compute() -> dict[str, Any]:
             sums = measure_closing(problem, x, known.transform, held, samples)
-            step = closing_step(domain, x, equations, sums)
-            mean, precision = domain.prior
-            compared = problem.compare(x, x + step, samples=samples, step=0, trial=0)
-            change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-            return {"sums": sums.record(), "step": (0.0 * step if change > Options().sure_z * compared.se else step).tolist()}
+            step, (mean, precision) = closing_step(domain, x, equations, sums), domain.prior
+            for trial in range(CLOSING_TRIALS):
+                compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
+                change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+                if change <= Options().sure_z * compared.se:
+                    return {"sums": sums.record(), "step": step.tolist()}
+                step = 0.3 * step
+            return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
 
         self.pause()
         entry, _ = self.journal.once(f"{self.files.channel}/closing", compute)
