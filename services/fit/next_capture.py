@@ -23,7 +23,7 @@ from services.fit.transport.recipe import SceneRecipe, View
 
 Array = NDArray[np.float64]
 
-PIXELS = 200
+PIXELS = 100
 """Of each view, spread evenly."""
 VIEW_ANGLE = np.radians(60)
 WORTH = 0.1

@@ -61,6 +61,8 @@ REWEIGHTINGS = 2
 """Rounds of a loss that follows residuals, after the first exact stage."""
 STAIN_SAMPLES = 2
 """Least paths per pixel of a step of the stains, over those of the start; as many as the media needed in the end."""
+CLOSING_TRIALS = 2
+"""Lengths tried of the step after the closing measurement."""
 START_STEPS = 2
 ADAM_BURST = 10
 """Steps of Adam between two journal entries and reports, each of which costs an evaluation of all images."""
@@ -269,11 +271,14 @@ class ChannelSchedule(Stages[Tissue]):
 
         def compute() -> dict[str, Any]:
             sums = measure_closing(problem, x, known.transform, held, samples)
-            step = closing_step(domain, x, equations, sums)
-            mean, precision = domain.prior
-            compared = problem.compare(x, x + step, samples=samples, step=0, trial=0)
-            change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-            return {"sums": sums.record(), "step": (0.0 * step if change > Options().sure_z * compared.se else step).tolist()}
+            step, (mean, precision) = closing_step(domain, x, equations, sums), domain.prior
+            for trial in range(CLOSING_TRIALS):
+                compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
+                change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+                if change <= Options().sure_z * compared.se:
+                    return {"sums": sums.record(), "step": step.tolist()}
+                step = 0.3 * step
+            return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
 
         self.pause()
         entry, _ = self.journal.once(f"{self.scope}/closing", compute)

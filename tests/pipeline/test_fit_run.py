@@ -13,7 +13,8 @@ from services.core.errors import CaptureInputError, DentineError, JobCancelledEr
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
-from services.fit.stage import run
+from services.fit.identifiability import NOTHING
+from services.fit.stage import export, run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
 
@@ -55,6 +56,18 @@ def test_finds_the_reduced_quantities_within_their_errors(finished: tuple[Path, 
     assert report.held_out_error["green"] < 0.02
 
 
+def test_says_what_is_known_what_goes_together_and_what_would_help(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    _, report, _ = finished
+    found = report.correlations["green"]
+    assert found.names == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
+    matrix = np.array(found.matrix)
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert (np.linalg.eigvalsh(matrix) > -1e-9).all()
+    assert report.told.startswith("This capture tells enamel scattering (")
+    assert "per mm" in report.told
+    assert "would" in report.next_capture
+
+
 def test_standard_errors_are_those_seen_over_noise(tmp_path: Path) -> None:
     # z of 4 quantities over 6 captures and seeds: the mean square of 24 values lies in 0.2 to 2.6 for all but 1e-3 of cases even if the 4 move together.
     z = []
@@ -91,6 +104,14 @@ def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path:
     assert max(report.fit_error["green"], report.held_out_error["green"]) > 0.15
     assert not report.converged
     assert "the images are still" in report.advice
+    assert report.told == NOTHING
+
+    # Neither report nor asset hides it.
+    spec = spec_for(tmp_path)
+    manifest = export(spec, LocalContext(tmp_path))
+    assert not manifest.converged
+    assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
+    assert (tmp_path / "report.html").read_text().index("did not converge") < (tmp_path / "report.html").read_text().index("Error on held-out images")
 
 
 def test_publishes_history_trace_and_pictures(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:

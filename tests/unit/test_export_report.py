@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.records import Estimate, FitReport
+from services.core.records import Correlation, Estimate, FitReport
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import Picture
 from services.fit.export.report import THIN_CAVEAT, ReportPictures, write_report
@@ -110,6 +110,15 @@ def test_numbers_carry_error_unit_and_flag(tmp_path: Path) -> None:
     assert "1 not fitted" in text
     assert text.index("reduced scattering") < text.index("extinction")
     assert "weight c, proximal" in text
+
+
+def test_what_is_told_and_what_goes_together_are_shown(tmp_path: Path) -> None:
+    found = Correlation(names=("enamel.sigma", "enamel.alpha", "shape.1"), matrix=((1.0, -0.92, 0.1), (-0.92, 1.0, 0.0), (0.1, 0.0, 1.0)))
+    fit = report(told="This capture tells a lot.", next_capture="A light above would help most.", correlations={"green": found})
+    text = " ".join(page(tmp_path, fit, pictures()).text.split())
+    assert text.index("This capture tells a lot. A light above would help most.") < text.index("Parameters")
+    assert "greenenamel σenamel αc proximal enamel σ1−0.92+0.10 enamel α−0.921+0.00" in text
+    assert "What goes together" not in page(tmp_path, report(), pictures()).text
 
 
 @pytest.mark.parametrize(("boundary", "expected"), [("thin", True), ("matched", False)])

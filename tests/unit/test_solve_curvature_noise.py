@@ -56,7 +56,7 @@ def test_a_record_holds_the_same_numbers() -> None:
     mean, difference, weight = random_estimates(5)
     regions = [((0, 1, 2), np.arange(MEASUREMENTS) < 20), ((2, 3, 4), np.arange(MEASUREMENTS) >= 20)]
     residual, ones = np.zeros(MEASUREMENTS), np.ones(MEASUREMENTS)
-    equations = normal_equations(mean + difference / 2, mean - difference / 2, residual, ones, ones, weight, regions)
+    equations = normal_equations(mean + difference / 2, mean - difference / 2, residual, residual, ones, weight, 1, regions)
     stored = NormalEquations.of(json.loads(json.dumps(equations.record())))
     assert [part.coordinates for part in stored.hessian_noise.parts] == [(0, 1, 2), (2, 3, 4)]
     for one, other in zip(stored.hessian_noise.parts, equations.hessian_noise.parts, strict=True):

@@ -2,17 +2,57 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
 from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.anatomy.rays import RayScene, pixel_rays
+from services.fit.transport.recipe import DentinShape
+
+LEAST_STEP = 0.01
+"""Least half step of a difference by a blend weight: some micrometres of dentin, far above rounding."""
 
 
 def enamel_thickness_mm(points_mm: NDArray[np.float64], dentin: Mesh) -> NDArray[np.float64]:
     """Distance (N,) from points on the enamel's outer surface (N, 3) to the dentin surface, mm."""
     return SurfaceDistance(dentin).closest(points_mm)[1]
+
+
+@dataclass(frozen=True)
+class UncertainThickness:
+    """Enamel thickness with one standard error, mm."""
+
+    values_mm: NDArray[np.float64]
+    """(N,)"""
+    errors_mm: NDArray[np.float64]
+    """(N,)"""
+    mean_mm: float
+    mean_error_mm: float
+    """Of the mean over all points; errors of points go together, so it is hardly smaller than theirs."""
+
+
+def uncertain_thickness(
+    points_mm: NDArray[np.float64], shape: DentinShape, weights: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> UncertainThickness:
+    """Thickness at points (N, 3) of the outer surface for fitted blend weights c (M,) of covariance (M, M), to first order.
+
+    The slope of the distance is a central difference over one standard error of each weight, cut at 0 and 1, so that it is that of the range that counts.
+    """
+
+    def thickness(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        return enamel_thickness_mm(points_mm, Mesh(shape.vertices_mm(tuple(at.tolist())), shape.base.faces))
+
+    slopes = np.zeros((len(points_mm), len(weights)))
+    for k, step in enumerate(np.clip(np.sqrt(np.diag(covariance)), LEAST_STEP, None)):
+        low, high = weights.copy(), weights.copy()
+        low[k], high[k] = max(weights[k] - step, 0.0), min(weights[k] + step, 1.0)
+        slopes[:, k] = (thickness(high) - thickness(low)) / (high[k] - low[k])
+    values, of_mean = thickness(weights), slopes.mean(axis=0)
+    errors = np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", slopes, covariance, slopes), 0.0))
+    return UncertainThickness(values, errors, float(values.mean()), float(np.sqrt(max(of_mean @ covariance @ of_mean, 0.0))))
 
 
 def thickness_image(outer: Mesh, dentin: Mesh, camera: Camera) -> NDArray[np.float64]:

@@ -130,9 +130,11 @@ class Pooled:
 
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
-    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise.
+    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise. The
+    # difference of the two ways of carrying is as uncertain as it is large: images are linear over short distances only.
     carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
-    known, known_noise = t.T @ equations.gradient + solved.excess @ carried, t.T @ equations.gradient_noise @ t
+    correction = solved.excess @ carried
+    known, known_noise = t.T @ equations.gradient + correction, t.T @ equations.gradient_noise @ t + np.outer(correction, correction)
     first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
     share = first / (first + second)
     return Pooled((1 - share) * known + share * sums.gradient, (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise, (1 - share) * carried)
