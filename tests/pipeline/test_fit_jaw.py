@@ -142,7 +142,7 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(finished: tuple[P
 def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
     # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
     write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
-    spec = jaw_spec(tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=6, search_candidates=1600)
+    spec = jaw_spec(tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600)
     report = run(spec, LocalContext(tmp_path))
     found = {name: report.parameters["green"][name] for name in ("gums.sigma_s_reduced", "gums.alpha_reduced", "cavity.reflectance")}
     truth = {"gums.sigma_s_reduced": TRUE_GUMS.sigma_s_reduced, "gums.alpha_reduced": TRUE_GUMS.alpha_reduced, "cavity.reflectance": TRUE_REFLECTANCE}

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -276,8 +276,11 @@ class LightMaps:
         return LightView(cell.direction, cell.falloff, (ENAMEL, DENTIN), (enamel_mm, dentin_mm), cell.between(1, 16) * (1 / 65535), certain)
 
 
-def aligned(values: mi.Float) -> mi.Float:
-    """A copy in Dr.Jit's own memory: what NumPy lends may lack the alignment that a gather of four at once needs."""
-    copy = values + dr.opaque(mi.Float, 0)
+def aligned(values: Any) -> Any:
+    """A copy in Dr.Jit's own memory: what NumPy lends may lack the alignment that a gather of four at once needs.
+
+    A kernel that reads one number per lane is compiled for the alignment it meets, and so again at random for memory that NumPy lends.
+    """
+    copy = values + dr.opaque(type(values), 0)
     dr.eval(copy)
     return copy

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
+from services.fit.transport.light_maps import aligned
 from services.fit.transport.recipe import View
 
 NEAR_MARGIN_MM = 1.0
@@ -50,9 +51,9 @@ class CameraStart:
         self.lanes = batches * len(view)
         self._pixels = np.tile(y * width + x, batches)
         self._batch = np.repeat(np.arange(batches, dtype=np.uint32) + np.uint32(skipped * batches), len(view))
-        self.pixel = mi.UInt32(self._pixels.astype(np.uint32))
-        self.batch = mi.UInt32(self._batch)
-        self.width = width
+        self.pixel = aligned(mi.UInt32(self._pixels.astype(np.uint32)))
+        self.batch = aligned(mi.UInt32(self._batch))
+        self.width = dr.opaque(mi.UInt32, width)
         self.seed = dr.opaque(mi.UInt32, seed)
         self.batches = batches
         pose = np.asarray(camera.camera_from_world)
@@ -61,7 +62,6 @@ class CameraStart:
         self._eye = dr.opaque(mi.Point3f, eye.tolist())
         self._columns = [dr.opaque(mi.Vector3f, inverse[:, k].tolist()) for k in range(3)]
         self._near = dr.opaque(mi.Float, max(float(np.linalg.norm(eye)) - radius_mm - NEAR_MARGIN_MM, 0.0))
-        dr.eval(self.pixel, self.batch)
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
         """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is not skipped."""

@@ -132,7 +132,7 @@ class Walk:
             shape_factor=zeros(self.modes),
             lane=lane,
             sample=mi.UInt32(0),
-            active=lane < self.start.lanes,
+            active=lane < dr.opaque(mi.UInt32, self.start.lanes),
         )
         (walker,) = dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
         if self.connections is not None:
