@@ -80,7 +80,7 @@ class RigSpec(Record):
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
-    kind: Literal["tooth"] = Field(default="tooth", description="what is fitted")
+    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with their gums and the wall behind")
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
@@ -135,7 +135,7 @@ class CaptureManifest(Record):
 
 
 class PreparedManifest(Record):
-    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid; and ``teeth/``."""
+    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid, surface; and ``teeth/``."""
 
     channels: tuple[str, ...]
     cameras: tuple[Camera, ...]
@@ -143,6 +143,9 @@ class PreparedManifest(Record):
     held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
     fdi: tuple[int, ...]
     dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
+    gums: bool = Field(default=False, description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there")
+    cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
+    tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
     valid_fraction: float
 

@@ -30,7 +30,7 @@ class ImageQuality(Record):
     camera: str
     light: str
     motion_px: float | None = Field(description="median displacement removed; null where not measured")
-    tooth_pixels: int = Field(description="pixels whose whole footprint is tooth")
+    tooth_pixels: int = Field(description="pixels whose whole footprint is to be fitted")
     valid_pixels: int
     masked: dict[str, float] = Field(description="mask bit -> fraction of the tooth pixels")
 

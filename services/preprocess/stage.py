@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import teeth_folder
-from services.core.meshfiles import read_mesh, read_teeth
 from services.core.records import CaptureManifest, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import MANIFEST, StageWriter, create_array, open_stage, write_record
@@ -29,8 +28,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     import numpy as np
 
     from services.preprocess.motion import stored_step
-    from services.preprocess.projection import project
     from services.preprocess.quality import QualityReport, assess, write_picture
+    from services.preprocess.subject import NOTHING, read_subject
     from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
 
     # Check everything that needs no pixel
@@ -39,8 +38,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     held_out = _held_out(spec, source)
     if unknown := set(spec.channels or ()) - set(channels):
         raise SettingsError(f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it.")
-    teeth = read_teeth(source.root)
-    gums = [read_mesh(source.root / "gums.ply")] if (source.root / "gums.ply").exists() else []
+    subject = read_subject(source.root, whole=spec.kind == "jaw")
+    teeth = subject.teeth
     require_plausible_scale(cameras, lights, teeth)
 
     writer = StageWriter(context.root, "prepared", context.attempt)
@@ -61,6 +60,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         for name in ("radiance", "variance")
     )
     valid = create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
+    surface = create_array(store, "surface", (len(cameras), height, width), (1, height, width), "int16", ("camera", "y", "x"))
     motion = None
     if source.measures_motion:
         step = stored_step((height, width))
@@ -68,18 +68,23 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         motion = create_array(store, "motion", (len(cameras), len(lights), *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
         motion.attrs["step_px"] = step
 
-    reports, done = [], 0
+    reports, done, seen = [], 0, np.zeros(len(teeth), dtype=np.int64)
     for k, camera in enumerate(cameras):
         context.raise_if_cancelled()
         w, h = camera.size
-        footprint = project(camera, [tooth.outer for tooth in teeth], gums)
-        require_seen(footprint, camera)
+        footprint = subject.seen_by(camera)
+        require_seen(footprint, len(teeth), camera)
+        glossy = subject.glossy(footprint)
+        labels = np.full((height, width), NOTHING, dtype=np.int16)
+        labels[:h, :w] = footprint.mesh
+        surface[k] = labels
         for j in set(range(len(lights))) - set(source.lights_of(k)):
             valid[k, j] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
         for j, image in source.images(k, footprint):
             context.raise_if_cancelled()
             bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
-            bits[:h, :w] = valid_bits(image, footprint, camera, lights[j])
+            bits[:h, :w] = valid_bits(image, footprint, camera, lights[j], glossy)
+            seen += subject.pixels_of_teeth(footprint, bits[:h, :w])
             radiance[k, j, :h, :w], variance[k, j, :h, :w], valid[k, j] = image.radiance, image.variance, bits
             if motion is not None and image.displacement is not None:
                 motion[k, j, : image.displacement.shape[0], : image.displacement.shape[1]] = image.displacement
@@ -105,8 +110,12 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:
         raise CaptureInputError(f"No image of {source.root} has a valid tooth pixel; look at its exposure, noise and masks.")
-    write_record(writer.folder / "quality.json", QualityReport(images=tuple(reports)))
     fdi = tuple(tooth.fdi for tooth in teeth)
+    if hidden := [str(number) for number, count in zip(fdi, seen, strict=True) if count == 0]:
+        context.report(
+            StageEvent(stage="prepare", kind="log", message=f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
+        )
+    write_record(writer.folder / "quality.json", QualityReport(images=tuple(reports)))
     _copy_meshes(source.root, writer.folder, fdi)
     motions = [report.motion_px for report in reports if report.motion_px is not None]
     manifest = PreparedManifest(
@@ -116,6 +125,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         held_out=held_out,
         fdi=fdi,
         dentin_known=tuple(tooth.fdi for tooth in teeth if tooth.dentin is not None),
+        gums=subject.whole and subject.gums is not None,
+        cavity=subject.whole and subject.cavity is not None,
+        tooth_pixels=tuple(seen.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
     )

@@ -13,11 +13,16 @@ from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage
 
 
-def valid_bits(image: LightImage, footprint: Footprint, camera: Camera, light: Light) -> NDArray[np.uint16]:
+def valid_bits(
+    image: LightImage, footprint: Footprint, camera: Camera, light: Light, glossy: tuple[NDArray[np.bool_], ...] | None = None
+) -> NDArray[np.uint16]:
     """Mask bits (H, W); 0 is a pixel to fit.
 
     Shading is no reason to mask: a tooth glows where its surface turns from the light. OUTSIDE keeps pixels whose whole footprint is
-    tooth, and one pixel less along the outline where the image was resampled, which mixes it with its surroundings.
+    to be fitted, and one pixel less along the outline where the image was resampled, which mixes it with its surroundings.
+
+    Args:
+        glossy: masks (H, W) of surfaces that reflect, each of its own colour; None for one that is everything.
     """
     import cv2
 
@@ -28,7 +33,9 @@ def valid_bits(image: LightImage, footprint: Footprint, camera: Camera, light: L
     saturated = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED) > 0)
     usable = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE) == 0)
     angles = half_angles(camera, light, footprint)
-    highlight = highlight_mask(image.radiance, image.variance, usable, saturated, angles, footprint.normal, light.intensity)
+    highlight = np.zeros(bits.shape, dtype=bool)
+    for part in (footprint.covered,) if glossy is None else glossy:
+        highlight |= highlight_mask(image.radiance, image.variance, usable & part, saturated & part, angles, footprint.normal, light.intensity)
     return np.asarray(bits | np.where(highlight, MaskBit.HIGHLIGHT, 0).astype(np.uint16), dtype=np.uint16)
 
 
@@ -63,11 +70,11 @@ def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ..
             )
 
 
-def require_seen(footprint: Footprint, camera: Camera) -> None:
+def require_seen(footprint: Footprint, teeth: int, camera: Camera) -> None:
     """Refuse a camera that sees no tooth.
 
     Raises:
         CaptureInputError: names the camera.
     """
-    if not footprint.covered.any():
+    if not (footprint.covered & (footprint.mesh < teeth)).any():
         raise CaptureInputError(f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are in millimetres.")

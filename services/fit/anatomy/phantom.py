@@ -1,41 +1,35 @@
-"""A virtual mouth: a folder capture of a tooth with known optics, for tests, demonstrations and the simulated cameras."""
+"""A virtual tooth: a folder capture with known optics, for tests, demonstrations and the simulated cameras."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import read_mesh, write_mesh
-from services.core.records import Boundary, FolderCapture, ImageEntry
-from services.core.store import write_atomic, write_record
+from services.core.records import Boundary
 from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.phantom_files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
+from services.fit.anatomy.phantom_render import Stack, render_engine, render_mitsuba
 from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.anatomy.subjects import subject_tissues
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.fit.transport.recipe import DentinShape, single_tooth
 
 FDI = 11
 IOR = 1.631
-CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
 TRUE_TISSUE = {
     "red": Tissue(Medium(4.2, 0.9980, g1=0.80), Medium(11.0, 0.9965, g1=0.75)),
     "green": Tissue(Medium(4.5, 0.9970, g1=0.80), Medium(12.0, 0.9945, g1=0.75)),
     "blue": Tissue(Medium(5.0, 0.9955, g1=0.80), Medium(13.0, 0.9905, g1=0.75)),
 }
 """Absorption rises towards blue, dentin's faster: the yellow of teeth. Within the literature's spread."""
-HELD_OUT_EVERY = 4
-
-Renderer = Literal["engine", "mitsuba"]
-Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def write_phantom(
@@ -53,11 +47,10 @@ def write_phantom(
     renderer: Renderer = "engine",
     highlights: bool = False,
     gums: bool = False,
+    held_out: int | None = None,
     subject: int | None = None,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``teeth/11``) and ``truth.json`` with its optics.
-
-    Every fourth light is marked as held out.
 
     Args:
         pixel_mm: size of a pixel at the tooth.
@@ -68,12 +61,14 @@ def write_phantom(
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
         highlights: add the surface's reflection of each light; also written alone to ``highlights/<camera>_<light>.npy``.
         gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
+        held_out: how many lights are marked as held out; default every fourth.
         subject: seed of a random subject's optics; None for those of ``TRUE_TISSUE``.
 
     Raises:
         InputError: impossible combination of options.
     """
-    _require_possible(pixel_mm, cameras, lights, channels, samples, boundary, outer, dentin, renderer, highlights, gums)
+    _require_possible(boundary, outer, dentin, highlights, gums)
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
     tooth, collar = _tooth(outer, dentin)
     shown_gums = collar if gums else None
     names = CHANNELS[channels]
@@ -82,7 +77,7 @@ def write_phantom(
     rig_cameras = dome_cameras(cameras, pixel_mm, (tooth.outer,))
     _write_meshes(out, tooth, shown_gums)
 
-    entries = []
+    entries, kept = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
@@ -94,42 +89,19 @@ def write_phantom(
         mean, variance = mean * share + surface.gums, variance * share**2
         if highlights:
             mean = mean + surface.highlight
-        for n, light in enumerate(rig_lights):
-            stem = f"{camera.name}_{light.name}"
-            _write_image(out / f"{stem}.npy", mean[n])
-            _write_image(out / f"{stem}_var.npy", variance[n])
-            if highlights:
-                _write_image(out / "highlights" / f"{stem}.npy", surface.highlight[n])
-            held_out = n % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
-            entries.append(ImageEntry(camera=camera.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy", held_out=held_out))
+        entries += write_images(out, camera, rig_lights, mean, variance, kept)
+        if highlights:
+            for n, light in enumerate(rig_lights):
+                write_image(out / "highlights" / f"{camera.name}_{light.name}.npy", surface.highlight[n])
     truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums)
-    write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
-    write_record(out / "capture.json", FolderCapture(units="mm", channels=names, cameras=rig_cameras, lights=rig_lights, images=tuple(entries)))
+    write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
-def _require_possible(
-    pixel_mm: float,
-    cameras: int,
-    lights: int,
-    channels: int,
-    samples: int,
-    boundary: Boundary,
-    outer: Path | None,
-    dentin: Path | None,
-    renderer: Renderer,
-    highlights: bool,
-    gums: bool,
-) -> None:
-    if min(cameras, lights) < 1 or samples < 16 or not pixel_mm > 0:
-        raise InputError("A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that is too small.")
-    if channels not in CHANNELS:
-        raise InputError(f"A phantom has 1 or 3 channels, not {channels}; choose one of these.")
+def _require_possible(boundary: Boundary, outer: Path | None, dentin: Path | None, highlights: bool, gums: bool) -> None:
     if dentin is not None and outer is None:
         raise InputError("A dentin mesh was given without its enamel's outer mesh; give both.")
     if outer is not None and gums:
         raise InputError("Gums are made for the procedural incisor only; leave out either the gums or the outer mesh.")
-    if renderer == "mitsuba" and boundary != "matched":
-        raise InputError(f"Stock Mitsuba has no {boundary} boundary; choose renderer engine or boundary matched.")
     if highlights and boundary == "matched":
         raise InputError("An index-matched surface has no highlights; choose boundary thin or leave the highlights out.")
 
@@ -172,10 +144,15 @@ def _render(
     samples: int,
     seed: int,
 ) -> Stack:
-    """Radiance (L, H, W) from inside the tooth, and the variance of its mean."""
+    """Light that was inside the tooth."""
     prepare_device()
     if renderer == "mitsuba":
-        return _render_mitsuba(out, tooth, camera, lights, channel, tissue, samples, seed)
+        from services.fit.export.mitsuba_scene import nested_scene
+
+        folder = teeth_folder(out, tooth.fdi)
+        files = {str(tooth.fdi): (folder / "outer.ply", folder / "dentin.ply" if tooth.dentin is not None else None)}
+        scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0)
+        return render_mitsuba(scene, lights, channel, samples, seed)
     from services.fit.transport.engine import Engine
 
     recipe = single_tooth(
@@ -186,47 +163,11 @@ def _render(
         boundary=boundary,
         ior=IOR,
     )
-    pixels = np.argwhere(surface.enamel_pixels)[:, ::-1].astype(np.int32)
-    estimate = Engine(recipe).images(tissue, View(camera, pixels), samples=samples, seed=seed)
-    width, height = camera.size
-    images = np.zeros((2, len(lights), height, width))
-    # Single estimates of almost no light may come out below zero; a photograph's cannot.
-    images[:, :, pixels[:, 1], pixels[:, 0]] = np.maximum(estimate.mean, 0.0), estimate.variance
-    return images[0], images[1]
-
-
-def _render_mitsuba(out: Path, tooth: Tooth, camera: Camera, lights: tuple[Light, ...], channel: int, tissue: Tissue, samples: int, seed: int) -> Stack:
-    import mitsuba as mi
-
-    from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-
-    folder = teeth_folder(out, tooth.fdi)
-    inner = folder / "dentin.ply" if tooth.dentin is not None else None
-    scene = load_scene(nested_scene({str(tooth.fdi): (folder / "outer.ply", inner)}, tissue, (camera,), lights[0].position_mm, 1.0))
-    params = mi.traverse(scene)
-    images = []
-    for n, light in enumerate(lights):
-        params["light.position"] = mi.Point3f(*light.position_mm)
-        params["light.intensity.value"] = mi.Float(light.intensity[channel])
-        params.update()
-        images.append(render_batches(scene, 0, samples, seed + n))
-    return np.stack([image[0] for image in images]), np.stack([image[1] for image in images])
-
-
-def _write_image(path: Path, image: NDArray[np.float64]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, image.astype(np.float32))
+    return render_engine(Engine(recipe), tissue, camera, surface.enamel_pixels, samples, seed)
 
 
 def _truth(tissues: Mapping[str, Tissue], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
-    optics = {
-        name: {
-            part: {field: getattr(medium, field) for field in MEDIUM_FIELDS}
-            | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced}
-            for part, medium in parts
-        }
-        for name, parts in ((name, (("enamel", tissue.enamel), ("dentin", tissue.dentin))) for name, tissue in tissues.items())
-    }
+    optics = {name: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)} for name, tissue in tissues.items()}
     surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
     return {
         "boundary": boundary,

@@ -1,0 +1,63 @@
+"""Known optics of a phantom jaw: each tooth's own media about the phantom tooth's, its gums, and the colour of the mouth's wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from services.fit.anatomy.phantom import TRUE_TISSUE
+from services.fit.anatomy.reflection import GUM_REFLECTANCE
+from services.fit.optics.parameters import Medium, Mouth, Tissue
+
+GUMS_IOR = 1.33
+GUMS_MEAN_COSINE = 0.8
+"""Generic soft tissue's is nearer to 0.9; images fix reduced scattering, and fewer scatters are cheaper."""
+GUMS_PER_MM = {"red": (1.39, 0.05), "green": (1.71, 1.2), "blue": (1.99, 0.6)}
+"""Reduced scattering and absorption of gums at 635, 540 and 480 nm: generic soft tissue (Jacques 2013) and a guess at its blood."""
+
+SIGMA_SPREAD, ABSORPTION_SPREAD, COSINE_SPREAD = 0.15, 0.30, 0.02
+"""Half widths of uniform draws about the phantom tooth: relative, relative, absolute. Reduced scattering stays within the literature's spread."""
+REFLECTANCE_SPREAD = 0.2
+_GUMS, _CAVITY = 1, 2
+"""Streams of random numbers beside the teeth's, which are their FDI numbers."""
+
+
+def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
+    """Media of a subject's teeth, gums and wall in one channel; what differs between subjects is drawn alike for all channels.
+
+    Args:
+        subject: None for the same average in every tooth.
+    """
+    average = TRUE_TISSUE[channel]
+    teeth = []
+    for number in fdi:
+        enamel, dentin = _draws(subject, number, 2)
+        teeth.append(Tissue(_varied(average.enamel, enamel), _varied(average.dentin, dentin)))
+    gums = _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0])
+    return Mouth(tuple(teeth), gums, GUM_REFLECTANCE[channel] * (1 + REFLECTANCE_SPREAD * _draws(subject, _CAVITY, 1)[0][0]))
+
+
+def gums_medium(channel: str) -> Medium:
+    """Average gums."""
+    reduced, absorption = GUMS_PER_MM[channel]
+    scattering = reduced / (1 - GUMS_MEAN_COSINE)
+    return Medium(scattering + absorption, scattering / (scattering + absorption), g1=GUMS_MEAN_COSINE)
+
+
+def _draws(subject: int | None, stream: int, media: int) -> list[list[float]]:
+    if subject is None:
+        return [[0.0, 0.0, 0.0]] * media
+    draws: list[list[float]] = np.random.default_rng((subject, stream)).uniform(-1, 1, (media, 3)).tolist()
+    return draws
+
+
+def _varied(medium: Medium, draws: list[float]) -> Medium:
+    sigma, absorption, cosine = draws
+    return replace(
+        medium,
+        sigma=medium.sigma * (1 + SIGMA_SPREAD * sigma),
+        alpha=1 - (1 - medium.alpha) * (1 + ABSORPTION_SPREAD * absorption),
+        g1=medium.g1 + COSINE_SPREAD * cosine,
+    )

@@ -1,0 +1,77 @@
+"""What every phantom writes: images with their variance, the capture's description, and media as known truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import InputError
+from services.core.geometry import Camera, Light
+from services.core.records import Boundary, FolderCapture, ImageEntry
+from services.core.store import write_atomic, write_record
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
+
+CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
+HELD_OUT_EVERY = 4
+
+Renderer = Literal["engine", "mitsuba"]
+
+
+def require_rig(pixel_mm: float, cameras: int, lights: int, channels: int, samples: int, held_out: int | None, boundary: Boundary, renderer: Renderer) -> None:
+    """Refuse what no phantom can be rendered with.
+
+    Raises:
+        InputError: names the option.
+    """
+    if min(cameras, lights) < 1 or samples < 16 or not pixel_mm > 0:
+        raise InputError("A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that is too small.")
+    if channels not in CHANNELS:
+        raise InputError(f"A phantom has 1 or 3 channels, not {channels}; choose one of these.")
+    if held_out is not None and not 0 <= held_out < lights:
+        raise InputError(f"Of {lights} lights {held_out} cannot be held out; leave at least one to the fit.")
+    if renderer == "mitsuba" and boundary != "matched":
+        raise InputError(f"Stock Mitsuba has no {boundary} boundary; choose renderer engine or boundary matched.")
+
+
+def held_out_lights(lights: int, held_out: int | None) -> frozenset[int]:
+    """Which lights are kept from the fit: every fourth, or so many at even distances, neither the first nor the last where there is a choice."""
+    if held_out is None:
+        return frozenset(range(HELD_OUT_EVERY - 1, lights, HELD_OUT_EVERY))
+    return frozenset(int((k + 0.5) * lights / held_out) for k in range(held_out))
+
+
+def write_images(
+    out: Path, camera: Camera, lights: tuple[Light, ...], mean: NDArray[np.float64], variance: NDArray[np.float64], held_out: frozenset[int]
+) -> list[ImageEntry]:
+    """Write ``<camera>_<light>.npy`` and its variance for images (L, H, W, C) of one camera."""
+    entries = []
+    for n, light in enumerate(lights):
+        stem = f"{camera.name}_{light.name}"
+        write_image(out / f"{stem}.npy", mean[n])
+        write_image(out / f"{stem}_var.npy", variance[n])
+        entries.append(ImageEntry(camera=camera.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy", held_out=n in held_out))
+    return entries
+
+
+def write_image(path: Path, image: NDArray[np.float64]) -> None:
+    """Write an image (H, W, C) as float32."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, image.astype(np.float32))
+
+
+def write_description(
+    out: Path, channels: tuple[str, ...], cameras: tuple[Camera, ...], lights: tuple[Light, ...], images: list[ImageEntry], truth: dict[str, Any]
+) -> None:
+    """Write ``truth.json``, then ``capture.json``, which makes the folder a capture."""
+    write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
+    write_record(out / "capture.json", FolderCapture(units="mm", channels=channels, cameras=cameras, lights=lights, images=tuple(images)))
+
+
+def medium_truth(medium: Medium) -> dict[str, float]:
+    """A medium's parameters, and what similar media share."""
+    fields = {field: float(getattr(medium, field)) for field in MEDIUM_FIELDS}
+    return fields | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced}

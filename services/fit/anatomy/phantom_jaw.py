@@ -1,0 +1,207 @@
+"""A virtual jaw: a folder capture of fourteen teeth with gums and the wall of the mouth, whose optics are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from services.core.errors import MeshError
+from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
+from services.core.meshfiles import write_mesh
+from services.core.records import Boundary
+from services.fit.anatomy.blend import dentin_blend_shape
+from services.fit.anatomy.jaw import build_jaw
+from services.fit.anatomy.jaw_optics import GUMS_IOR, jaw_mouth
+from services.fit.anatomy.phantom import IOR
+from services.fit.anatomy.phantom_files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
+from services.fit.anatomy.phantom_render import Stack, render_engine, render_mitsuba
+from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.anatomy.scan import read_scan
+from services.fit.anatomy.scanned_jaw import jaw_from_scan
+from services.fit.optics.parameters import Mouth
+from services.fit.transport.platform import prepare_device
+from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces
+
+if TYPE_CHECKING:
+    from services.fit.transport.engine import Engine
+
+SCAN_DENTIN = (0.3, 0.8)
+"""Range of the blend weights of a scanned tooth's dentin, whose true surface nobody has seen."""
+_DENTIN = 3
+"""Stream of random numbers beside those of the optics."""
+
+
+@dataclass(frozen=True)
+class JawSurfaces:
+    """A jaw in its own coordinates, teeth by ascending FDI number."""
+
+    teeth: tuple[Tooth, ...]
+    gums: Mesh
+    cavity: Mesh | None = None
+    weights: dict[int, tuple[float, ...]] | None = None
+    """Blend weights of each dentin that was made up; None where all are known."""
+
+    def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
+        """The scene for the project's engine; dentin stays as it is."""
+        surfaces = [
+            ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3))))
+            for tooth in self.teeth
+        ]
+        positions, intensities = np.array([light.position_mm for light in lights]), np.array([light.intensity[channel] for light in lights])
+        return SceneRecipe(tuple(surfaces), positions, intensities, boundary, IOR, gums=self.gums, gums_ior=GUMS_IOR, cavity=self.cavity)
+
+
+def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSurfaces:
+    """A subject's jaw, or a scanned one with made-up dentin, which has no wall behind it.
+
+    Args:
+        subject: None for the average; a number draws sizes and stances, of a scanned jaw the dentin alone.
+
+    Raises:
+        CaptureInputError: the scan cannot be read. MeshError: a part of it cannot be closed.
+    """
+    if scan is None:
+        jaw = build_jaw(subject)
+        teeth = sorted((Tooth(tooth.fdi, tooth.outer, tooth.dentin) for tooth in jaw.teeth), key=lambda tooth: tooth.fdi)
+        return JawSurfaces(tuple(teeth), jaw.gums, jaw.cavity)
+    scanned = jaw_from_scan(read_scan(scan))
+    teeth, weights = [], {}
+    for tooth, frame in zip(scanned.teeth, scanned.frames, strict=True):
+        middle = sum(SCAN_DENTIN) / 2
+        c = (middle,) * 3 if subject is None else tuple(np.random.default_rng((subject, _DENTIN, tooth.fdi)).uniform(*SCAN_DENTIN, 3).tolist())
+        try:
+            shape = dentin_blend_shape(tooth.outer, frame)
+        except MeshError:
+            # A crown too thin for any dentin is enamel throughout.
+            teeth.append(tooth)
+            continue
+        teeth.append(replace(tooth, dentin=Mesh(shape.vertices_mm(c), shape.base.faces)))
+        weights[tooth.fdi] = c
+    return JawSurfaces(tuple(sorted(teeth, key=lambda tooth: tooth.fdi)), scanned.gums, weights=weights)
+
+
+def write_jaw_phantom(
+    out: Path,
+    *,
+    subject: int | None = None,
+    scan: Path | None = None,
+    pixel_mm: float = 1.0,
+    cameras: int = 3,
+    lights: int = 8,
+    held_out: int | None = None,
+    channels: int = 1,
+    boundary: Boundary = "matched",
+    seed: int = 1,
+    samples: int = 1024,
+    renderer: Renderer = "engine",
+) -> None:
+    """Write a folder capture (``capture.json``, images with variance, ``teeth/``, ``gums.ply``, ``cavity.ply``) and ``truth.json`` with its optics.
+
+    Args:
+        subject: whose sizes, stances and optics are drawn; None for the average.
+        scan: a labelled scan (.vtp or .ply) to take teeth and gums from.
+        pixel_mm: size of a pixel in the jaw's middle.
+        held_out: how many lights are marked as held out; default every fourth.
+        channels: 1 (green) or 3 (red, green, blue).
+        seed: of the rendering and of the lights' brightness.
+        samples: paths per pixel.
+        renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
+
+    Raises:
+        InputError: impossible combination of options. CaptureInputError: the scan cannot be read. MeshError: a surface cannot bound a medium.
+    """
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
+    jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]
+    rig_lights = dome_lights(lights, names, seed)
+    rig_cameras = dome_cameras(cameras, pixel_mm, tuple(tooth.outer for tooth in jaw.teeth))
+    mouths = {name: known_mouth(jaw, name, subject) for name in names}
+    write_jaw_meshes(out, jaw)
+
+    stacks = _render(jaw, mouths, rig_cameras, rig_lights, boundary, renderer, samples, seed)
+    entries, kept = [], held_out_lights(lights, held_out)
+    for number, camera in enumerate(rig_cameras):
+        mean, variance = (np.stack([stacks[name, number][k] for name in names], axis=-1) for k in range(2))
+        entries += write_images(out, camera, rig_lights, mean, variance, kept)
+    made = {"subject": subject, "scan": None if scan is None else scan.name, "renderer": renderer, "samples_per_pixel": samples, "seed": seed}
+    write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | made)
+
+
+def write_jaw_meshes(out: Path, jaw: JawSurfaces) -> None:
+    """Write ``teeth/<FDI>/outer.ply`` and ``dentin.ply``, ``gums.ply`` and ``cavity.ply``."""
+    for tooth in jaw.teeth:
+        folder = teeth_folder(out, tooth.fdi)
+        write_mesh(folder / "outer.ply", tooth.outer)
+        if tooth.dentin is not None:
+            write_mesh(folder / "dentin.ply", tooth.dentin)
+    write_mesh(out / "gums.ply", jaw.gums)
+    if jaw.cavity is not None:
+        write_mesh(out / "cavity.ply", jaw.cavity)
+
+
+def jaw_truth(jaw: JawSurfaces, mouths: dict[str, Mouth], boundary: Boundary) -> dict[str, Any]:
+    """What ``truth.json`` says of the optics, by channel and FDI number."""
+    return {
+        "boundary": boundary,
+        "ior": IOR if boundary == "thin" else 1.0,
+        "gums_ior": GUMS_IOR if boundary == "thin" else 1.0,
+        "channels": {name: _channel_truth(jaw, mouth) for name, mouth in mouths.items()},
+        "dentin_shape": jaw.weights and {str(fdi): list(weights) for fdi, weights in jaw.weights.items()},
+    }
+
+
+def _channel_truth(jaw: JawSurfaces, mouth: Mouth) -> dict[str, Any]:
+    assert mouth.gums is not None
+    teeth = {}
+    for tooth, tissue in zip(jaw.teeth, mouth.teeth, strict=True):
+        teeth[str(tooth.fdi)] = {"enamel": medium_truth(tissue.enamel)} | ({} if tooth.dentin is None else {"dentin": medium_truth(tissue.dentin)})
+    return {"teeth": teeth, "gums": medium_truth(mouth.gums), "cavity_reflectance": mouth.reflectance}
+
+
+def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
+    """A subject's media in one channel, in the order of the jaw's teeth."""
+    mouth = jaw_mouth([tooth.fdi for tooth in jaw.teeth], channel, subject)
+    return mouth if jaw.cavity is not None else replace(mouth, reflectance=None)
+
+
+def _render(
+    jaw: JawSurfaces,
+    mouths: dict[str, Mouth],
+    cameras: tuple[Camera, ...],
+    lights: tuple[Light, ...],
+    boundary: Boundary,
+    renderer: Renderer,
+    samples: int,
+    seed: int,
+) -> dict[tuple[str, int], Stack]:
+    """Images by channel and number of the camera."""
+    prepare_device()
+    if renderer == "mitsuba":
+        return _render_mitsuba(jaw, mouths, cameras, lights, samples, seed)
+    from services.fit.transport.engine import Engine
+
+    stacks = {}
+    for channel, (name, mouth) in enumerate(mouths.items()):
+        engine: Engine = Engine(jaw.recipe(lights, channel, boundary))
+        for number, camera in enumerate(cameras):
+            everything = np.ones(camera.size[::-1], dtype=bool)
+            stacks[name, number] = render_engine(engine, mouth, camera, everything, samples, seed + 7919 * number)
+    return stacks
+
+
+def _render_mitsuba(
+    jaw: JawSurfaces, mouths: dict[str, Mouth], cameras: tuple[Camera, ...], lights: tuple[Light, ...], samples: int, seed: int
+) -> dict[tuple[str, int], Stack]:
+    from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
+
+    fdi = tuple(tooth.fdi for tooth in jaw.teeth)
+    with TemporaryDirectory() as folder:
+        files, stacks = write_mouth_surfaces(Path(folder), jaw.teeth, jaw.gums, jaw.cavity), {}
+        for channel, (name, mouth) in enumerate(mouths.items()):
+            for number, camera in enumerate(cameras):
+                scene = mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0)
+                stacks[name, number] = render_mitsuba(scene, lights, channel, samples, seed + 7919 * number)
+    return stacks

@@ -1,0 +1,46 @@
+"""Images of a scene under each of its lights, by the project's engine or by stock Mitsuba, for phantoms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Light
+from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.transport.recipe import View
+
+if TYPE_CHECKING:
+    from services.fit.export.mitsuba_scene import SceneDict
+    from services.fit.transport.engine import Engine
+
+Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Radiance (L, H, W) and the variance of its mean."""
+
+
+def render_engine(engine: Engine, tissue: Tissue | Mouth, camera: Camera, seen: NDArray[np.bool_], samples: int, seed: int) -> Stack:
+    """All lights in one walk; pixels that are not ``seen`` (H, W) stay dark."""
+    pixels = np.argwhere(seen)[:, ::-1].astype(np.int32)
+    estimate = engine.images(tissue, View(camera, pixels), samples=samples, seed=seed)
+    images = np.zeros((2, len(engine.recipe.light_positions_mm), *seen.shape))
+    # Single estimates of almost no light may come out below zero; a photograph's cannot.
+    images[:, :, pixels[:, 1], pixels[:, 0]] = np.maximum(estimate.mean, 0.0), estimate.variance
+    return images[0], images[1]
+
+
+def render_mitsuba(scene: SceneDict, lights: tuple[Light, ...], channel: int, samples: int, seed: int) -> Stack:
+    """One light after the other, in place of the point light ``light`` of a scene with one camera."""
+    import mitsuba as mi
+
+    from services.fit.export.mitsuba_scene import load_scene, render_batches
+
+    loaded = load_scene(scene)
+    params = mi.traverse(loaded)
+    images = []
+    for n, light in enumerate(lights):
+        params["light.position"] = mi.Point3f(*light.position_mm)
+        params["light.intensity.value"] = mi.Float(light.intensity[channel])
+        params.update()
+        images.append(render_batches(loaded, 0, samples, seed + n))
+    return np.stack([image[0] for image in images]), np.stack([image[1] for image in images])

@@ -1,0 +1,90 @@
+"""Teeth, gums and the wall of the mouth as a scene for stock Mitsuba; one colour channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from services.core.geometry import Camera, Mesh, Tooth
+from services.core.meshfiles import write_mesh
+from services.core.records import Boundary
+from services.fit.anatomy.separation import separate
+from services.fit.export.mitsuba_scene import MAX_DEPTH, ROULETTE_DEPTH, SceneDict, boundary_dict, medium_dict, sensor_dict
+from services.fit.optics.parameters import Mouth
+
+SurfaceFiles = Mapping[str, Path]
+"""PLY files by the name of the surface: ``crown_11``, ``root_11``, ``dentin_11`` and ``contact_11_12`` by FDI number, ``gums``, ``cavity``."""
+
+
+def write_mouth_surfaces(folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | None, cavity: Mesh | None) -> dict[str, Path]:
+    """Write the surfaces between media, none of which overlap; what is empty has no file.
+
+    Raises:
+        MeshError: a tooth reaches into another one's dentin, or a surface cannot be cut.
+    """
+    parts = separate(teeth, gums)
+    meshes = {"gums": parts.gums} | ({} if cavity is None else {"cavity": cavity})
+    for tooth, crown, root in zip(teeth, parts.crowns, parts.roots, strict=True):
+        meshes |= {f"crown_{tooth.fdi}": crown, f"root_{tooth.fdi}": root}
+        if tooth.dentin is not None:
+            meshes[f"dentin_{tooth.fdi}"] = tooth.dentin
+    meshes |= {f"contact_{teeth[i].fdi}_{teeth[j].fdi}": mesh for (i, j), mesh in parts.contacts.items()}
+    files = {name: folder / f"{name}.ply" for name, mesh in meshes.items() if len(mesh.faces)}
+    for name, path in files.items():
+        write_mesh(path, meshes[name])
+    return files
+
+
+def mouth_scene(
+    files: SurfaceFiles,
+    fdi: tuple[int, ...],
+    mouth: Mouth,
+    cameras: tuple[Camera, ...],
+    light_mm: Sequence[Any],
+    intensity: Any,
+    *,
+    boundary: Boundary = "matched",
+    ior: float = 1.631,
+    gums_ior: float = 1.33,
+    samples: Any = 64,
+) -> SceneDict:
+    """Scene of a mouth under one point light, as ``nested_scene``.
+
+    Args:
+        fdi: FDI numbers in the order of the mouth's teeth.
+    """
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
+        "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
+    }
+    for number, tissue in zip(fdi, mouth.teeth, strict=True):
+        scene |= {f"medium_enamel_{number}": medium_dict(tissue.enamel), f"medium_dentin_{number}": medium_dict(tissue.dentin)}
+    if mouth.gums is not None:
+        scene["medium_gums"] = medium_dict(mouth.gums)
+
+    def between(path: Path, contrast: float, inside: str, outside: str | None = None) -> SceneDict:
+        sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | ({"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {})
+        return _mesh(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
+
+    for name, path in files.items():
+        kind, _, whose = name.partition("_")
+        if kind == "crown":
+            scene[name] = between(path, ior, f"enamel_{whose}")
+        elif kind == "root":
+            scene[name] = between(path, ior / gums_ior, f"enamel_{whose}", "gums")
+        elif kind == "dentin":
+            scene[name] = between(path, 1.0, f"dentin_{whose}", f"enamel_{whose}")
+        elif kind == "contact":
+            scene[name] = between(path, 1.0, *(f"enamel_{number}" for number in whose.split("_")))
+        elif kind == "gums":
+            scene[name] = between(path, gums_ior, "gums")
+        else:
+            wall = {"type": "diffuse", "reflectance": {"type": "uniform", "value": mouth.reflectance}}
+            scene[name] = _mesh(path, {"type": "twosided", "nested": wall})
+    return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
+
+
+def _mesh(path: Path, bsdf: SceneDict) -> SceneDict:
+    return {"type": "ply", "filename": path.as_posix(), "face_normals": True, "bsdf": bsdf}

@@ -1,0 +1,83 @@
+"""What a capture shows: teeth, and around them gums and the wall of the mouth, which a jaw's fit explains and a single tooth's does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Mesh, Tooth
+from services.core.meshfiles import read_mesh, read_teeth
+from services.preprocess.projection import Footprint, project
+
+NOTHING = -1
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The surfaces of a capture. Numbers in a footprint: teeth by their place, then one for gums and one for the wall, -1 for nothing."""
+
+    teeth: tuple[Tooth, ...]
+    gums: Mesh | None
+    cavity: Mesh | None
+    """Open, seen from either side."""
+    whole: bool
+    """Whether gums and wall are to be fitted too; else gums are in the way, and nothing is known of the wall."""
+
+    @property
+    def gums_number(self) -> int:
+        """Of gums in a footprint."""
+        return len(self.teeth)
+
+    @property
+    def cavity_number(self) -> int:
+        """Of the wall in a footprint."""
+        return len(self.teeth) + 1
+
+    def seen_by(self, camera: Camera) -> Footprint:
+        """What a camera sees of all that is to be fitted."""
+        outers = [tooth.outer for tooth in self.teeth]
+        if not self.whole:
+            return project(camera, outers, () if self.gums is None else (self.gums,))
+        shown = dict(enumerate(outers))
+        if self.gums is not None:
+            shown[self.gums_number] = self.gums
+        if self.cavity is not None:
+            shown[self.cavity_number] = _two_sided(self.cavity)
+        footprint = project(camera, list(shown.values()))
+        numbers = np.array([*shown, NOTHING], dtype=np.int16)
+        return replace(footprint, mesh=numbers[footprint.mesh])
+
+    def glossy(self, footprint: Footprint) -> tuple[NDArray[np.bool_], ...]:
+        """Masks (H, W) of the surfaces that reflect, apart because their colours differ."""
+        teeth = (footprint.mesh >= 0) & (footprint.mesh < len(self.teeth))
+        return (teeth, footprint.mesh == self.gums_number) if self.whole else (teeth,)
+
+    def pixels_of_teeth(self, footprint: Footprint, bits: NDArray[np.uint16]) -> NDArray[np.int64]:
+        """How many valid pixels (teeth,) show each tooth."""
+        labels = footprint.mesh[(bits == 0) & (footprint.mesh >= 0)]
+        return np.bincount(labels, minlength=len(self.teeth))[: len(self.teeth)]
+
+
+def read_subject(root: Path, whole: bool) -> Subject:
+    """Read ``teeth/``, ``gums.ply`` and ``cavity.ply`` of a capture.
+
+    Raises:
+        CaptureInputError: no tooth is there, or a file cannot be read. MeshError: a surface cannot bound a medium.
+    """
+    teeth, gums, cavity = read_teeth(root), _optional(root / "gums.ply"), _optional(root / "cavity.ply")
+    if whole and gums is not None:
+        gums.require_solid("gums.ply")
+    if whole and cavity is not None:
+        cavity.require_surface("cavity.ply")
+    return Subject(teeth, gums, cavity, whole)
+
+
+def _optional(path: Path) -> Mesh | None:
+    return read_mesh(path) if path.exists() else None
+
+
+def _two_sided(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices_mm, np.concatenate([mesh.faces, mesh.faces[:, ::-1]]))

@@ -1,0 +1,113 @@
+"""A jaw with known optics as stock Mitsuba renders it; ``tests/benchmarks/render_jaw_truth.py`` made the images.
+
+Its surfaces are those of the phantom jaw of one subject, which are built again; numbers stored with the images tell whether they are still the same.
+Sensor noise is added when the capture is written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera, Light
+from services.fit.anatomy.phantom_files import held_out_lights, write_description, write_images
+from services.fit.anatomy.phantom_jaw import JawSurfaces, jaw_surfaces, jaw_truth, known_mouth, write_jaw_meshes
+from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.fit.optics.parameters import Mouth
+
+STORED = Path(__file__).resolve().parents[1] / "data" / "truths-jaw" / "subject-1.npz"
+SUBJECT, CHANNEL = 1, "green"
+PIXEL_MM, CAMERAS, LIGHTS, HELD_OUT = 1.0, 3, 7, 2
+NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
+"""Sensor noise: of the value, and of the image's maximum."""
+NEIGHBOURS_PX = 2
+"""Half width of the square in which the renderer's noise is smoothed."""
+
+
+@dataclass(frozen=True)
+class JawTruth:
+    """The jaw of ``SUBJECT`` without sensor noise."""
+
+    jaw: JawSurfaces
+    mouth: Mouth
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    mean: tuple[NDArray[np.float64], ...]
+    """By camera, (L, H, W)."""
+    variance: tuple[NDArray[np.float64], ...]
+    """Of the mean, from independent passes."""
+
+
+def cameras(jaw: JawSurfaces) -> tuple[Camera, ...]:
+    """The rig's cameras."""
+    return dome_cameras(CAMERAS, PIXEL_MM, tuple(tooth.outer for tooth in jaw.teeth))
+
+
+def lights() -> tuple[Light, ...]:
+    """The rig's lights."""
+    return dome_lights(LIGHTS, (CHANNEL,), seed=SUBJECT)
+
+
+def pack(stored: Path, passes: list[NDArray[np.float64]], samples: int) -> None:
+    """Store images (P, L, H, W) of every camera, from P independent passes.
+
+    Args:
+        samples: paths per pixel of all passes together.
+    """
+    arrays: dict[str, NDArray[Any]] = {"samples": np.array(samples), "moments": _moments(jaw_surfaces(SUBJECT))}
+    for k, images in enumerate(passes):
+        arrays[f"mean_{k}"] = images.mean(axis=0).astype(np.float32)
+        arrays[f"standard_error_{k}"] = (images.std(axis=0, ddof=1) / np.sqrt(len(images))).astype(np.float16)
+    stored.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(stored, allow_pickle=False, **arrays)
+
+
+def read_jaw_truth(stored: Path = STORED) -> JawTruth:
+    """Read the images, and build the jaw that they show."""
+    jaw = jaw_surfaces(SUBJECT)
+    with np.load(stored) as arrays:
+        assert np.allclose(arrays["moments"], _moments(jaw), rtol=1e-6), f"the phantom jaw is not the one of {stored.name}; render it again"
+        mean, error = ([arrays[f"{kind}_{k}"].astype(np.float64) for k in range(CAMERAS)] for kind in ("mean", "standard_error"))
+    return JawTruth(jaw, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights(), tuple(mean), tuple(one**2 for one in error))
+
+
+def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool = True) -> None:
+    """Write the truth as a folder capture with sensor noise.
+
+    A pixel's variance file holds the sensor's variance and the renderer's, the latter as its neighbours have it: where few bright paths are missed,
+    value and spread both come out low, and weights by a pixel's own spread would pull a fit down.
+
+    Args:
+        dentin: give its surfaces.
+    """
+    random = np.random.default_rng(seed)
+    entries, kept = [], held_out_lights(LIGHTS, HELD_OUT)
+    for camera, mean, variance in zip(truth.cameras, truth.mean, truth.variance, strict=True):
+        sensor = (NOISE_RELATIVE * mean) ** 2 + (NOISE_FLOOR * mean.max(axis=(1, 2), keepdims=True)) ** 2
+        noisy = mean + np.sqrt(sensor) * random.standard_normal(mean.shape)
+        entries += write_images(folder, camera, truth.lights, noisy[..., None], (sensor + _of_neighbours(variance))[..., None], kept)
+    jaw = truth.jaw if dentin else JawSurfaces(tuple(type(tooth)(tooth.fdi, tooth.outer) for tooth in truth.jaw.teeth), truth.jaw.gums, truth.jaw.cavity)
+    write_jaw_meshes(folder, jaw)
+    known = jaw_truth(truth.jaw, {CHANNEL: truth.mouth}, "matched")
+    write_description(folder, (CHANNEL,), truth.cameras, truth.lights, entries, known | {"subject": SUBJECT, "renderer": "mitsuba"})
+
+
+def _of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Mean over the square around a pixel, itself and what is quite dark left out.
+    from scipy.ndimage import uniform_filter
+
+    width = 2 * NEIGHBOURS_PX + 1
+    lit = variance > 0
+    total, count = (uniform_filter(array, (0, width, width), mode="constant") * width**2 for array in (variance, lit.astype(float)))
+    others, number = np.maximum(total - variance, 0.0), np.round(count - lit)
+    return np.where(number > 0, others / np.maximum(number, 1), 0.0)
+
+
+def _moments(jaw: JawSurfaces) -> NDArray[np.float64]:
+    # Volume and mean vertex of every surface, mm.
+    meshes = [mesh for tooth in jaw.teeth for mesh in (tooth.outer, tooth.dentin) if mesh is not None]
+    return np.array([[mesh.signed_volume_mm3(), *mesh.vertices_mm.mean(axis=0)] for mesh in (*meshes, jaw.gums)])

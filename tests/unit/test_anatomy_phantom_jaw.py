@@ -1,0 +1,121 @@
+"""The virtual jaw's optics and options; ``tests/pipeline/test_prepare_jaw.py`` reads the folder it writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from services.__main__ import build_app
+from services.core.errors import CaptureInputError, InputError
+from services.fit.anatomy.distance import SurfaceDistance
+from services.fit.anatomy.jaw_optics import COSINE_SPREAD, SIGMA_SPREAD, gums_medium, jaw_mouth
+from services.fit.anatomy.phantom import TRUE_TISSUE
+from services.fit.anatomy.phantom_files import held_out_lights
+from services.fit.anatomy.phantom_jaw import SCAN_DENTIN, jaw_surfaces, jaw_truth, known_mouth, write_jaw_phantom
+from services.fit.optics.parameters import Medium
+from tests.support.labelled_scan import bumps, universal, write_vtp
+
+FDI = (11, 12, 13, 21)
+SUBJECTS = range(1, 30)
+
+
+def test_an_average_jaw_has_one_tissue() -> None:
+    mouth = jaw_mouth(FDI, "blue", None)
+    assert set(mouth.teeth) == {TRUE_TISSUE["blue"]}
+    assert mouth.gums == gums_medium("blue")
+
+
+@pytest.mark.parametrize(("channel", "reduced", "absorption"), [("red", 1.39, 0.05), ("green", 1.71, 1.2), ("blue", 1.99, 0.6)])
+def test_gums_have_the_tables_optics(channel: str, reduced: float, absorption: float) -> None:
+    medium = gums_medium(channel)
+    assert medium.sigma_s_reduced == pytest.approx(reduced)
+    assert (1 - medium.alpha) * medium.sigma == pytest.approx(absorption)
+
+
+def test_every_tooth_of_every_subject_has_its_own_media() -> None:
+    mouths = [jaw_mouth(FDI, "green", subject) for subject in SUBJECTS]
+    media = [medium for mouth in mouths for tissue in mouth.teeth for medium in (tissue.enamel, tissue.dentin)]
+    assert len(set(media)) == 2 * len(FDI) * len(SUBJECTS)
+    # ../shared/reference/tooth_optics.csv, reduced scattering near 540 nm: 0.24 to 2.1 per mm in enamel, 0.245 to 3.77 in dentin.
+    for mouth in mouths:
+        for tissue in mouth.teeth:
+            assert 0.24 < tissue.enamel.sigma_s_reduced < 2.11
+            assert 0.245 < tissue.dentin.sigma_s_reduced < 3.77
+    average = TRUE_TISSUE["green"].enamel
+    ratios = np.array([tissue.enamel.sigma / average.sigma for mouth in mouths for tissue in mouth.teeth])
+    cosines = np.array([tissue.enamel.g1 - average.g1 for mouth in mouths for tissue in mouth.teeth])
+    assert SIGMA_SPREAD * 0.9 < np.ptp(ratios) / 2 <= SIGMA_SPREAD
+    assert COSINE_SPREAD * 0.9 < np.ptp(cosines) / 2 <= COSINE_SPREAD
+
+
+def test_a_tooth_is_the_same_in_all_channels_and_whatever_stands_beside_it() -> None:
+    green, blue = (jaw_mouth(FDI, channel, 4) for channel in ("green", "blue"))
+
+    def character(medium: Medium, average: Medium) -> list[float]:
+        return [medium.sigma / average.sigma, (1 - medium.alpha) / (1 - average.alpha), medium.g1 - average.g1]
+
+    for one, other in zip(green.teeth, blue.teeth, strict=True):
+        np.testing.assert_allclose(character(one.dentin, TRUE_TISSUE["green"].dentin), character(other.dentin, TRUE_TISSUE["blue"].dentin), rtol=1e-9)
+    assert jaw_mouth((21,), "green", 4).teeth[0] == green.teeth[3]
+
+
+def test_held_out_lights_lie_between_the_others() -> None:
+    assert held_out_lights(8, None) == {3, 7}
+    assert held_out_lights(7, 2) == {1, 5}
+    assert held_out_lights(5, 0) == frozenset()
+    assert all(len(held_out_lights(count, k)) == k for count in range(1, 40) for k in range(count))
+
+
+def test_a_scanned_jaw_gets_dentin_where_there_is_room(tmp_path: Path) -> None:
+    scan = bumps({11: (-4.5, 0.0), 21: (4.5, 0.0)})
+    write_vtp(tmp_path / "scan.vtp", scan.mesh, universal(scan.fdi))
+    jaw = jaw_surfaces(3, tmp_path / "scan.vtp")
+    assert jaw.cavity is None
+    assert jaw.weights is not None
+    assert set(jaw.weights) == {11, 21}
+    for tooth in jaw.teeth:
+        assert tooth.dentin is not None
+        tooth.dentin.require_solid("dentin")
+        # B0 lies 0.1 mm deep, and what the weights add is at most as much of the way to 1.5 mm.
+        depths = SurfaceDistance(tooth.outer).closest(tooth.dentin.vertices_mm)[1]
+        assert 0.04 < depths.min() < depths.max() < 0.1 + SCAN_DENTIN[1] * 1.4 + 0.05
+    mouth = known_mouth(jaw, "green", 3)
+    assert mouth.reflectance is None
+    truth = jaw_truth(jaw, {"green": mouth}, "matched")
+    assert set(truth["dentin_shape"]) == {"11", "21"}
+    assert all(SCAN_DENTIN[0] <= weight <= SCAN_DENTIN[1] for weight in truth["dentin_shape"]["11"])
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"renderer": "mitsuba", "boundary": "thin"}, "Stock Mitsuba has no thin boundary"),
+        ({"channels": 2}, "1 or 3 channels"),
+        ({"lights": 4, "held_out": 4}, "Of 4 lights 4 cannot be held out"),
+        ({"samples": 8}, "16 samples"),
+        ({"scan": Path("nowhere.vtp")}, "nowhere.vtp does not exist"),
+    ],
+)
+def test_impossible_options_end_in_a_sentence(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises((InputError, CaptureInputError), match=sentence):
+        write_jaw_phantom(tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--jaw", "--gums"], "Option --gums is for one tooth"),
+        (["--jaw", "--outer", "o.ply"], "Option --outer is for one tooth"),
+        (["--scan", "s.vtp"], "Option --scan is for a jaw; add --jaw"),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(tmp_path: Path, arguments: list[str], sentence: str) -> None:
+    outcome = CliRunner().invoke(build_app(), ["phantom", "--out", str(tmp_path / "out"), *arguments])
+    assert isinstance(outcome.exception, InputError)
+    assert sentence in outcome.exception.message
+    assert not (tmp_path / "out").exists()
