@@ -78,6 +78,8 @@ class StockFit:
             image = mi.render(scene, params, spp=self._samples, spp_grad=self._samples, seed=seed, seed_grad=seed + 1)
             dr.backward(dr.sum(dr.square((image - reference) * counts)) / self._signal)
         self._optimizer.step()
+        dr.eval(*(self._optimizer[name] for name in NAMES))
+        dr.sync_thread()
         self.rounds += 1
         self.seconds += time.process_time() - begun
 
