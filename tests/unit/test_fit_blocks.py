@@ -13,7 +13,7 @@ from services.core.records import Device
 from services.fit.blocks import Block, StoredFile, read_block, read_recipe, write_block, write_recipe
 from services.fit.evaluate import evaluate_task
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.passes import BlockTask, compare_task, image_task, jacobian_task, orders_task
+from services.fit.passes import BlockTask, Differentiation, compare_task, image_task, jacobian_task, orders_task
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 
@@ -83,7 +83,7 @@ def task(tmp_path: Path) -> BlockTask:
 def test_every_task_of_the_fit_asks_for_fitted_lights_alone(task: BlockTask) -> None:
     host = Recorder()
     image_task(host, task, (1, 2))
-    jacobian_task(host, task, ("enamel.sigma",), np.ones((1, 1)), (1, 2))
+    jacobian_task(host, task, Differentiation(("enamel.sigma",), np.ones((1, 1))), (1, 2))
     compare_task(host, task, task.tissue, (1, 2))
     orders_task(host, task, np.array([0, 2, 9]), 1)
     assert host.asked == [(1, 2)] * 9

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from services.core.errors import SettingsError
-from services.fit.optics.domain import BOUNDS, Coordinate, Domain, kind_of, natural_derivative, similar_medium, to_dual, to_natural
+from services.core.records import JobSpec
+from services.fit.optics.domain import BOUNDS, HELD_G, Coordinate, Domain, kind_of, natural_derivative, similar_medium, to_dual, to_natural
 from services.fit.optics.parameters import Medium, Tissue
 
 KINDS = tuple(BOUNDS)
@@ -69,3 +71,24 @@ def test_similar_media_share_reduced_scattering_and_absorption(sigma: float, alp
     assert similar.sigma_s_reduced == pytest.approx(medium.sigma_s_reduced, rel=1e-9)
     assert (1 - similar.alpha) * similar.sigma == pytest.approx((1 - alpha) * sigma, rel=1e-6)
     assert similar.alpha_reduced == pytest.approx(medium.alpha_reduced, rel=1e-6)
+
+
+def test_a_cosine_changes_neither_reduced_quantity_and_comes_back() -> None:
+    tissue = Tissue(Medium(4.0, 0.995, g1=0.6), Medium(12.0, 0.99, g1=0.75))
+    domain = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "enamel.cosine")))
+    x = domain.x_of(tissue)
+    again = domain.tissue_at(x, tissue)
+    for name in ("enamel.sigma", "enamel.alpha", "enamel.g1", "dentin.sigma", "dentin.g1"):
+        assert again.value(name) == pytest.approx(tissue.value(name), rel=1e-12)
+    moved = domain.tissue_at(x + [0, 0, 0, 0.5], tissue).enamel
+    assert moved.g1 == pytest.approx(math.tanh(math.atanh(0.6) + 0.5))
+    assert (moved.sigma_s_reduced, moved.alpha_reduced) == pytest.approx((tissue.enamel.sigma_s_reduced, tissue.enamel.alpha_reduced))
+    # The other coordinates are those of the medium at the cosine that is held where none is fitted.
+    assert x[0] == pytest.approx(math.log(similar_medium(tissue.enamel, HELD_G).sigma))
+
+
+def test_only_what_can_be_held_may_be() -> None:
+    with pytest.raises(ValidationError, match=r"held names 'enamel.colour'"):
+        JobSpec.model_validate({"capture": "x", "held": {"enamel.colour": 1.0}})
+    with pytest.raises(ValidationError, match=r"held enamel.alpha = 1.5 must lie between 0 and 1"):
+        JobSpec.model_validate({"capture": "x", "held": {"enamel.alpha": 1.5}})
