@@ -61,7 +61,7 @@ def test_says_what_is_known_what_goes_together_and_what_would_help(finished: tup
     found = report.correlations["green"]
     assert found.names == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.cosine", "dentin.cosine")
     matrix = np.array(found.matrix)
-    np.testing.assert_allclose(matrix, matrix.T)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
     assert (np.linalg.eigvalsh(matrix) > -1e-9).all()
     assert report.told.startswith("This capture tells enamel scattering (")
     assert "per mm" in report.told
