@@ -1,0 +1,116 @@
+"""Which captures and fits the figures show, at the size that is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from services.fit.bench.tooth_capture import real_tooth
+from services.fit.figures.cases import Capture, Case
+
+FRONT_LIGHTS = tuple(f"l{n}" for n in range(9))
+"""Of eighteen: up to 70 degrees from the front."""
+SIDE_LIGHTS = tuple(f"l{n}" for n in range(9, 18))
+"""From there to 108 degrees, a little from behind."""
+FIVE_LIGHTS, FIVE_OTHERS = ("l0", "l4", "l8", "l12", "l16"), ("l2", "l6", "l10", "l14", "l17")
+STAIN_LIGHTS = tuple(f"l{n}" for n in range(12) if n % 4 != 3)
+JAW_LIGHTS = tuple(f"l{n}" for n in range(5))
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How large captures and fits are, and how many paths the figures themselves take."""
+
+    tooth_mm: float
+    jaw_mm: float
+    step: int
+    """Teeth are fitted to every so many pixels."""
+    photo_samples: int
+    jaw_photo_samples: int
+    shown_samples: int
+    tooth_job: Mapping[str, Any]
+    jaw_job: Mapping[str, Any]
+    environment_samples: int
+    environment_px: int
+    ambient: tuple[float, ...]
+    """Constant light from all around, as fractions of the photographs' mean radiance."""
+
+
+FULL = Effort(
+    0.4, 1.0, 2, 256, 128, 256,
+    {"samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 6, "search_candidates": 5000, "advise": False},
+    {"samples_per_pixel": 16, "max_samples_per_pixel": 32, "max_steps": 4, "search_candidates": 1000, "advise": False},
+    256, 240, (0.0, 0.02, 0.05, 0.1),
+)  # fmt: skip
+QUICK = Effort(
+    0.8, 2.0, 1, 128, 64, 64,
+    {"samples_per_pixel": 32, "max_samples_per_pixel": 64, "max_steps": 3, "search_candidates": 1000, "advise": False},
+    {"samples_per_pixel": 8, "max_samples_per_pixel": 8, "max_steps": 1, "search_candidates": 1000, "advise": False},
+    32, 100, (0.0, 0.1),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cast:
+    """All that figures are made of."""
+
+    effort: Effort
+    teeth: Path | None
+    """Folder with ``outer.ply`` and ``dentin.ply`` of a scanned incisor; None for the procedural one."""
+
+    @classmethod
+    def of(cls, effort: Effort) -> Cast:
+        """With the scanned incisor where this machine has it."""
+        scan = real_tooth()
+        return cls(effort, None if scan is None else scan / "teeth" / "11")
+
+    @property
+    def tooth_name(self) -> str:
+        """In captions."""
+        return "a procedural incisor" if self.teeth is None else "a micro-CT incisor"
+
+    @property
+    def tooth(self) -> Capture:
+        """An isolated tooth, in colour, three cameras and eighteen lights."""
+        meshes = {} if self.teeth is None else {name: str(self.teeth / f"{name}.ply") for name in ("outer", "dentin")}
+        return self._phantom("tooth", self.effort.tooth_mm, self.effort.photo_samples, cameras=3, lights=18, channels=3, **meshes)
+
+    def isolated(self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], **job: Any) -> Case:
+        """A fit of it with known dentin."""
+        options = {"dentin": "known", "pixel_step": self.effort.step} | dict(self.effort.tooth_job) | job
+        return Case(name, self.tooth, cameras, fitted, lights, options)
+
+    @property
+    def front(self) -> Case:
+        """Fitted from the front, with front lights."""
+        return self.isolated("front", ("c1", "c2"), ("c1",), FRONT_LIGHTS, channels=["green"])
+
+    @property
+    def five_lights(self) -> Case:
+        """Fitted to three cameras and five lights, in colour."""
+        cameras = ("c0", "c1", "c2")
+        return self.isolated("five-lights", cameras, cameras, FIVE_LIGHTS)
+
+    @property
+    def two_cameras(self) -> Case:
+        """Fitted to two cameras of three."""
+        return self.isolated("two-cameras", ("c0", "c1", "c2"), ("c1", "c2"), FIVE_LIGHTS, channels=["green"])
+
+    @property
+    def stained(self) -> Case:
+        """A stained incisor."""
+        capture = self._phantom("stained", self.effort.tooth_mm, 2 * self.effort.photo_samples, cameras=2, lights=12, stains=True, seed=4)
+        options = {"dentin": "known", "pixel_step": self.effort.step, "stains": True} | dict(self.effort.tooth_job)
+        return Case("stained", capture, ("c0", "c1"), ("c0", "c1"), STAIN_LIGHTS, options)
+
+    def jaw(self, subject: int, fitted: tuple[str, ...] = ("c0", "c1", "c2")) -> Case:
+        """A whole jaw of a random subject."""
+        capture = self._phantom(f"jaw{subject}", self.effort.jaw_mm, self.effort.jaw_photo_samples, cameras=3, lights=6, jaw=True, subject=subject)
+        return Case(f"jaw{subject}", capture, ("c0", "c1", "c2"), fitted, JAW_LIGHTS, {"kind": "jaw", "dentin": "known"} | dict(self.effort.jaw_job))
+
+    @staticmethod
+    def _phantom(name: str, pixel_mm: float, samples: int, **options: Any) -> Capture:
+        named = {key.replace("_", "-"): value for key, value in options.items()}
+        return Capture(name, {"pixel-mm": pixel_mm, "samples": samples, "boundary": "thin"} | named)
