@@ -31,9 +31,13 @@ Row = dict[str, Any]
 
 
 def under_ambient_light(cast: Cast, work: Path) -> Drawn:
-    """The fit of Fig. 8 with constant light from all around added to its photographs."""
+    """A fit of one view with constant light from all around added to its photographs."""
     rows = ambient_rows(cast, work)
-    return Drawn(plot(rows), f"{cast.tooth_name.capitalize()} as in fig8, with constant light from all around added to every photograph. {sentence(rows)}")
+    return Drawn(
+        plot(rows),
+        f"A procedural incisor of known dentin from one side, with constant light from all around added to every photograph, its mirror "
+        f"image included. {sentence(rows)}",
+    )
 
 
 def ambient_rows(cast: Cast, work: Path) -> list[Row]:
@@ -42,7 +46,7 @@ def ambient_rows(cast: Cast, work: Path) -> list[Row]:
     Returns:
         Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and ``value``, ``se`` and ``truth`` by quantity.
     """
-    case = cast.front
+    case = cast.lone_view
     source = case.capture.rendered(work)
     media = json.loads((source / "truth.json").read_text())["channels"][CHANNEL]
     rows = []

@@ -15,7 +15,8 @@ FRONT_LIGHTS = tuple(f"l{n}" for n in range(9))
 SIDE_LIGHTS = tuple(f"l{n}" for n in range(9, 18))
 """From there to 108 degrees, a little from behind."""
 FIVE_LIGHTS, FIVE_OTHERS = ("l0", "l4", "l8", "l12", "l16"), ("l2", "l6", "l10", "l14", "l17")
-STAIN_LIGHTS = tuple(f"l{n}" for n in range(12) if n % 4 != 3)
+SPREAD_LIGHTS = tuple(f"l{n}" for n in range(12) if n % 4 != 3)
+"""Of twelve."""
 JAW_LIGHTS = tuple(f"l{n}" for n in range(5))
 
 
@@ -24,6 +25,7 @@ class Effort:
     """How large captures and fits are, and how many paths the figures themselves take."""
 
     tooth_mm: float
+    lone_mm: float
     jaw_mm: float
     step: int
     """Teeth are fitted to every so many pixels."""
@@ -39,13 +41,13 @@ class Effort:
 
 
 FULL = Effort(
-    0.4, 1.0, 2, 256, 128, 256,
+    0.4, 0.6, 1.0, 2, 256, 128, 512,
     {"samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 6, "search_candidates": 5000, "advise": False},
     {"samples_per_pixel": 16, "max_samples_per_pixel": 32, "max_steps": 4, "search_candidates": 1000, "advise": False},
     256, 240, (0.0, 0.02, 0.05, 0.1),
 )  # fmt: skip
 QUICK = Effort(
-    0.8, 2.0, 1, 128, 64, 64,
+    0.8, 0.8, 2.0, 1, 128, 64, 64,
     {"samples_per_pixel": 32, "max_samples_per_pixel": 64, "max_steps": 3, "search_candidates": 1000, "advise": False},
     {"samples_per_pixel": 8, "max_samples_per_pixel": 8, "max_steps": 1, "search_candidates": 1000, "advise": False},
     32, 100, (0.0, 0.1),
@@ -103,7 +105,13 @@ class Cast:
         """A stained incisor."""
         capture = self._phantom("stained", self.effort.tooth_mm, 2 * self.effort.photo_samples, cameras=2, lights=12, stains=True, seed=4)
         options = {"dentin": "known", "pixel_step": self.effort.step, "stains": True} | dict(self.effort.tooth_job)
-        return Case("stained", capture, ("c0", "c1"), ("c0", "c1"), STAIN_LIGHTS, options)
+        return Case("stained", capture, ("c0", "c1"), ("c0", "c1"), SPREAD_LIGHTS, options)
+
+    @property
+    def lone_view(self) -> Case:
+        """The procedural incisor from one side, eight lights of twelve fitted: small, for what takes many fits."""
+        capture = self._phantom("lone-view", self.effort.lone_mm, 2 * self.effort.photo_samples, cameras=1, lights=12)
+        return Case("lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job))
 
     def jaw(self, subject: int, fitted: tuple[str, ...] = ("c0", "c1", "c2")) -> Case:
         """A whole jaw of a random subject."""

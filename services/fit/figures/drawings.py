@@ -10,7 +10,7 @@ import numpy as np
 
 from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
 from services.fit.figures.cases import Case
-from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, JAW_LIGHTS, SIDE_LIGHTS, STAIN_LIGHTS, Cast
+from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, JAW_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
 from services.fit.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
 from services.fit.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
 from services.fit.optics.domain import similar_tissue
@@ -61,15 +61,17 @@ def stages(cast: Cast, work: Path) -> Drawn:
         rows.append(
             [*drawn, tone_map(np.where(valid[..., None], photo, 0.0), white), *(signed_map(p.residual, RESIDUAL_LIMIT * white, valid) for p in pictures)]
         )
-    columns = [*(Column(name) for name in names), Column("photo", True), *(Column(name, name == names[0]) for name in names)]
-    images = [(camera, light) for camera in ("c0", "c1") for light in STAIN_LIGHTS]
+    images = [(camera, light) for camera in ("c0", "c1") for light in SPREAD_LIGHTS]
     others = [image for image in found[0] if image not in images]
-    losses = ", ".join(f"{name} {loss_of(one, images):.4f}" for name, one in zip(names, found, strict=True))
+    losses = [loss_of(one, images) for one in found]
+    heads = [f"{name}: {loss:.3f}" for name, loss in zip(names, losses, strict=True)]
+    columns = [*(Column(head) for head in heads), Column("photograph", starts_group=True), *(Column(name, name == names[0]) for name in names)]
     unseen = ", ".join(_percent(error_of(one, others)) for one in found)
     return Drawn(
-        mosaic(rows, columns, [f"{camera} {light}" for camera, light in shown], scale=3),
-        f"Stages of the fit of a stained incisor beside the photograph, and their differences to it. Loss (relative squared error of all fitted images, their "
-        f"noise included): {losses}; error on the six images that were not fitted {unseen}. Light l3 was not fitted. {DIFFERENCE}",
+        mosaic(rows, columns, [f"{camera} {light}" for camera, light in shown], scale=4),
+        f"Stages of the fit of a stained incisor beside the photograph, and their differences to it. The number is the loss, the relative squared error of all "
+        f"fitted images with their noise; it falls by {_percent(1 - losses[1] / losses[0])} and {_percent(1 - losses[2] / losses[1])}. Error on the "
+        f"{len(others)} images that were not fitted: {unseen}. Light l3 was not fitted. {DIFFERENCE}",
     )
 
 
