@@ -15,13 +15,14 @@ from types import MappingProxyType
 
 from services.core.errors import DentineError, InputError
 from services.core.store import write_atomic
+from services.fit.bench.tooth_capture import real_tooth
 from services.fit.export.pictures import png_bytes
 from services.fit.figures.ambient import under_ambient_light
 from services.fit.figures.cast import FULL, QUICK, Cast
 from services.fit.figures.drawings import Drawn, caption_page, five_lights, front_and_side, stages, unseen_camera, whole_jaw
 from services.fit.figures.environment import memorial, under_an_environment
 
-Drawing = Callable[[Cast, Path], Drawn]
+Drawing = Callable[[Cast], Drawn]
 
 FIGURES: Mapping[str, Drawing] = MappingProxyType(
     {
@@ -69,14 +70,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="smaller captures and fits of few samples, for a check")
     options = parser.parse_args(arguments)
     try:
-        names, cast = chosen_figures(options.only), Cast.of(QUICK if options.quick else FULL)
-        work = options.out / "work"
-        work.mkdir(parents=True, exist_ok=True)
+        names, cast = chosen_figures(options.only), Cast(QUICK if options.quick else FULL, options.out / "work", real_tooth())
+        cast.work.mkdir(parents=True, exist_ok=True)
         for name in names:
             if name == "environment" and memorial() is None:
                 print("environment: skipped, because hdr-memorial does not lie in shared/data beside the checkout.", flush=True)
                 continue
-            keep(options.out, name, FIGURES[name](cast, work))
+            keep(options.out, name, FIGURES[name](cast))
             print(options.out / f"{name}.png", flush=True)
     except DentineError as problem:
         print(f"figures: {problem.message}", file=sys.stderr)

@@ -30,9 +30,9 @@ QUANTITIES = tuple(f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in
 Row = dict[str, Any]
 
 
-def under_ambient_light(cast: Cast, work: Path) -> Drawn:
+def under_ambient_light(cast: Cast) -> Drawn:
     """A fit of one view with constant light from all around added to its photographs."""
-    rows = ambient_rows(cast, work)
+    rows = ambient_rows(cast)
     return Drawn(
         plot(rows),
         f"A procedural incisor of known dentin from one side, with constant light from all around added to every photograph, its mirror "
@@ -40,18 +40,18 @@ def under_ambient_light(cast: Cast, work: Path) -> Drawn:
     )
 
 
-def ambient_rows(cast: Cast, work: Path) -> list[Row]:
+def ambient_rows(cast: Cast) -> list[Row]:
     """A fit for each strength of ambient light, none first.
 
     Returns:
         Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and ``value``, ``se`` and ``truth`` by quantity.
     """
     case = cast.lone_view
-    source = case.capture.rendered(work)
+    source = case.capture.rendered(cast.work)
     media = json.loads((source / "truth.json").read_text())["channels"][CHANNEL]
     rows = []
     for fraction in cast.effort.ambient:
-        folder = case.fitted_with(work, _added(source, case, fraction), f"-ambient-{fraction:g}") if fraction else case.fitted(work)
+        folder = case.fitted_with(cast.work, _added(source, case, fraction), f"-ambient-{fraction:g}") if fraction else case.fitted(cast.work)
         rows.append({"fraction": fraction} | described(Fitted(folder).report, media))
     return rows
 

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from services.fit.bench.tooth_capture import real_tooth
+import numpy as np
+
+from services.core.meshfiles import write_mesh
+from services.core.records import FolderCapture
+from services.core.store import read_record
 from services.fit.figures.cases import Capture, Case
+from services.fit.gallery import tooth_surfaces
 
 FRONT_LIGHTS = tuple(f"l{n}" for n in range(9))
 """Of eighteen: up to 70 degrees from the front."""
@@ -59,46 +64,49 @@ class Cast:
     """All that figures are made of."""
 
     effort: Effort
-    teeth: Path | None
-    """Folder with ``outer.ply`` and ``dentin.ply`` of a scanned incisor; None for the procedural one."""
-
-    @classmethod
-    def of(cls, effort: Effort) -> Cast:
-        """With the scanned incisor where this machine has it."""
-        scan = real_tooth()
-        return cls(effort, None if scan is None else scan / "teeth" / "11")
+    work: Path
+    """Where captures and fits are kept."""
+    scan: Path | None = None
+    """Folder capture of a scanned incisor whose meshes are used; None for the procedural one."""
 
     @property
     def tooth_name(self) -> str:
         """In captions."""
-        return "a procedural incisor" if self.teeth is None else "a micro-CT incisor"
+        return "a procedural incisor" if self.scan is None else "a micro-CT incisor"
 
-    @property
-    def tooth(self) -> Capture:
-        """An isolated tooth, in colour, three cameras and eighteen lights."""
-        meshes = {} if self.teeth is None else {name: str(self.teeth / f"{name}.ply") for name in ("outer", "dentin")}
-        return self._phantom("tooth", self.effort.tooth_mm, self.effort.photo_samples, cameras=3, lights=18, channels=3, **meshes)
+    def _incisor(self) -> dict[str, Any]:
+        # The scanned one turned upright, towards the cameras of its own capture.
+        if self.scan is None:
+            return {}
+        files = {name: self.work / "incisor" / f"{name}.ply" for name in ("outer", "dentin")}
+        if not all(file.is_file() for file in files.values()):
+            description = read_record(self.scan / "capture.json", FolderCapture)
+            towards = np.mean([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in description.cameras], axis=0)
+            (tooth,) = (self.scan / "teeth").iterdir()
+            for name, mesh in tooth_surfaces(tooth / "outer.ply", tooth / "dentin.ply", tuple(towards.tolist())).items():
+                write_mesh(files[name], mesh)
+        return {name: str(file) for name, file in files.items()}
 
-    def isolated(self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], **job: Any) -> Case:
-        """A fit of it with known dentin."""
-        options = {"dentin": "known", "pixel_step": self.effort.step} | dict(self.effort.tooth_job) | job
-        return Case(name, self.tooth, cameras, fitted, lights, options)
+    def _isolated(self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], channels: int = 1) -> Case:
+        # A fit of an isolated tooth with known dentin, three cameras and eighteen lights.
+        capture = self._phantom(f"tooth{channels}", self.effort.tooth_mm, self.effort.photo_samples, cameras=3, lights=18, channels=channels, **self._incisor())
+        return Case(name, capture, cameras, fitted, lights, {"dentin": "known", "pixel_step": self.effort.step} | dict(self.effort.tooth_job))
 
     @property
     def front(self) -> Case:
         """Fitted from the front, with front lights."""
-        return self.isolated("front", ("c1", "c2"), ("c1",), FRONT_LIGHTS, channels=["green"])
+        return self._isolated("front", ("c1", "c2"), ("c1",), FRONT_LIGHTS)
 
     @property
     def five_lights(self) -> Case:
         """Fitted to three cameras and five lights, in colour."""
         cameras = ("c0", "c1", "c2")
-        return self.isolated("five-lights", cameras, cameras, FIVE_LIGHTS)
+        return self._isolated("five-lights", cameras, cameras, FIVE_LIGHTS, channels=3)
 
     @property
     def two_cameras(self) -> Case:
         """Fitted to two cameras of three."""
-        return self.isolated("two-cameras", ("c0", "c1", "c2"), ("c1", "c2"), FIVE_LIGHTS, channels=["green"])
+        return self._isolated("two-cameras", ("c0", "c1", "c2"), ("c1", "c2"), FIVE_LIGHTS)
 
     @property
     def stained(self) -> Case:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -27,12 +26,14 @@ class Drawn:
     caption: str
 
 
-def front_and_side(cast: Cast, work: Path) -> Drawn:
+def front_and_side(cast: Cast) -> Drawn:
     """Fig. 8: nine front lights fitted; a side view and nine side lights were not."""
-    comparisons = Fitted(cast.front.fitted(work)).compared(cast.effort.shown_samples)
+    comparisons = Fitted(cast.front.fitted(cast.work)).compared(cast.effort.shown_samples)
     groups = [("c1", FRONT_LIGHTS), ("c2", FRONT_LIGHTS), ("c1", SIDE_LIGHTS)]
     rows = [[drawn for camera, lights in groups for drawn in _drawn(comparisons, (camera, lights[n]))] for n in range(len(FRONT_LIGHTS))]
-    columns = [Column(name, name == "photo") for _ in groups for name in ("photo", "fit", "difference")]
+    columns = [
+        column for name in ("front view", "side view", "side lights") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+    ]
     errors = [error_of(comparisons, [(camera, light) for light in lights]) for camera, lights in groups]
     return Drawn(
         mosaic(rows, columns, scale=2),
@@ -41,9 +42,9 @@ def front_and_side(cast: Cast, work: Path) -> Drawn:
     )
 
 
-def stages(cast: Cast, work: Path) -> Drawn:
+def stages(cast: Cast) -> Drawn:
     """Fig. 9: a homogeneous tooth, both media, with stains, beside the photograph."""
-    fitted = Fitted(cast.stained.fitted(work))
+    fitted = Fitted(cast.stained.fitted(cast.work))
     (channel,) = fitted.channels
     homogeneous = similar_tissue(fitted.stage_tissue(channel, "homogeneous"), SIMILAR_G)
     found = [
@@ -75,9 +76,9 @@ def stages(cast: Cast, work: Path) -> Drawn:
     )
 
 
-def five_lights(cast: Cast, work: Path) -> Drawn:
+def five_lights(cast: Cast) -> Drawn:
     """Fig. 10: three cameras and five lights fitted, five lights unseen."""
-    comparisons, cameras = Fitted(cast.five_lights.fitted(work)).compared(cast.effort.shown_samples), ("c0", "c1", "c2")
+    comparisons, cameras = Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples), ("c0", "c1", "c2")
     rows = [
         [drawn for lights in (FIVE_LIGHTS, FIVE_OTHERS) for camera in cameras for drawn in _drawn(comparisons, (camera, lights[n]), difference=False)]
         for n in range(len(FIVE_LIGHTS))
@@ -91,12 +92,12 @@ def five_lights(cast: Cast, work: Path) -> Drawn:
     )
 
 
-def unseen_camera(cast: Cast, work: Path) -> Drawn:
+def unseen_camera(cast: Cast) -> Drawn:
     """Fig. 13: two cameras fitted, the third is shown."""
-    comparisons = Fitted(cast.two_cameras.fitted(work)).compared(cast.effort.shown_samples)
+    comparisons = Fitted(cast.two_cameras.fitted(cast.work)).compared(cast.effort.shown_samples)
     rows = [[drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))] for light in FIVE_LIGHTS]
     columns = [
-        Column(f"{camera}: photo" if name == "photo" else name, name == "photo") for camera in ("c0", "c1", "c2") for name in ("photo", "fit", "difference")
+        column for name in ("c0, not fitted", "c1, fitted", "c2, fitted") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
     ]
     seen, unseen = (error_of(comparisons, [(camera, light) for camera in cameras for light in FIVE_LIGHTS]) for cameras in (("c1", "c2"), ("c0",)))
     return Drawn(
@@ -106,13 +107,13 @@ def unseen_camera(cast: Cast, work: Path) -> Drawn:
     )
 
 
-def whole_jaw(cast: Cast, work: Path, subject: int) -> Drawn:
+def whole_jaw(cast: Cast, subject: int) -> Drawn:
     """Figs. 11 and 12: all teeth of a jaw, three views."""
-    return _jaw(cast, cast.jaw(subject), work)
+    return _jaw(cast, cast.jaw(subject))
 
 
-def _jaw(cast: Cast, case: Case, work: Path) -> Drawn:
-    fitted = Fitted(case.fitted(work))
+def _jaw(cast: Cast, case: Case) -> Drawn:
+    fitted = Fitted(case.fitted(cast.work))
     comparisons = fitted.compared(cast.effort.shown_samples)
     shown = [(camera, light) for camera in ("c0", "c1", "c2") for light in ("l0", "l3")]
     rows = [_drawn(comparisons, image) for image in shown]

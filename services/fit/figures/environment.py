@@ -28,13 +28,13 @@ def memorial() -> Path | None:
     return path if path.is_file() else None
 
 
-def under_an_environment(cast: Cast, work: Path) -> Drawn:
+def under_an_environment(cast: Cast) -> Drawn:
     """The tooth of Fig. 10 under an environment from three sides, without and with its mirror image.
 
     Raises:
         InputError: there is no environment.
     """
-    fitted = Fitted(cast.five_lights.fitted(work))
+    fitted = Fitted(cast.five_lights.fitted(cast.work))
     environment = read_environment(memorial() or MEMORIAL)
     (tooth,), (dentin,) = fitted.observations.teeth, fitted.dentins()
     surfaces = {"outer": tooth.outer} | ({} if dentin is None else {"dentin": Mesh(dentin.vertices_mm(fitted.report.shape), dentin.base.faces)})
