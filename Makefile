@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo gallery test test-all lint bench dashboard setup
+.PHONY: demo gallery figures test test-all lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -9,6 +9,9 @@ demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and repor
 
 gallery: setup ## pictures of a tooth in an ordinary scene, in gallery/, some minutes
 	@$(BIN)/python -m services.fit.gallery --out gallery
+
+figures: setup ## the figures of teeth 2018 from fits of this project's own, in figures/, tens of minutes
+	@$(BIN)/python -m services.fit.figures --out figures
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
 	@deploy/setup.sh dashboard browser

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -78,6 +78,6 @@ def _a_decade(low: float, high: float) -> tuple[float, float]:
     return low / wider, high * wider
 
 
-def write_png(figure: Figure, path: Path) -> None:
+def write_png(figure: Figure, path: Path | BinaryIO) -> None:
     """Render without a display."""
     FigureCanvasAgg(figure).print_png(path)

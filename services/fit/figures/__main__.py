@@ -1,0 +1,88 @@
+"""Figures of teeth 2018 by this project's own fits: ``python -m services.fit.figures --out DIR``.
+
+Each figure is a PNG with its caption beside it, and ``index.html`` shows all that are there. Captures and fits are made once, by the command line, and
+kept below ``DIR/work``; what is finished is used again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+
+from services.core.errors import DentineError, InputError
+from services.core.store import write_atomic
+from services.fit.bench.tooth_capture import real_tooth
+from services.fit.export.pictures import png_bytes
+from services.fit.figures.ambient import under_ambient_light
+from services.fit.figures.cast import FULL, QUICK, Cast
+from services.fit.figures.drawings import Drawn, caption_page, five_lights, front_and_side, stages, unseen_camera, whole_jaw
+from services.fit.figures.environment import memorial, under_an_environment
+
+Drawing = Callable[[Cast], Drawn]
+
+FIGURES: Mapping[str, Drawing] = MappingProxyType(
+    {
+        "fig8": front_and_side,
+        "fig9": stages,
+        "fig10": five_lights,
+        "fig11": partial(whole_jaw, subject=1),
+        "fig12": partial(whole_jaw, subject=2),
+        "fig13": unseen_camera,
+        "environment": under_an_environment,
+        "ambient": under_ambient_light,
+    }
+)
+"""By name, numbered as in teeth 2018."""
+
+
+def chosen_figures(names: str | None) -> tuple[str, ...]:
+    """Of a list of names with commas, in the order of the paper; all without one.
+
+    Raises:
+        InputError: there is no such figure.
+    """
+    asked = tuple(FIGURES) if names is None else tuple(filter(None, (name.strip() for name in names.split(","))))
+    for name in asked:
+        if name not in FIGURES:
+            raise InputError(f"Figure '{name}' does not exist; known are {', '.join(FIGURES)}.")
+    if not asked:
+        raise InputError(f"Option --only names no figure; known are {', '.join(FIGURES)}.")
+    return tuple(name for name in FIGURES if name in asked)
+
+
+def keep(folder: Path, name: str, drawn: Drawn) -> None:
+    """Write a figure and its caption, and the page of all that are there."""
+    write_atomic(folder / f"{name}.png", png_bytes(drawn.picture))
+    write_atomic(folder / f"{name}.txt", (drawn.caption + "\n").encode())
+    present = [(one, (folder / f"{one}.txt").read_text().strip()) for one in FIGURES if (folder / f"{one}.txt").is_file()]
+    write_atomic(folder / "index.html", caption_page(present).encode())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make figures; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m services.fit.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the figures (default: figures)")
+    parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas (default: all)")
+    parser.add_argument("--quick", action="store_true", help="smaller captures and fits of few samples, for a check")
+    options = parser.parse_args(arguments)
+    try:
+        names, cast = chosen_figures(options.only), Cast(QUICK if options.quick else FULL, options.out / "work", real_tooth())
+        cast.work.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            if name == "environment" and memorial() is None:
+                print("environment: skipped, because hdr-memorial does not lie in shared/data beside the checkout.", flush=True)
+                continue
+            keep(options.out, name, FIGURES[name](cast))
+            print(options.out / f"{name}.png", flush=True)
+    except DentineError as problem:
+        print(f"figures: {problem.message}", file=sys.stderr)
+        return problem.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,141 @@
+"""How far light from all around, which the model of a capture does not know, moves what a fit finds (teeth 2018, section 7)."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.meshfiles import read_mesh
+from services.core.records import FitReport, FolderCapture
+from services.core.store import read_record
+from services.fit.anatomy.reflection import ROUGHNESS
+from services.fit.bench.tooth_capture import tissue_of
+from services.fit.figures.cases import Case
+from services.fit.figures.cast import Cast
+from services.fit.figures.drawings import Drawn
+from services.fit.figures.fitted import Fitted
+from services.fit.figures.surroundings import seen_under
+
+CHANNEL = "green"
+AMBIENT_SAMPLES = 256
+QUANTITIES = tuple(f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "absorption_share"))
+"""Reduced scattering, per mm, and 1 - alpha'."""
+
+Row = dict[str, Any]
+
+
+def under_ambient_light(cast: Cast) -> Drawn:
+    """A fit of one view with constant light from all around added to its photographs."""
+    rows = ambient_rows(cast)
+    return Drawn(
+        plot(rows),
+        f"A procedural incisor of known dentin from one side, with constant light from all around added to every photograph, its mirror "
+        f"image included. {sentence(rows)}",
+    )
+
+
+def ambient_rows(cast: Cast) -> list[Row]:
+    """A fit for each strength of ambient light, none first.
+
+    Returns:
+        Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and ``value``, ``se`` and ``truth`` by quantity.
+    """
+    case = cast.lone_view
+    source = case.capture.rendered(cast.work)
+    media = json.loads((source / "truth.json").read_text())["channels"][CHANNEL]
+    rows = []
+    for fraction in cast.effort.ambient:
+        folder = case.fitted_with(cast.work, _added(source, case, fraction), f"-ambient-{fraction:g}") if fraction else case.fitted(cast.work)
+        rows.append({"fraction": fraction} | described(Fitted(folder).report, media))
+    return rows
+
+
+def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.float64]]:
+    # By camera, of the true media; kept beside the capture, as it serves every strength.
+    kept = source.with_name(f"{source.name}-around.npz")
+    description = read_record(source / "capture.json", FolderCapture)
+    if not kept.is_file():
+        truth = json.loads((source / "truth.json").read_text())
+        media = truth["channels"][CHANNEL]
+        tissue = tissue_of({f"{part}.{leaf}": value for part in media for leaf, value in media[part].items()})
+        (tooth,) = (source / "teeth").iterdir()
+        surfaces = {path.stem: read_mesh(path) for path in sorted(tooth.glob("*.ply"))}
+        options = {"samples": AMBIENT_SAMPLES, "boundary": truth["boundary"], "ior": truth["ior"], "roughness": ROUGHNESS}
+        constant = {"type": "constant", "radiance": 1.0}
+        around = {c.name: seen_under(constant, surfaces, tissue, c, **options) for c in description.cameras if c.name in case.cameras}
+        np.savez(kept, allow_pickle=False, **around)
+    channel = description.channels.index(CHANNEL)
+    fitted = [np.load(source / image.file)[..., channel] for image in description.images if case.is_fitted(image.camera, image.light)]
+    mean = float(np.concatenate([image[image > 0] for image in fitted]).mean())
+    with np.load(kept) as stored:
+        # The surroundings themselves are seen beside the tooth and are masked in a capture.
+        on_tooth = {camera: np.where(_tooth_pixels(source, description, camera), stored[camera], 0.0) for camera in stored.files}
+    return {camera: fraction * mean * image / image[image > 0].mean() for camera, image in on_tooth.items()}
+
+
+def _tooth_pixels(source: Path, description: FolderCapture, camera: str) -> NDArray[np.bool_]:
+    return np.any([np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera], axis=0)
+
+
+def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Row:
+    """What a fit found of each quantity beside the truth."""
+    row: Row = {"fit_error": report.fit_error[CHANNEL], "held_out_error": report.held_out_error[CHANNEL]}
+    for quantity in QUANTITIES:
+        part, leaf = quantity.split(".")
+        if leaf == "absorption_share":
+            found, true = report.parameters[CHANNEL][f"{part}.alpha_reduced"], media[part]["alpha_reduced"]
+            row[quantity] = {"value": 1 - found.value, "se": found.se, "truth": 1 - true}
+        else:
+            found = report.parameters[CHANNEL][quantity]
+            row[quantity] = {"value": found.value, "se": found.se, "truth": media[part][leaf]}
+    return row
+
+
+def moved(row: Row, without: Row, quantity: str) -> float:
+    """Relative change against the fit without ambient light."""
+    return float(row[quantity]["value"] / without[quantity]["value"] - 1)
+
+
+def sentence(rows: Sequence[Row]) -> str:
+    """How far each quantity moved."""
+    parts = []
+    for row in rows[1:]:
+        changes = ", ".join(f"{100 * moved(row, rows[0], quantity):+.0f} %" for quantity in QUANTITIES)
+        parts.append(f"{100 * row['fraction']:.0f} % of the mean radiance: {changes}, held-out error {100 * row['held_out_error']:.1f} %")
+    return f"Change of σs' and 1 − α' of enamel and of dentin by {'; '.join(parts)}; without it {100 * rows[0]['held_out_error']:.1f} %."
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The same as a table in Markdown, with errors and truth."""
+    head = "| ambient light | σs' enamel, per mm | 1 − α' enamel | σs' dentin, per mm | 1 − α' dentin | fit | held out |\n|---|---|---|---|---|---|---|\n"
+    lines = ["| truth | " + " | ".join(f"{rows[0][quantity]['truth']:.3g}" for quantity in QUANTITIES) + " | | |"]
+    for row in rows:
+        found = " | ".join(f"{row[q]['value']:.3g}" + ("" if row[q]["se"] is None else f" ± {row[q]['se']:.1g}") for q in QUANTITIES)
+        lines.append(f"| {100 * row['fraction']:.0f} % | {found} | {100 * row['fit_error']:.1f} % | {100 * row['held_out_error']:.1f} % |")
+    return head + "\n".join(lines) + "\n"
+
+
+def plot(rows: Sequence[Row]) -> NDArray[np.uint8]:
+    """Found over true, with standard errors, against the strength of the ambient light."""
+    from PIL import Image
+
+    from services.fit.bench.plots import grid, write_png
+
+    figure, axes = grid(2)
+    for one, leaf in zip(axes, ("sigma_s_reduced", "absorption_share"), strict=True):
+        for part in ("enamel", "dentin"):
+            found = [row[f"{part}.{leaf}"] for row in rows]
+            values, errors = (np.array([(point[key] or 0.0) / point["truth"] for point in found]) for key in ("value", "se"))
+            one.errorbar([100 * row["fraction"] for row in rows], values, errors, marker="o", capsize=3, label=part)
+        one.axhline(1.0, color="0.6", linewidth=1)
+        one.set(title="σs'" if leaf == "sigma_s_reduced" else "1 − α'", xlabel="ambient light, % of the mean radiance", ylabel="found over true")
+        one.legend()
+    stream = io.BytesIO()
+    write_png(figure, stream)
+    return np.asarray(Image.open(stream).convert("RGB"))

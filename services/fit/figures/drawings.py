@@ -1,0 +1,150 @@
+"""The figures of teeth 2018 that compare fits with photographs, each with its errors in its caption."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
+from services.fit.figures.cases import Case
+from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, JAW_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
+from services.fit.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
+from services.fit.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
+from services.fit.optics.domain import similar_tissue
+from services.fit.schedule import SIMILAR_G
+
+DIFFERENCE = f"Differences are fit minus photograph, blue to orange within ±{100 * RESIDUAL_LIMIT:.0f} % of white."
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure and what is said below it."""
+
+    picture: Image8
+    caption: str
+
+
+def front_and_side(cast: Cast) -> Drawn:
+    """Fig. 8: nine front lights fitted; a side view and nine side lights were not."""
+    comparisons = Fitted(cast.front.fitted(cast.work)).compared(cast.effort.shown_samples)
+    groups = [("c1", FRONT_LIGHTS), ("c2", FRONT_LIGHTS), ("c1", SIDE_LIGHTS)]
+    rows = [[drawn for camera, lights in groups for drawn in _drawn(comparisons, (camera, lights[n]))] for n in range(len(FRONT_LIGHTS))]
+    columns = [
+        column for name in ("front view", "side view", "side lights") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+    ]
+    errors = [error_of(comparisons, [(camera, light) for light in lights]) for camera, lights in groups]
+    return Drawn(
+        mosaic(rows, columns, scale=2),
+        f"An isolated tooth ({cast.tooth_name}) of known dentin, fitted to nine front lights of one camera (left): error {_percent(errors[0])}. Not fitted: "
+        f"a side view under the same lights (centre) {_percent(errors[1])}, and nine side lights (right) {_percent(errors[2])}. {DIFFERENCE}",
+    )
+
+
+def stages(cast: Cast) -> Drawn:
+    """Fig. 9: a homogeneous tooth, both media, with stains, beside the photograph."""
+    fitted = Fitted(cast.stained.fitted(cast.work))
+    (channel,) = fitted.channels
+    homogeneous = similar_tissue(fitted.stage_tissue(channel, "homogeneous"), SIMILAR_G)
+    found = [
+        fitted.compared(cast.effort.shown_samples, optics)
+        for optics in ({channel: homogeneous}, {channel: fitted.stage_tissue(channel, "exact")}, {channel: fitted.optics(channel)})
+    ]
+    names = ("homogeneous", "both media", "with stains")
+    shown = [("c0", "l0"), ("c1", "l1"), ("c0", "l6"), ("c1", "l3")]
+    rows = []
+    for image in shown:
+        pictures = [cropped(one[image].picture) for one in found]
+        photo, valid = pictures[0].photo, pictures[0].valid
+        white = white_level(photo, valid)
+        drawn = [tone_map(np.where(valid[..., None], picture.render, 0.0), white) for picture in pictures]
+        rows.append(
+            [*drawn, tone_map(np.where(valid[..., None], photo, 0.0), white), *(signed_map(p.residual, RESIDUAL_LIMIT * white, valid) for p in pictures)]
+        )
+    images = [(camera, light) for camera in ("c0", "c1") for light in SPREAD_LIGHTS]
+    others = [image for image in found[0] if image not in images]
+    losses = [loss_of(one, images) for one in found]
+    heads = [f"{name}: {loss:.3f}" for name, loss in zip(names, losses, strict=True)]
+    columns = [*(Column(head) for head in heads), Column("photograph", starts_group=True), *(Column(name, name == names[0]) for name in names)]
+    unseen = ", ".join(_percent(error_of(one, others)) for one in found)
+    return Drawn(
+        mosaic(rows, columns, [f"{camera} {light}" for camera, light in shown], scale=4),
+        f"Stages of the fit of a stained incisor beside the photograph, and their differences to it. The number is the loss, the relative squared error of all "
+        f"fitted images with their noise; it falls by {_percent(1 - losses[1] / losses[0])} and {_percent(1 - losses[2] / losses[1])}. Error on the "
+        f"{len(others)} images that were not fitted: {unseen}. Light l3 was not fitted. {DIFFERENCE}",
+    )
+
+
+def five_lights(cast: Cast) -> Drawn:
+    """Fig. 10: three cameras and five lights fitted, five lights unseen."""
+    comparisons, cameras = Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples), ("c0", "c1", "c2")
+    rows = [
+        [drawn for lights in (FIVE_LIGHTS, FIVE_OTHERS) for camera in cameras for drawn in _drawn(comparisons, (camera, lights[n]), difference=False)]
+        for n in range(len(FIVE_LIGHTS))
+    ]
+    columns = [Column(name, name == "photo") for _ in range(2 * len(cameras)) for name in ("photo", "fit")]
+    fit, unseen = (error_of(comparisons, [(camera, light) for camera in cameras for light in lights]) for lights in (FIVE_LIGHTS, FIVE_OTHERS))
+    return Drawn(
+        mosaic(rows, columns, scale=2),
+        f"One tooth in colour ({cast.tooth_name}, dentin known), fitted to three cameras under five lights (left half): error {_percent(fit)}; "
+        f"under five lights that were not fitted (right half): {_percent(unseen)}.",
+    )
+
+
+def unseen_camera(cast: Cast) -> Drawn:
+    """Fig. 13: two cameras fitted, the third is shown."""
+    comparisons = Fitted(cast.two_cameras.fitted(cast.work)).compared(cast.effort.shown_samples)
+    rows = [[drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))] for light in FIVE_LIGHTS]
+    columns = [
+        column for name in ("c0, not fitted", "c1, fitted", "c2, fitted") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+    ]
+    seen, unseen = (error_of(comparisons, [(camera, light) for camera in cameras for light in FIVE_LIGHTS]) for cameras in (("c1", "c2"), ("c0",)))
+    return Drawn(
+        mosaic(rows, columns, FIVE_LIGHTS, scale=3),
+        f"Two cameras fitted (c1 and c2, five lights; {cast.tooth_name}, dentin known), the third (c0, left) was not: error {_percent(seen)} on the fitted "
+        f"ones, {_percent(unseen)} on the third, a ratio of {unseen / max(seen, 1e-9):.2f}. {DIFFERENCE}",
+    )
+
+
+def whole_jaw(cast: Cast, subject: int) -> Drawn:
+    """Figs. 11 and 12: all teeth of a jaw, three views."""
+    return _jaw(cast, cast.jaw(subject))
+
+
+def _jaw(cast: Cast, case: Case) -> Drawn:
+    fitted = Fitted(case.fitted(cast.work))
+    comparisons = fitted.compared(cast.effort.shown_samples)
+    shown = [(camera, light) for camera in ("c0", "c1", "c2") for light in ("l0", "l3")]
+    rows = [_drawn(comparisons, image) for image in shown]
+    columns = [Column(name) for name in ("photo", "fit", "difference")]
+    images = [[image for image in comparisons if (image[1] in JAW_LIGHTS) == is_fitted] for is_fitted in (True, False)]
+    fit, unseen = (error_of(comparisons, some) for some in images)
+    states = [tooth.state for tooth in fitted.report.teeth.values()]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("fitted", "tied", "failed") if state in states)
+    return Drawn(
+        mosaic(rows, columns, [" ".join(image) for image in shown], scale=4),
+        f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, three views under two of five fitted lights: error "
+        f"{_percent(fit)} on all fitted images, {_percent(unseen)} under the light that was not fitted. {DIFFERENCE}",
+    )
+
+
+def _drawn(comparisons: Comparisons, image: Image, *, difference: bool = True) -> Sequence[Image8]:
+    return photo_and_fit(cropped(comparisons[image].picture), difference=difference)
+
+
+def _percent(error: float) -> str:
+    return f"{100 * error:.1f} %"
+
+
+def caption_page(captions: Iterable[tuple[str, str]]) -> str:
+    """A page of all figures: file name without its ending, and caption."""
+    from html import escape
+
+    parts = [
+        f'<figure><img src="{escape(name)}.png" alt="{escape(name)}"><figcaption><b>{escape(name)}</b> {escape(text)}</figcaption></figure>'
+        for name, text in captions
+    ]
+    style = "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto}img{max-width:100%}figure{margin:0 0 3em}"
+    head = f"<!doctype html><html lang='en'><meta charset='utf-8'><title>Figures</title><style>{style}</style>"
+    return f"{head}<body>{''.join(parts)}</body></html>\n"

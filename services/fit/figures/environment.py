@@ -1,0 +1,73 @@
+"""Fitted teeth in other light than a dome's: under a photographed environment, with the highlights that a fit leaves out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from services.core.geometry import Camera, Mesh
+from services.fit.anatomy.reflection import ROUGHNESS
+from services.fit.export.pictures import tone_map, white_level
+from services.fit.figures.cast import Cast
+from services.fit.figures.drawings import Drawn
+from services.fit.figures.fitted import Fitted
+from services.fit.figures.mosaic import Column, mosaic
+from services.fit.figures.surroundings import environment_light, read_environment, seen_under
+from services.fit.gallery import SIMILAR_G
+from services.fit.optics.domain import similar_tissue
+from services.fit.optics.parameters import Tissue
+
+MEMORIAL = Path("shared") / "data" / "hdr-memorial" / "memorial.hdr"
+TURNS_DEGREES = (0.0, 120.0, 240.0)
+
+
+def memorial() -> Path | None:
+    """The environment, where this data lies beside the checkout."""
+    path = Path(__file__).resolve().parents[4] / MEMORIAL
+    return path if path.is_file() else None
+
+
+def under_an_environment(cast: Cast) -> Drawn:
+    """The tooth of Fig. 10 under an environment from three sides, without and with its mirror image.
+
+    Raises:
+        InputError: there is no environment.
+    """
+    fitted = Fitted(cast.five_lights.fitted(cast.work))
+    environment = read_environment(memorial() or MEMORIAL)
+    (tooth,), (dentin,) = fitted.observations.teeth, fitted.dentins()
+    surfaces = {"outer": tooth.outer} | ({} if dentin is None else {"dentin": Mesh(dentin.vertices_mm(fitted.report.shape), dentin.base.faces)})
+    camera = finer(fitted.observations.manifest.cameras[1], cast.effort.environment_px)
+    rows = []
+    for roughness in (None, ROUGHNESS):
+        images = []
+        for turn in TURNS_DEGREES:
+            channels = []
+            for k, channel in enumerate(fitted.channels):
+                tissue = fitted.optics(channel)
+                assert isinstance(tissue, Tissue)
+                options = {"samples": cast.effort.environment_samples, "boundary": fitted.spec.boundary, "ior": fitted.spec.ior, "roughness": roughness}
+                light = environment_light(environment[..., k], turn)
+                channels.append(seen_under(light, surfaces, similar_tissue(tissue, SIMILAR_G), camera, **options))  # type: ignore[arg-type]
+            images.append(np.stack(channels, axis=-1))
+        rows.append(images)
+    width, height = camera.size
+    middle = np.zeros((height, width), dtype=bool)
+    middle[height // 4 : 3 * height // 4, width // 3 : 2 * width // 3] = True
+    pictures = [[tone_map(image, white_level(rows[-1][k], middle)) for k, image in enumerate(row)] for row in rows]
+    columns = [Column(f"turned by {turn:.0f} degrees") for turn in TURNS_DEGREES]
+    return Drawn(
+        mosaic(pictures, columns, ["fitted", "with GGX"], scale=1),
+        f"The tooth of fig10 ({cast.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph wrapped around it, turned three ways; "
+        f"above as a fit sees teeth, below with the mirror image in its enamel put back (GGX, roughness {ROUGHNESS:g}). "
+        f"By similar media of mean cosine {SIMILAR_G:g}.",
+    )
+
+
+def finer(camera: Camera, height_px: int) -> Camera:
+    """The same camera with pixels so small that its image has about this height."""
+    factor = height_px / camera.size[1]
+    size = (max(round(camera.size[0] * factor), 1), max(round(camera.size[1] * factor), 1))
+    K = np.diag([factor, factor, 1.0]) @ np.asarray(camera.K)
+    return camera.model_copy(update={"size": size, "K": tuple(tuple(float(v) for v in row) for row in K)})

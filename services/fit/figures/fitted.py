@@ -1,0 +1,151 @@
+"""A finished fit, rendered anew beside its photographs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.records import FitReport, JobSpec
+from services.core.store import open_stage
+from services.fit.bench.tooth_capture import tissue_of
+from services.fit.driver import dentin_shape
+from services.fit.evaluate import ErrorSums, error_sums
+from services.fit.export.pictures import Picture
+from services.fit.export.stains import kept_stains
+from services.fit.figures.cases import job_of
+from services.fit.jaw_driver import fixed_dentin, known_dentin
+from services.fit.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
+from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import DentinShape, View
+
+Image = tuple[str, str]
+"""Camera and light."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An image beside its photograph, and the sums of its error."""
+
+    picture: Picture
+    sums: ErrorSums
+
+
+Comparisons = Mapping[Image, Comparison]
+
+
+def error_of(comparisons: Comparisons, images: Iterable[Image]) -> float:
+    """Relative error over some images, both noises taken out; not below what the samples resolve."""
+    total = sum((comparisons[image].sums for image in images), ErrorSums())
+    return total.resolved_error or 0.0
+
+
+def loss_of(comparisons: Comparisons, images: Iterable[Image]) -> float:
+    """Relative squared error over some images, the photographs' noise included."""
+    return sum((comparisons[image].sums for image in images), ErrorSums()).loss or 0.0
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A case's fit of one tooth or of a jaw."""
+
+    folder: Path
+
+    @cached_property
+    def spec(self) -> JobSpec:
+        """Its options, with every pixel in place of every n-th: what is shown was not all fitted."""
+        return job_of(self.folder)[1].model_copy(update={"pixel_step": 1})
+
+    @cached_property
+    def _stage(self) -> tuple[Path, FitReport]:
+        return open_stage(job_of(self.folder)[0], "fit", FitReport)
+
+    @property
+    def report(self) -> FitReport:
+        """What it found."""
+        return self._stage[1]
+
+    @cached_property
+    def observations(self) -> Observations:
+        """What it saw, a jaw's teeth with the dentin that was assumed."""
+        found = read_observations(job_of(self.folder)[0], self.spec)
+        if self.spec.kind == "tooth":
+            return found
+        teeth = (fixed_dentin(tooth, found.manifest.cameras, self.spec) for tooth in found.teeth)
+        layered = {fdi for fdi, tooth in self.report.teeth.items() if all("dentin.sigma" in table for table in tooth.parameters.values())}
+        return replace(found, teeth=tuple(tooth if str(tooth.fdi) in layered else replace(tooth, dentin=None) for tooth in teeth))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Those that were fitted."""
+        return tuple(self.report.parameters)
+
+    def optics(self, channel: str) -> Tissue | Mouth:
+        """As reported."""
+        values = {name: estimate.value for name, estimate in self.report.parameters[channel].items()}
+        if self.spec.kind == "tooth":
+            stains = kept_stains(self._stage[0])
+            return replace(tissue_of(values), shape=self.report.shape, stain=None if stains is None else stains.textures.get(channel))
+        teeth = [self.report.teeth[str(tooth.fdi)].parameters[channel] for tooth in self.observations.teeth]
+        gums = tissue_of({f"enamel.{leaf}": values[f"gums.{leaf}"] for leaf in MEDIUM_FIELDS}).enamel if "gums.sigma" in values else None
+        return Mouth(tuple(tissue_of({name: one.value for name, one in table.items()}) for table in teeth), gums, values.get("cavity.reflectance"))
+
+    def stage_tissue(self, channel: str, stage: str) -> Tissue:
+        """A tooth's media as a stage ended."""
+        history = json.loads((self._stage[0] / "history.json").read_text())
+        return replace(tissue_of([step for step in history if (step["channel"], step["stage"]) == (channel, stage)][-1]["parameters"]), shape=self.report.shape)
+
+    def dentins(self) -> list[DentinShape | None]:
+        """Of each tooth."""
+        if self.spec.kind == "tooth":
+            (tooth,) = self.observations.teeth
+            return [dentin_shape(tooth, self.observations.manifest.cameras, self.spec)]
+        return [known_dentin(tooth) for tooth in self.observations.teeth]
+
+    def renderer(self, channel: str) -> Engine:
+        """The scene under all lights."""
+        stains = kept_stains(self._stage[0])
+        return Engine(channel_scene(self.observations, channel, self.dentins(), self.spec, None if stains is None else stains.corners_uv))
+
+    def compared(self, samples: int, optics: Mapping[str, Tissue | Mouth] | None = None, cameras: tuple[str, ...] | None = None) -> dict[Image, Comparison]:
+        """Every image of some cameras under all lights beside its photograph.
+
+        Args:
+            samples: paths per pixel of each of two renders; their mean is shown.
+            optics: by channel, instead of what was reported.
+            cameras: default all.
+        """
+        channels = [self._channel(channel, samples, self.optics(channel) if optics is None else optics[channel], cameras) for channel in self.channels]
+        return {image: _merged([found[image] for found in channels]) for image in channels[0]}
+
+    def _channel(self, channel: str, samples: int, optics: Tissue | Mouth, cameras: tuple[str, ...] | None) -> dict[Image, Comparison]:
+        engine, found = self.renderer(channel), {}
+        for number, view in enumerate(read_channel(self.observations, channel, self.spec)):
+            if cameras is None or view.camera.name in cameras:
+                first, second = (engine.images(optics, View(view.camera, view.pixels), samples=samples, seed=7001 + 2 * number + k).mean for k in range(2))
+                for light, record in enumerate(self.observations.manifest.lights):
+                    found[view.camera.name, record.name] = _comparison(view, record.name, light, first[light], second[light])
+        return found
+
+
+def _comparison(view: ViewStack, name: str, light: int, first: NDArray[np.float64], second: NDArray[np.float64]) -> Comparison:
+    width, height = view.camera.size
+    photo, render, valid = np.zeros((height, width, 1)), np.zeros((height, width, 1)), np.zeros((height, width), dtype=bool)
+    x, y = view.pixels.T
+    photo[y, x, 0], render[y, x, 0], valid[y, x] = view.reference[light], 0.5 * (first + second), view.valid[light]
+    sums = error_sums(first, second, view.reference[light], view.variance[light], view.valid[light])
+    return Comparison(Picture(view.camera.name, name, bool(view.held_out[light]), photo, render, valid), sums)
+
+
+def _merged(channels: list[Comparison]) -> Comparison:
+    # One picture of all channels.
+    pictures = [one.picture for one in channels]
+    photo, render = (np.concatenate([getattr(picture, name) for picture in pictures], axis=-1) for name in ("photo", "render"))
+    valid = np.all([picture.valid for picture in pictures], axis=0)
+    return Comparison(replace(pictures[0], photo=photo, render=render, valid=valid), sum((one.sums for one in channels), ErrorSums()))

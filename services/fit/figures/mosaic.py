@@ -1,0 +1,82 @@
+"""Pictures side by side with names, as one image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from services.core.errors import InputError
+from services.fit.export.pictures import Image8, Picture, signed_map, tone_map, white_level
+
+GAP_PX, HEAD_PX, LINE_PX = 6, 20, 16
+FONT_PX = 13
+RESIDUAL_LIMIT = 0.25
+"""End of a difference's colours, as a fraction of white."""
+PAPER = (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's name; ``starts_group`` leaves room before it."""
+
+    name: str
+    starts_group: bool = False
+
+
+def photo_and_fit(picture: Picture, *, difference: bool = True) -> list[Image8]:
+    """Photograph and fit in the photograph's tone, and fit minus photograph in blue and orange."""
+    white = white_level(picture.photo, picture.valid)
+    drawn = [tone_map(np.where(picture.valid[..., None], image, 0.0), white) for image in (picture.photo, picture.render)]
+    return drawn + ([signed_map(picture.residual, RESIDUAL_LIMIT * white, picture.valid)] if difference else [])
+
+
+def mosaic(rows: Sequence[Sequence[Image8 | None]], columns: Sequence[Column], names: Sequence[str] = (), *, scale: int = 3) -> Image8:
+    """Rows of pictures (H, W, 3), each pixel ``scale`` pixels wide; smaller ones are centred in their cell.
+
+    Args:
+        rows: None leaves a place empty.
+        columns: one for each picture of a row.
+        names: of the rows, if they have any.
+
+    Raises:
+        InputError: a row has another number of pictures than there are columns, or of rows and names.
+    """
+    if not rows or any(len(row) != len(columns) for row in rows) or (names and len(names) != len(rows)):
+        raise InputError(f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name for each; correct it.")
+    heights = [scale * max((image.shape[0] for image in row if image is not None), default=1) for row in rows]
+    widths = [scale * max((row[k].shape[1] for row in rows if row[k] is not None), default=1) for k in range(len(columns))]  # type: ignore[union-attr]
+    font = ImageFont.load_default(FONT_PX)
+    label_px = GAP_PX + int(max((font.getlength(name) for name in names), default=0))
+    lefts, x = list[int](), label_px + GAP_PX
+    for column, width in zip(columns, widths, strict=True):
+        x += 3 * GAP_PX if column.starts_group and lefts else 0
+        lefts.append(x)
+        x += max(width, int(font.getlength(column.name)) + 2) + GAP_PX
+    page = Image.new("RGB", (x, HEAD_PX + sum(heights) + GAP_PX * len(rows)), PAPER)
+    draw = ImageDraw.Draw(page)
+    for column, left, width in zip(columns, lefts, widths, strict=True):
+        middle = left + max(width, int(font.getlength(column.name)) + 2) // 2
+        draw.text((middle, 2), column.name, fill=(0, 0, 0), font=font, anchor="ma")
+    y = HEAD_PX
+    for number, (row, height) in enumerate(zip(rows, heights, strict=True)):
+        if names:
+            draw.text((GAP_PX, y + height // 2), names[number], fill=(0, 0, 0), font=font, anchor="lm")
+        for image, left, width, column in zip(row, lefts, widths, columns, strict=True):
+            if image is not None:
+                large = Image.fromarray(np.ascontiguousarray(image.repeat(scale, axis=0).repeat(scale, axis=1)))
+                room = max(width, int(font.getlength(column.name)) + 2)
+                page.paste(large, (left + (room - large.width) // 2, y + (height - large.height) // 2))
+        y += height + GAP_PX
+    return np.asarray(page)
+
+
+def cropped(picture: Picture, margin_px: int = 1) -> Picture:
+    """The part around what is valid."""
+    rows, columns = (np.flatnonzero(picture.valid.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return picture
+    window = tuple(slice(max(int(axis[0]) - margin_px, 0), int(axis[-1]) + 1 + margin_px) for axis in (rows, columns))
+    return Picture(picture.camera, picture.light, picture.held_out, picture.photo[window], picture.render[window], picture.valid[window])
