@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,28 +17,45 @@ PLAUSIBLE = (1e-3, 10.0)
 """Radiance of teeth over that of a white diffuser. Real teeth give 0.1 to 1; a unit that is wrong by 1000 moves this by 1e6."""
 ODD_LIGHT = 30.0
 """A light this much brighter or dimmer than the others, against what its calibration says, is told."""
+NAMED = 3
+"""Dark images that are named."""
 CERTAIN = 4.0
 """Standard errors above which an image's light counts as seen."""
 
 
 @dataclass
-class Brightness:
-    """Sums over the images of a capture, one light at a time."""
+class _Sums:
+    # Over one light's pixels: radiance measured, that of a white diffuser, and the cosine at which light falls on it.
+    measured: float = 0.0
+    white: float = 0.0
+    cosine: float = 0.0
 
-    _sums: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
+    @property
+    def ratio(self) -> float:
+        return self.measured / self.white
+
+
+@dataclass
+class Brightness:
+    """Sums over the images of a capture."""
+
     dark: list[tuple[str, str]] = field(default_factory=list)
     """(camera, light) of images in which no tooth is above the noise."""
+    _lights: dict[str, _Sums] = field(default_factory=lambda: defaultdict(_Sums))
 
     def add(self, image: LightImage, footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]) -> bool:
-        """Count the chosen pixels (H, W) of an image; returns whether any light is seen in them."""
-        measured, variance = image.radiance[chosen].astype(np.float64), image.variance[chosen].astype(np.float64)
+        """Count the chosen pixels (H, W) of an image; returns False where there are some and no light is seen in them."""
         if not chosen.any():
             return True
-        if measured.sum() <= CERTAIN * np.sqrt(variance.sum()):
+        measured, variance = (float(values[chosen].sum(dtype=np.float64)) for values in (image.radiance, image.variance))
+        if measured <= CERTAIN * np.sqrt(variance):
             self.dark.append((camera.name, light.name))
             return False
-        white = white_irradiance(footprint, camera, light, chosen).sum() / np.pi * sum(light.intensity)
-        self._sums[light.name].append((float(measured.sum()), float(white)))
+        cosine, distance_mm = _incidence(footprint, camera, light, chosen)
+        sums = self._lights[light.name]
+        sums.measured += measured
+        sums.white += float((cosine / distance_mm**2).sum()) / np.pi * sum(light.intensity)
+        sums.cosine += float(cosine.sum())
         return True
 
     def require_plausible(self) -> None:
@@ -48,7 +64,7 @@ class Brightness:
         Raises:
             CaptureInputError: says by how much.
         """
-        measured, white = (sum(pair[k] for pairs in self._sums.values() for pair in pairs) for k in (0, 1))
+        measured, white = sum(sums.measured for sums in self._lights.values()), sum(sums.white for sums in self._lights.values())
         if white > 0 and not PLAUSIBLE[0] <= measured / white <= PLAUSIBLE[1]:
             raise CaptureInputError(
                 f"Teeth are {measured / white:.2g} times as bright as a white surface in their place would be, where real ones are 0.1 to 1 times; give "
@@ -59,30 +75,23 @@ class Brightness:
         """Sentences on dark images and on lights unlike the others."""
         notes = []
         if self.dark:
-            which = ", ".join(f"camera {camera} under light {light}" for camera, light in self.dark[:3])
-            more = f" and {len(self.dark) - 3} more" if len(self.dark) > 3 else ""
+            which = ", ".join(f"camera {camera} under light {light}" for camera, light in self.dark[:NAMED])
+            more = f" and {len(self.dark) - NAMED} more" if len(self.dark) > NAMED else ""
             notes.append(f"Dark and left out: {which}{more}; check that these lights were on, then capture them again.")
-        ratios = _ratios(self._sums)
+        # Only lights from the front: behind a tooth, what shines through has little to do with a white surface.
+        front = 0.1 * max((sums.cosine for sums in self._lights.values()), default=0.0)
+        ratios = {light: sums.ratio for light, sums in self._lights.items() if sums.cosine > front}
         typical = float(np.median(list(ratios.values()))) if ratios else 1.0
         for light, ratio in ratios.items():
-            factor = ratio / typical
-            if not 1 / ODD_LIGHT <= factor <= ODD_LIGHT:
-                notes.append(f"Teeth under light {light} are {factor:.2g} times as bright as its position and intensity let expect; check both.")
+            if not 1 / ODD_LIGHT <= ratio / typical <= ODD_LIGHT:
+                notes.append(f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity let expect; check both.")
         return tuple(notes)
 
 
-def white_irradiance(footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Irradiance (N,) at the chosen pixels' surface, per mm^2, by a light of unit intensity; shadows are not looked for."""
+def _incidence(footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows are not looked for.
     rows = np.flatnonzero(chosen.any(axis=1))
     band = slice(int(rows[0]), int(rows[-1]) + 1)
     towards = np.asarray(light.position_mm) - footprint.points_mm(camera, band)[chosen[band]].astype(np.float64)
-    distance = np.linalg.norm(towards, axis=-1)
-    cosine = (towards * footprint.normal[chosen]).sum(axis=-1) / distance
-    return np.asarray(np.maximum(cosine, 0) / distance**2, dtype=np.float64)
-
-
-def _ratios(sums: Mapping[str, list[tuple[float, float]]]) -> dict[str, float]:
-    # Only lights from the front: behind a tooth, what shines through has little to do with a white surface.
-    totals = {light: (sum(m for m, _ in pairs), sum(w for _, w in pairs)) for light, pairs in sums.items()}
-    bright = 0.1 * max((white for _, white in totals.values()), default=0.0)
-    return {light: measured / white for light, (measured, white) in totals.items() if white > bright}
+    distance_mm = np.linalg.norm(towards, axis=-1)
+    return np.maximum((towards * footprint.normal[chosen]).sum(axis=-1) / distance_mm, 0), distance_mm

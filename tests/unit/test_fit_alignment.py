@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import create_array
-from services.fit.alignment import Offset, offsets_told, clearest_offset
+from services.fit.alignment import Offset, clearest_offset, offsets_told
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.observations import Observations, ViewStack
 from tests.support.prepared import lights, sphere
