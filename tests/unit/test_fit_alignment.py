@@ -12,6 +12,7 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import create_array
 from services.fit.alignment import Offset, clearest_offset, offsets_told
+from services.fit.blocks import PixelParts
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.observations import Observations, ViewStack
 from tests.support.prepared import lights, sphere
@@ -28,9 +29,14 @@ def ball(right_px: float = 0.0, down_px: float = 0.0, exponent: float = 1.0, flo
 
 
 def compare(
-    root: Path, photo: NDArray[np.float64], render: NDArray[np.float64], noise: float = 0.02, neighbour: float = 0.0
+    root: Path, photo: NDArray[np.float64], render: NDArray[np.float64], noise: float = 0.02, neighbour: float = 0.0, tooth: int | None = None
 ) -> tuple[Offset | None, list[str]]:
-    """Offset and sentences for one camera and one light; ``neighbour`` is the brightness of whatever stands beside the tooth."""
+    """Offset and sentences for one camera and one light.
+
+    Args:
+        neighbour: brightness of whatever stands beside the tooth.
+        tooth: 0 for the left half of the ball, 1 for the right one.
+    """
     pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 400.0), (0.0, 0.0, 0.0, 1.0))
     k = ((1000.0, 0.0, SIZE / 2), (0.0, 1000.0, SIZE / 2), (0.0, 0.0, 1.0))
     camera = Camera(name="c0", size=(SIZE, SIZE), K=k, camera_from_world=pose)
@@ -50,10 +56,11 @@ def compare(
     y, x = np.nonzero(inside)
     pixels = np.stack([x, y], axis=-1).astype(np.int32)
     valid, held_out = np.ones((1, len(x)), dtype=bool), np.zeros(1, dtype=bool)
-    views = (ViewStack(camera, pixels, photo[y, x][None], np.full((1, len(x)), noise**2), valid, held_out),)
+    halves = (x >= SIZE // 2).astype(np.int16)
+    views = (ViewStack(camera, pixels, photo[y, x][None], np.full((1, len(x)), noise**2), valid, held_out, PixelParts(halves, halves)),)
     evaluation = Evaluation(ErrorSums(), ErrorSums(), {("c0", 0): (pixels, render[y, x])})
-    told = offsets_told({"green": evaluation}, {"green": 0.3}, observations, {"green": views}, "the mesh of tooth 11")
-    return clearest_offset(evaluation, observations, views, "green"), told
+    told = offsets_told({"green": evaluation}, {"green": 0.3}, observations, {"green": views}, "the mesh of tooth 11", tooth)
+    return clearest_offset(evaluation, observations, views, "green", tooth), told
 
 
 @pytest.mark.parametrize(("right_mm", "down_mm"), [(2.0, 0.0), (0.0, -2.0), (-1.6, 1.2), (0.9, 0.0)])
@@ -75,6 +82,16 @@ def test_an_offset_is_found_where_the_fit_has_bent_its_media_to_it_and_neighbour
     offset, _ = compare(tmp_path, ball(2.0 / PIXEL_MM), ball(exponent=0.6, floor=0.1), neighbour=0.3)
     assert offset is not None
     assert offset.right_mm == pytest.approx(2.0, abs=PIXEL_MM)
+
+
+def test_one_tooth_of_two_that_lies_elsewhere_is_told_from_the_other(tmp_path: Path) -> None:
+    # Only the right half of the photograph is higher than its mesh.
+    photo = np.where(np.arange(SIZE) < SIZE // 2, ball(), ball(down_px=-1.6 / PIXEL_MM))
+    assert compare(tmp_path / "left", photo, ball(), tooth=0) == (None, [])
+    offset, told = compare(tmp_path / "right", photo, ball(), tooth=1)
+    assert offset is not None
+    assert offset.down_mm == pytest.approx(-1.6, abs=0.5 * PIXEL_MM)
+    assert told[0].split(")")[0].endswith("mm up")
 
 
 @pytest.mark.parametrize(
