@@ -99,8 +99,16 @@ def run(
     if not view.events:
         print("Every stage was published already; nothing ran.", file=sys.stderr)
     report = out / "report.html"
+    if not asset.converged:
+        print(f"The fit did not converge. {asset.advice}", file=sys.stderr)
     if as_json:
-        result = {"held_out_error": asset.held_out_error, "report": str(report), "parameters": str(out / "parameters.json"), "files": list(asset.files)}
+        result = {
+            "converged": asset.converged,
+            "held_out_error": asset.held_out_error,
+            "report": str(report),
+            "parameters": str(out / "parameters.json"),
+            "files": list(asset.files),
+        }
         print(json.dumps(result))
     else:
         print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")

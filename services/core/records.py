@@ -170,6 +170,7 @@ class PreparedManifest(Record):
     cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
     tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
+    notes: tuple[str, ...] = Field(default=(), description="what to know of the capture before trusting a fit of it, one sentence each")
     valid_fraction: float
 
 
@@ -214,6 +215,7 @@ class FitReport(Record):
     teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
     correlations: dict[str, Correlation] = Field(default={}, description="per channel: correlation of the fitted coordinates")
     told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
+    notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
     next_capture: str = Field(default="", description="in plain words, which further light or view would help most; empty where none was looked for")
     seconds: float
 
@@ -224,4 +226,5 @@ class AssetManifest(Record):
     files: tuple[str, ...]
     held_out_error: float = Field(description="mean over channels")
     converged: bool = Field(default=True, description="whether the fit behind it did")
+    advice: str = Field(default="", description="what to do where it did not")
     centre_mm: Vector3 = (0.0, 0.0, 0.0)

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,8 @@ class Attempt:
         folder = self.context.root / CHECKPOINT
         folder.mkdir(parents=True, exist_ok=True)
         journal = Journal(folder / "journal.json", fingerprint(self.spec, self.engine, files), self.writer.require_lease)
+        if journal.set_aside is not None:
+            self.log(f"The checkpoint is damaged or of another job, data or version: it is kept as {journal.set_aside.name} and this fit starts anew.")
         if journal.resumed:
             self.log(f"Attempt {self.context.attempt} continues after {journal.resumed} recorded results.")
         return journal
@@ -103,10 +106,15 @@ class Attempt:
         write_pictures(folder, evaluations, observations.manifest, views)
 
 
+def worst_error(fit: ChannelFit[Any]) -> float:
+    """Relative image error on fitted or on held-out images, whichever is larger."""
+    return max(fit.fit_error, fit.held_out_error or 0.0)
+
+
 def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
     """Whether a fit of these channels counts as converged, and what to do about it."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
-    off = {c: max(fit.fit_error, fit.held_out_error or 0.0) for c, fit in fits.items()}
+    off = {c: worst_error(fit) for c, fit in fits.items()}
     unexplained = [c for c, error in off.items() if error > UNEXPLAINED]
     advice += [f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples." for c in unexplained]
     return not unexplained and all(fit.solution.result.converged for fit in fits.values()), advice
@@ -114,7 +122,7 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
     """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
-    parts = [engine, spec.model_dump_json(exclude={"workers", "capture", "rig"})]
+    parts = [version("dentine"), engine, spec.model_dump_json(exclude={"workers", "capture", "rig"})]
     for channel in files:
         parts += [channel.channel, *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

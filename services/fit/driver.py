@@ -11,8 +11,9 @@ import numpy as np
 
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
+from services.fit.alignment import offsets_told
 from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
-from services.fit.attempt import Attempt, judge
+from services.fit.attempt import Attempt, judge, worst_error
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
 from services.fit.identifiability import NOTHING, correlation, told
@@ -95,10 +96,15 @@ class FitDriver:
         journal: Journal,
         seconds: float,
     ) -> FitReport:
-        self.attempt.write_records(journal, observations, {c: fit.evaluation for c, fit in fits.items()}, views)
+        evaluations = {c: fit.evaluation for c, fit in fits.items()}
+        self.attempt.write_records(journal, observations, evaluations, views)
         known = {c: fit.known for c, fit in fits.items()}
         tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         converged, advice = judge(fits)
+        misplaced = offsets_told(
+            evaluations, {c: worst_error(fit) for c, fit in fits.items()}, observations, views, f"the mesh of tooth {observations.teeth[0].fdi}"
+        )
+        converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
         return FitReport(
             converged=converged,

@@ -80,7 +80,7 @@ class JawDriver:
         with attempt.workers() as run_on:
             fits = {c.name: _ChannelRun(attempt, observations, dentins, c, journal, run_on, (n, len(channels))).fit() for n, c in enumerate(channels)}
         attempt.write_records(journal, observations, {c: jaw.fit.evaluation for c, jaw in fits.items()}, {c: jaw.views for c, jaw in fits.items()})
-        return report(fits, time.time() - begun)
+        return report(fits, observations, time.time() - begun)
 
 
 def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> Tooth:

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from services.core.records import Estimate, FitReport, ToothReport
-from services.fit.attempt import UNEXPLAINED, judge
+from services.fit.alignment import offsets_told
+from services.fit.attempt import UNEXPLAINED, judge, worst_error
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.identifiability import told
 from services.fit.jaw_starts import ToothStart
-from services.fit.observations import ViewStack
+from services.fit.observations import Observations, ViewStack
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
 from services.fit.stages import ChannelFit
@@ -30,15 +31,17 @@ class JawFit:
     """What was fitted and judged."""
 
 
-def report(fits: Mapping[str, JawFit], seconds: float) -> FitReport:
+def report(fits: Mapping[str, JawFit], observations: Observations, seconds: float) -> FitReport:
     """The report of all channels."""
     first = next(iter(fits.values()))
-    teeth = {str(start.fdi): _tooth(k, fits) for k, start in enumerate(first.starts)}
     converged, advice = judge({c: jaw.fit for c, jaw in fits.items()})
+    misplaced = offsets_told(_evaluations(fits), {c: worst_error(jaw.fit) for c, jaw in fits.items()}, observations, _views(fits), "the jaw's meshes")
+    advice = misplaced + advice
+    teeth = {str(start.fdi): _tooth(k, fits, None if misplaced else observations) for k, start in enumerate(first.starts)}
     unexplained = [fdi for fdi, tooth in teeth.items() if tooth.state == "fitted" and tooth.sentence]
     advice += [tooth.sentence for tooth in teeth.values() if tooth.state != "tied" and tooth.sentence]
     return FitReport(
-        converged=converged and not unexplained,
+        converged=converged and not unexplained and not misplaced,
         advice=" ".join(advice),
         parameters={c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()},
         fit_error={c: jaw.fit.fit_error for c, jaw in fits.items()},
@@ -53,14 +56,25 @@ def _surroundings(mouth: Mouth) -> tuple[str, ...]:
     return (*(() if mouth.gums is None else ("gums",)), *(() if mouth.reflectance is None else ("cavity",)))
 
 
-def _tooth(k: int, fits: Mapping[str, JawFit]) -> ToothReport:
-    # The worst state of all channels, and what it says.
+def _evaluations(fits: Mapping[str, JawFit]) -> dict[str, Evaluation]:
+    return {channel: jaw.fit.evaluation for channel, jaw in fits.items()}
+
+
+def _views(fits: Mapping[str, JawFit]) -> dict[str, tuple[ViewStack, ...]]:
+    return {channel: jaw.views for channel, jaw in fits.items()}
+
+
+def _tooth(k: int, fits: Mapping[str, JawFit], observations: Observations | None) -> ToothReport:
+    # The worst state of all channels, and what it says; whether it lies elsewhere is asked of the observations, if at all.
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
-    fit_error, held_out_error = (_errors({c: jaw.fit.evaluation for c, jaw in fits.items()}, k, kind) for kind in (0, 1))
+    fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)
     sentence = start.sentence
     if start.state == "fitted" and worst > UNEXPLAINED:
         sentence = f"Tooth {start.fdi} is still {100 * worst:.0f} % off in its images; check its mesh and its masks."
+        if observations is not None:
+            errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}
+            sentence = " ".join([*offsets_told(_evaluations(fits), errors, observations, _views(fits), f"the mesh of tooth {start.fdi}", k), sentence])
     tables = {c: _table(k, jaw) for c, jaw in fits.items()}
     return ToothReport(
         state=start.state,

@@ -44,7 +44,7 @@ class ToothStart:
 def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
     """Fit one tooth alone, unless too little of it is seen; what its own data or meshes cause becomes its state."""
     if pixels < LEAST_TOOTH_PIXELS:
-        seen = f"shows in {pixels} usable pixels" if pixels else "is hidden in every image"
+        seen = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
         return ToothStart(fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None)
     try:
         return ToothStart(fdi, "fitted", "", pixels, fit())

@@ -7,6 +7,7 @@ recorded results and on seeds, so the answer of an interrupted fit is that of an
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -18,21 +19,31 @@ FORMAT_VERSION = 1
 
 
 class Journal:
-    """Results by key, in one file that is replaced atomically."""
+    """Results by key, in one file that is replaced atomically.
+
+    Attributes:
+        resumed: how many results an earlier attempt left.
+        set_aside: where a checkpoint that is not this fit's was moved, kept for its owner; None where there was none.
+    """
 
     def __init__(self, path: Path, fingerprint: str, guard: Callable[[], None] = lambda: None) -> None:
         """Open or begin a journal.
 
         Args:
-            fingerprint: identifies job and data; a journal of another one is not continued.
+            fingerprint: identifies job, data and version; a journal of another one is set aside, neither continued nor lost.
             guard: called before every write; raises when this attempt has lost the right to write.
         """
         self.path, self._fingerprint, self._guard = path, fingerprint, guard
         self.entries: dict[str, Any] = {}
+        self.set_aside: Path | None = None
         if path.is_file():
-            stored = json.loads(path.read_text())
+            stored = _read(path)
             if stored.get("format") == FORMAT_VERSION and stored.get("fingerprint") == fingerprint:
                 self.entries = stored["entries"]
+            else:
+                guard()
+                self.set_aside = _free_name(path)
+                path.rename(self.set_aside)
         self.resumed = len(self.entries)
 
     def once(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
@@ -45,3 +56,17 @@ class Journal:
         content = {"format": FORMAT_VERSION, "fingerprint": self._fingerprint, "entries": self.entries}
         write_atomic(self.path, json.dumps(content).encode())
         return value, True
+
+
+def _read(path: Path) -> dict[str, Any]:
+    # A file that is no journal belongs to no fit.
+    try:
+        stored = json.loads(path.read_bytes())
+    except ValueError:
+        return {}
+    return stored if isinstance(stored, dict) and isinstance(stored.get("entries"), dict) else {}
+
+
+def _free_name(path: Path) -> Path:
+    numbers = (path.with_stem(f"{path.stem}-set-aside-{k}") for k in itertools.count(1))
+    return next(candidate for candidate in numbers if not candidate.exists())

@@ -41,7 +41,8 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     writer = StageWriter(context.root, "fit", context.attempt)
     attempt = Attempt(spec, context, writer, engine)
     driver = FitDriver(attempt) if spec.kind == "tooth" else JawDriver(attempt)
-    report = driver.run(time.time())
+    notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
+    report = driver.run(time.time()).model_copy(update={"notes": notes})
     writer.publish(report)
     context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=summary(report)))
     return report
@@ -109,7 +110,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     corners = [corner for tooth in teeth for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))]
     centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
     place = float(centre[0]), float(centre[1]), float(centre[2])
-    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), converged=report.converged, centre_mm=place)
+    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), converged=report.converged, advice=report.advice, centre_mm=place)
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
     context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))

@@ -14,8 +14,8 @@ from services.core.store import read_record
 from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage, require_consistent
 
-# A few dead pixels are masked; more than this share of the tooth means the file is broken
-NOT_FINITE_LIMIT = 0.01
+# Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
+NOT_FINITE_LIMIT = 0.5
 
 
 class FolderSource:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,20 @@ def assess(camera: str, light: str, bits: NDArray[np.uint16], covered: NDArray[n
         valid_pixels=int(np.count_nonzero(bits == 0)),
         masked={name: share for name, share in masked.items() if share > 0},
     )
+
+
+def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
+    """A sentence on pixels without a finite value or a positive variance, where there are any."""
+    name = (MaskBit.NOT_FINITE.name or "").lower()
+    counts = [round(image.masked.get(name, 0.0) * image.tooth_pixels) for image in images]
+    if not any(counts):
+        return ()
+    worst = images[int(np.argmax(counts))]
+    note = (
+        f"{sum(counts)} pixels of teeth in {np.count_nonzero(counts)} images have no finite value or no positive variance and are left out, most of them "
+        f"({max(counts)}) in camera {worst.camera} under light {worst.light}; export these images again if they should count."
+    )
+    return (note,)
 
 
 def write_picture(path: Path, radiance: Image, bits: NDArray[np.uint16]) -> None:

@@ -27,8 +27,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     """
     import numpy as np
 
+    from services.preprocess.brightness import Brightness
     from services.preprocess.motion import stored_step
-    from services.preprocess.quality import QualityReport, assess, write_picture
+    from services.preprocess.quality import QualityReport, assess, unusable_note, write_picture
     from services.preprocess.subject import NOTHING, read_subject
     from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
 
@@ -48,9 +49,6 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     images_in_all = sum(len(source.lights_of(k)) for k in range(len(cameras)))
     context.report(StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras."))
 
-    for note in source.notes:
-        context.report(StageEvent(stage="prepare", kind="log", message=note))
-
     # One chunk per image, so that each is written once
     height, width = max(c.size[1] for c in cameras), max(c.size[0] for c in cameras)
     planes, stack = (len(cameras), len(lights), height, width), ("camera", "light", "y", "x")
@@ -68,7 +66,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         motion = create_array(store, "motion", (len(cameras), len(lights), *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
         motion.attrs["step_px"] = step
 
-    reports, done, seen = [], 0, np.zeros(len(teeth), dtype=np.int64)
+    brightness, reports, done, seen = Brightness(), [], 0, np.zeros(len(teeth), dtype=np.int64)
     for k, camera in enumerate(cameras):
         context.raise_if_cancelled()
         w, h = camera.size
@@ -84,6 +82,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             context.raise_if_cancelled()
             bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
             bits[:h, :w] = valid_bits(image, footprint, camera, lights[j], glossy)
+            of_teeth = (bits[:h, :w] == 0) & (footprint.mesh < len(teeth))
+            if not brightness.add(image, footprint, camera, lights[j], of_teeth):
+                bits[:h, :w] |= np.uint16(MaskBit.UNLIT)
             seen += subject.pixels_of_teeth(footprint, bits[:h, :w])
             radiance[k, j, :h, :w], variance[k, j, :h, :w], valid[k, j] = image.radiance, image.variance, bits
             if motion is not None and image.displacement is not None:
@@ -108,13 +109,17 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
                 )
 
     valid_pixels = sum(report.valid_pixels for report in reports)
+    if valid_pixels == 0 and brightness.dark:
+        raise CaptureInputError(f"Every image of {source.root} is dark: no tooth is above the noise in any; check exposure and lights, then capture again.")
     if valid_pixels == 0:
         raise CaptureInputError(f"No image of {source.root} has a valid tooth pixel; look at its exposure, noise and masks.")
+    brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in teeth)
+    notes = [*source.notes, *brightness.notes(), *unusable_note(reports)]
     if hidden := [str(number) for number, count in zip(fdi, seen, strict=True) if count == 0]:
-        context.report(
-            StageEvent(stage="prepare", kind="log", message=f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
-        )
+        notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
+    for note in notes:
+        context.report(StageEvent(stage="prepare", kind="log", message=note))
     write_record(writer.folder / "quality.json", QualityReport(images=tuple(reports)))
     _copy_meshes(source.root, writer.folder, fdi)
     motions = [report.motion_px for report in reports if report.motion_px is not None]
@@ -129,6 +134,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         cavity=subject.whole and subject.cavity is not None,
         tooth_pixels=tuple(seen.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
+        notes=tuple(notes),
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
     )
     writer.publish(manifest)

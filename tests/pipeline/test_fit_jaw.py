@@ -72,7 +72,7 @@ def test_a_failed_tooth_does_not_sink_the_jaw(finished: tuple[Path, FitReport, l
 def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
     _, report, _ = finished
     assert report.teeth[TIED].state == "tied"
-    assert "hidden in every image" in report.teeth[TIED].sentence
+    assert "hidden or masked in every image" in report.teeth[TIED].sentence
     for fdi in (TIED, FAILED):
         for part in ("enamel", "dentin"):
             sigma = report.teeth[fdi].parameters["green"][f"{part}.sigma"]

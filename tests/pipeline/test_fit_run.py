@@ -154,6 +154,51 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
     assert min(e.data["step"] for e in events if e.kind == "step") == stop_at + 1
 
 
+def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+    _, report, _ = finished
+    write_prepared(tmp_path)
+    fit(tmp_path, seed=2, max_steps=1)
+    journal = tmp_path / "fit-checkpoint" / "journal.json"
+    earlier, events = journal.read_bytes(), list[StageEvent]()
+    assert without_time(fit(tmp_path, attempt=2, events=events)) == without_time(report)
+    assert journal.with_name("journal-set-aside-1.json").read_bytes() == earlier
+    (said,) = [event.message for event in events if "checkpoint" in event.message]
+    assert "kept as journal-set-aside-1.json and this fit starts anew" in said
+
+
+def test_a_checkpoint_of_another_version_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_prepared(tmp_path)
+    fit(tmp_path, max_steps=1)
+    monkeypatch.setattr("services.fit.attempt.version", lambda _: "0.0.1")
+    events: list[StageEvent] = []
+    fit(tmp_path, attempt=2, events=events, max_steps=1)
+    assert [event for event in events if "starts anew" in event.message]
+    assert not [event for event in events if "continues after" in event.message]
+
+
+def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    report = fit(tmp_path, max_steps=1)
+    assert not report.converged
+    assert "max_steps" in report.advice
+    manifest = export(spec_for(tmp_path, max_steps=1), LocalContext(tmp_path))
+    assert (manifest.converged, manifest.advice) == (False, report.advice)
+    assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("did not converge") < page.index("Error on held-out images")
+
+
+def test_what_the_preparation_noted_leads_the_report(tmp_path: Path) -> None:
+    note = "Dark and left out: camera c0 under light l1; check that these lights were on, then capture them again."
+    write_prepared(tmp_path, notes=(note,))
+    report = fit(tmp_path, max_steps=1)
+    assert report.notes == (note,)
+    export(spec_for(tmp_path, max_steps=1), LocalContext(tmp_path))
+    assert json.loads((tmp_path / "errors.json").read_text())["notes"] == [note]
+    page = (tmp_path / "report.html").read_text()
+    assert page.index(note) < page.index("Error on held-out images")
+
+
 def test_cancel_ends_between_steps_and_keeps_the_record(tmp_path: Path) -> None:
     write_prepared(tmp_path)
 

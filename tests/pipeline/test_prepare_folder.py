@@ -111,6 +111,45 @@ def test_few_dead_pixels_and_zero_variance_are_masked(tmp_path: Path) -> None:
     assert np.isfinite(radiance).all()
 
 
+def test_a_dark_image_is_left_out_and_said(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    np.save(tmp_path / "side_left.npy", 1e-3 * np.random.default_rng(1).standard_normal((18, 24, 2)).astype(np.float32))
+    np.save(tmp_path / "variance.npy", np.full((18, 24, 2), 1e-6, dtype=np.float32))
+    tree["images"][2]["variance_file"] = "variance.npy"
+    write_tree(tmp_path, tree)
+    manifest = prepare(tmp_path, tmp_path / "job")
+    assert [note for note in manifest.notes if note.startswith("Dark and left out: camera side under light left;")]
+    valid = np.asarray(zarr.open_array(tmp_path / "job" / "prepared" / "prepared.zarr" / "valid", mode="r"))
+    assert (valid[1, 0] & MaskBit.UNLIT > 0).all()
+    assert (valid[1, 1] == 0).any()
+
+
+def test_a_light_unlike_the_others_is_said(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    assert prepare(tmp_path, tmp_path / "before").notes == ()
+    tree["lights"][1]["intensity"] = [1e8, 1e8]
+    write_tree(tmp_path, tree)
+    (note,) = prepare(tmp_path, tmp_path / "job").notes
+    assert "under light " in note
+    assert "check both" in note
+
+
+def test_broken_pixels_are_counted_and_said(tmp_path: Path) -> None:
+    write_folder(tmp_path)
+    for name, rows in (("front_left", slice(6, 8)), ("side_right", slice(7, 11))):
+        image = np.load(tmp_path / f"{name}.npy")
+        image[rows] = np.nan
+        np.save(tmp_path / f"{name}.npy", image)
+    manifest = prepare(tmp_path, tmp_path / "job")
+    published, _ = open_stage(tmp_path / "job", "prepared", PreparedManifest)
+    valid = np.asarray(zarr.open_array(published / "prepared.zarr" / "valid", mode="r"))
+    lost = ((valid & MaskBit.NOT_FINITE > 0) & (valid & MaskBit.OUTSIDE == 0)).sum(axis=(2, 3))
+    assert lost[0, 0] > 0
+    (note,) = manifest.notes
+    assert note.startswith(f"{lost.sum()} pixels of teeth in 2 images have no finite value")
+    assert f"({lost.max()}) in camera side under light right" in note
+
+
 def test_held_out_lights_of_the_job_replace_the_captures(tmp_path: Path) -> None:
     tree = write_folder(tmp_path)
     tree["images"][0]["held_out"] = True
@@ -143,6 +182,15 @@ def rescale_mesh(factor: float) -> Callable[[Path, Tree], None]:
 def open_mesh(root: Path, _: Tree) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
     write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces[3:], dtype=np.int32)))
+
+
+def darken_all(root: Path, tree: Tree) -> None:
+    np.save(root / "noise.npy", np.full((18, 24, 2), 1e-4, dtype=np.float32))
+    tree["cameras"][0]["size"] = tree["cameras"][1]["size"]
+    for image in tree["images"]:
+        np.save(root / image["file"], 1e-2 * np.random.default_rng(len(image["file"])).standard_normal((18, 24, 2)).astype(np.float32))
+        image["variance_file"] = "noise.npy"
+    write_tree(root, tree)
 
 
 def move_camera(distance: float) -> Callable[[Tree], object]:
@@ -180,6 +228,17 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
     "pose in metres": (edit(move_camera(1.0)), CaptureInputError, r"Camera side stands 1 mm from the teeth"),
     "pose in micrometres": (edit(move_camera(1e6)), CaptureInputError, r"teeth span 0\.012 px in camera side"),
     "light in metres": (edit(lambda tree: tree["lights"][0].update(position_mm=[-0.9, 0, -0.4])), CaptureInputError, r"Light left stands 0\.985 mm"),
+    "light in micrometres": (
+        edit(lambda tree: [light.update(position_mm=[1e3 * x for x in light["position_mm"]]) for light in tree["lights"]]),
+        CaptureInputError,
+        r"times as bright as a white surface .* positions in mm",
+    ),
+    "intensity in metres": (
+        edit(lambda tree: [light.update(intensity=[1.0, 1.0]) for light in tree["lights"]]),
+        CaptureInputError,
+        r"times as bright as a white surface .* intensities per steradian with mm",
+    ),
+    "all images dark": (darken_all, CaptureInputError, r"Every image of .* is dark.*check exposure and lights"),
     "tooth out of view": (edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)), CaptureInputError, r"No tooth .* camera front"),
 }
 

@@ -52,6 +52,7 @@ def write_prepared(
     stain_uv: NDArray[np.float64] | None = None,
     seed: int = 5,
     engine: type[FakeEngine] = FakeEngine,
+    notes: tuple[str, ...] = (),
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
@@ -90,7 +91,8 @@ def write_prepared(
     for part, radius in (("outer", 4.0), ("dentin", 3.0)):
         write_mesh(writer.folder / "teeth" / "11" / f"{part}.ply", sphere(radius))
     manifest = PreparedManifest(
-        channels=channels, cameras=cameras, lights=all_lights, held_out=held_out, fdi=(11,), dentin_known=(11,), median_motion_px=None, valid_fraction=0.9
-    )
+        channels=channels, cameras=cameras, lights=all_lights, held_out=held_out, fdi=(11,), dentin_known=(11,), median_motion_px=None, notes=notes,
+        valid_fraction=0.9,
+    )  # fmt: skip
     writer.publish(manifest)
     return manifest

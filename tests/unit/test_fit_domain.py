@@ -80,7 +80,7 @@ def test_a_cosine_changes_neither_reduced_quantity_and_comes_back() -> None:
     again = domain.tissue_at(x, tissue)
     for name in ("enamel.sigma", "enamel.alpha", "enamel.g1", "dentin.sigma", "dentin.g1"):
         assert again.value(name) == pytest.approx(tissue.value(name), rel=1e-12)
-    moved = domain.tissue_at(x + [0, 0, 0, 0.5], tissue).enamel
+    moved = domain.tissue_at(x + np.array([0, 0, 0, 0.5]), tissue).enamel
     assert moved.g1 == pytest.approx(math.tanh(math.atanh(0.6) + 0.5))
     assert (moved.sigma_s_reduced, moved.alpha_reduced) == pytest.approx((tissue.enamel.sigma_s_reduced, tissue.enamel.alpha_reduced))
     # The other coordinates are those of the medium at the cosine that is held where none is fitted.

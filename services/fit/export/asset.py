@@ -149,6 +149,7 @@ def errors_json(report: FitReport) -> dict[str, Any]:
         "held_out_error": report.held_out_error,
         "converged": report.converged,
         "advice": report.advice,
+        "notes": report.notes,
         "told": report.told,
         "next_capture": report.next_capture,
         "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},

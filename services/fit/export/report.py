@@ -76,6 +76,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         title=context.get("title", "Fit"),
         converged=report.converged,
         advice=report.advice,
+        notes=report.notes,
         told=report.told,
         next_capture=report.next_capture,
         correlations=_correlations(report.correlations),
