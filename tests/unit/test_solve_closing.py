@@ -92,7 +92,7 @@ def test_a_response_that_noise_explains_is_not_believed() -> None:
     rng = np.random.default_rng(3)
     noise = np.full((3, 3), 0.09)
     sums = ClosingSums(np.zeros(3), np.eye(3), np.eye(3) + 0.1 * rng.standard_normal((3, 3)), noise, np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    found = response(sums, np.zeros((3, 3)))
+    found = response(sums, np.zeros((3, 3)), DOMAIN.relation)
     np.testing.assert_allclose(found.inverse, np.eye(3))
     np.testing.assert_allclose(found.variance, 0.0)
 
@@ -100,7 +100,7 @@ def test_a_response_that_noise_explains_is_not_believed() -> None:
 def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
     truth = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]])
     sums = ClosingSums(np.zeros(3), np.eye(3), truth, np.full((3, 3), 1e-8), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    np.testing.assert_allclose(response(sums, np.zeros((3, 3))).inverse, np.linalg.inv(truth), atol=1e-5)
+    np.testing.assert_allclose(response(sums, np.zeros((3, 3)), DOMAIN.relation).inverse, np.linalg.inv(truth), atol=1e-5)
 
 
 def test_a_shift_within_its_noise_adds_no_error() -> None:

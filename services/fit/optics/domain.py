@@ -150,6 +150,16 @@ class Domain:
         precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates])
         return mean, precision
 
+    @property
+    def relation(self) -> NDArray[np.int_]:
+        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums or wall, 2 of two teeth. All 0 for a tooth alone."""
+        owners = [name.partition(".")[0] for name in (c.targets[0] for c in self.coordinates)]
+        tooth = np.array([int(owner) if owner.isdigit() else -1 for owner in owners])
+        if (tooth < 0).all():
+            return np.zeros((len(tooth), len(tooth)), dtype=int)
+        shared = (tooth < 0)[:, None] | (tooth < 0)
+        return np.where(shared, 1, np.where(tooth[:, None] == tooth, 0, 2))
+
     def x_of(self, tissue: Tissue | Mouth) -> NDArray[np.float64]:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""
         return np.array([to_dual(c.kind, tissue.value(c.targets[0])) for c in self.coordinates])
