@@ -7,7 +7,7 @@ search        table over albedo x density x anisotropy         exact     best po
 homogeneous   sigma, alpha shared by both media                similar   converged, or a few steps
 start.k       sigma, alpha of both media, from several ratios  similar   two steps each; the least loss goes on
 layered       the same                                         similar   converged, or max_steps
-shape         the same and the dentin's blend weights          similar   converged, or max_steps; only where they are fitted
+shape         the same and the dentin's blend weights          exact     converged, or max_steps; only where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
 stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; only where stains are fitted
@@ -121,7 +121,8 @@ class ChannelSchedule(Stages[Tissue]):
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
         if self.modes:
             domain = self._with_shape(domain)
-            tissue, solution = self._solve("shape", domain, tissue, options, solution.samples, SIMILAR_G)
+            problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
+            tissue, solution = self._iterate(problem, options, solution.samples)
 
         options = self.at_full_resolution()
         exact_samples = self.fewer(min(solution.samples, EXACT_SAMPLES * samples))

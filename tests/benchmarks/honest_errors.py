@@ -27,7 +27,7 @@ from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.fit.optics.domain import to_natural
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.schedule import PRIORS
+from services.fit.optics.priors import WEAK
 from services.fit.stage import ENGINE, run
 from services.fit.transport.platform import prepare_device
 from tests.support.fake_engine import DirectFakeEngine
@@ -52,7 +52,7 @@ def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> T
 
 def drawn_tissue(rng: np.random.Generator) -> Tissue:
     """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits."""
-    mean, sd = PRIORS["g1"]
+    mean, sd = WEAK["enamel.g1"]
     reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
     return tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part in CENTRE})
 

@@ -28,7 +28,7 @@ LEAVES = {"sigma": "sigma_t.value.value", "alpha": "albedo.value.value"}
 class StockFit:
     """One fit at one learning rate, resumable step by step."""
 
-    def __init__(self, case: PreparedTooth, folder: Path, rate: float, samples: int = SAMPLES) -> None:
+    def __init__(self, case: PreparedTooth, folder: Path, rate: float, samples: int = SAMPLES, start: Medium = START) -> None:
         """Load one scene per fitted light; the clock runs from here."""
         import drjit as dr
         import mitsuba as mi
@@ -42,14 +42,14 @@ class StockFit:
         assert tooth.dentin is not None
         for file, mesh in zip(files, (tooth.outer, tooth.dentin), strict=True):
             write_mesh(file, mesh)
-        start, (width, height) = Tissue(START, START), view.camera.size
+        self._start, (width, height) = Tissue(start, start), view.camera.size
         x, y = view.pixels.T
         positions, intensities = seen.light_positions_mm, seen.light_intensities(CHANNEL)
         self._scenes: list[tuple[Any, Any, Any, Any]] = []
         signal = 0.0
         for light in np.flatnonzero(~view.held_out):
             where, intensity = positions[light], float(intensities[light])
-            scene = load_scene(nested_scene({"tooth": files}, start, (view.camera,), where, intensity, samples=samples))
+            scene = load_scene(nested_scene({"tooth": files}, self._start, (view.camera,), where, intensity, samples=samples))
             reference, counts = np.zeros((2, height, width, 1), dtype=np.float32)
             counts[y, x, 0] = view.valid[light]
             reference[y, x, 0] = np.where(view.valid[light], view.reference[light], 0.0)
@@ -58,7 +58,7 @@ class StockFit:
         self._signal = signal
         self._optimizer = mi.ad.Adam(lr=rate)
         for name in NAMES:
-            self._optimizer[name] = mi.Float(to_dual(name.split(".")[1], start.value(name)))
+            self._optimizer[name] = mi.Float(to_dual(name.split(".")[1], self._start.value(name)))
         dr.eval(*(self._optimizer[name] for name in NAMES))
         self.seconds += time.process_time() - begun
 
@@ -78,10 +78,12 @@ class StockFit:
             image = mi.render(scene, params, spp=self._samples, spp_grad=self._samples, seed=seed, seed_grad=seed + 1)
             dr.backward(dr.sum(dr.square((image - reference) * counts)) / self._signal)
         self._optimizer.step()
+        dr.eval(*(self._optimizer[name] for name in NAMES))
+        dr.sync_thread()
         self.rounds += 1
         self.seconds += time.process_time() - begun
 
     def tissue(self) -> Tissue:
         """Where it stands."""
         values = {name: to_natural(name.split(".")[1], float(self._optimizer[name][0])) for name in NAMES}
-        return Tissue(START, START).with_values(values)
+        return self._start.with_values(values)

@@ -34,6 +34,7 @@ OURS, OUR_ADAM, PEER = "dentine", "dentine-adam", "mitsuba-prbvolpath-adam"
 RATES = (0.02, 0.05, 0.15)
 """Of Adam in the unbounded domain."""
 CHOICE_S, LIMIT_S = 300.0, 2400.0
+QUICK_CHOICE_S, QUICK_LIMIT_S = 20.0, 60.0
 MARK_GROWTH = 1.12
 """From one mark of a peer to the next, in time."""
 MARGIN = 1.1
@@ -96,7 +97,7 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
         tooth = smallest_case(folder, pixel_step=3 if quick else 1)
         judge = Judge(tooth, keep, 256 if quick else JUDGE_SAMPLES)
         ours = our_fit(judge, folder / "ours", OURS, tooth.spec)
-        peers = {PEER: stock_fit(judge, folder, *((20.0, 60.0) if quick else (CHOICE_S, LIMIT_S)))}
+        peers = {PEER: stock_fit(judge, folder, *((QUICK_CHOICE_S, QUICK_LIMIT_S) if quick else (CHOICE_S, LIMIT_S)))}
         if "solver" in JobSpec.model_fields:
             peers[OUR_ADAM] = our_fit(judge, folder / "adam", OUR_ADAM, tooth.spec.model_copy(update={"solver": "adam"}))
         target = max(MARGIN * ours[-1].error, tooth.resolution())
