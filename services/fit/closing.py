@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from services.fit.blocks import read_block
 from services.fit.engine_host import EngineHost
-from services.fit.optics.domain import kind_of, similar_medium, to_natural
+from services.fit.optics.domain import similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
-from services.fit.passes import BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import SECANT_STEP, BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
@@ -33,17 +33,16 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
         samples: paths per pixel and seed.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
-    tissue, similar, parameters, chain = problem.jacobian_media(x)
+    tissue, similar, how = problem.jacobian_media(x)
     first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
-    exact = tuple(name for name in problem.domain.parameters if kind_of(name) != "shape")
-    rows = [k for k, name in enumerate(problem.domain.parameters) if name in exact]
-    borrowed = np.array([kind_of(name) == "shape" for name in problem.domain.names])
+    exact = problem.scored
+    borrowed = np.array([c.kind in SECANT_STEP for c in problem.domain.coordinates])
     ends = tuple((_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd)) for parts, (mean, sd) in held.items())
     pending = []
     for task in problem.passes.tasks(label, tissue, samples):
-        jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, first)
-        arguments = (whiten, exact, problem.domain.chain(x)[rows], borrowed, second, images, ends)
+        jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, first)
+        arguments = (whiten, exact, problem.chain(x, exact, None), borrowed, second, images, ends)
         pending.append(run.submit(f"{label}-{task.index}", closing_task, task, jacobian, *arguments))
     parts: list[tuple[ClosingSums, tuple[TraceRow, ...]]] = run.gather(pending)
     problem.passes.record([row for _, trace in parts for row in trace])
@@ -85,7 +84,7 @@ def closing_task(
         (slopes(seeds[0]), slopes(seeds[1])),
         borrowed,
         (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
-        np.array(moved).reshape(len(ends), 2, -1),
+        np.array(moved).reshape(len(ends), 2, renders[0].size),
         block.fit_weight.reshape(-1),
         len(block.reference),
     )

@@ -53,7 +53,7 @@ class JawSchedule(Stages[Mouth]):
     def run(self) -> ChannelFit[Mouth]:
         """Fit the channel."""
         samples = self.spec.samples_per_pixel
-        options = self.options(self.files.coarse)
+        options = self.in_similar_media(self.options(self.files.coarse))
         mouth = self._best_starts() if any(self.dentin) else self.start
         mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
         options = self.at_full_resolution()

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from services.core.errors import InputError, MeshError, NonFiniteError
-from services.fit.optics.domain import to_dual, to_natural
+from services.fit.optics.domain import HELD_G, to_dual, to_natural
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.optics.priors import HELD_G
 
 LEAST_TOOTH_PIXELS = 16
 """A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so few."""

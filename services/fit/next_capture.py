@@ -88,13 +88,13 @@ def advice(
     """
     assert known.sandwich is not None
     recipe, probes = probes_of(problem, folder, pixel_step)
-    _, similar, parameters, chain = problem.jacobian_media(known.x)
+    _, similar, how = problem.jacobian_media(known.x)
     seeds = problem.seed(0, "advice-1"), problem.seed(0, "advice-2")
     images = problem.seed(0, "advice-image-1"), problem.seed(0, "advice-image-2")
     run, label, pending = problem.passes.executor, f"{problem.passes.seeds.channel}-advice", []
     for index, probe in enumerate(probes):
         task = BlockTask(probe.block, index, recipe, label, similar, samples)
-        jacobian = run.submit(f"{label}-jacobian-{index}", jacobian_task, task, parameters, chain, seeds)
+        jacobian = run.submit(f"{label}-jacobian-{index}", jacobian_task, task, how, seeds)
         pending.append(run.submit(f"{label}-{index}", advice_task, task, jacobian, known.sandwich, images, probe, sensor, weight))
     parts_found: list[tuple[dict[str, tuple[Addition, Addition]], TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts_found])

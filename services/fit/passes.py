@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from services.fit.blocks import Block, StoredFile, read_block
 from services.fit.engine_host import EngineHost
 from services.fit.executors import Executor
-from services.fit.optics.domain import BOUNDS, Domain, kind_of, similar_tissue
+from services.fit.optics.domain import Domain, kind_of, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.seeds import Seeds
 from services.fit.solve.adam import Gradient
@@ -37,8 +37,8 @@ Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]
 """For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
 
-SHAPE_STEP = 0.2
-"""Half the step of the differences that give derivatives to blend weights; of their scale in a fit."""
+SECANT_STEP = {"shape": 0.2, "cosine": 0.35}
+"""Half the step of the differences that give derivatives to coordinates of these kinds; about their scale in a fit."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,43 @@ class BlockTask:
 
 
 @dataclass(frozen=True)
+class Secant:
+    """The derivative to one coordinate as a difference of images with common random numbers: quieter than border terms, and for a cosine than scores."""
+
+    coordinate: int
+    low: Tissue | Mouth
+    high: Tissue | Mouth
+    width: float
+
+    def slope(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
+        """Derivative of a block's images, (L N,)."""
+        low, high = (host.call("images", task.recipe, tissue, view, samples=task.samples, seed=seed).mean for tissue in (self.low, self.high))
+        return np.asarray((high - low) / self.width).reshape(-1)
+
+
+@dataclass(frozen=True)
+class Differentiation:
+    """How a stage's images are differentiated: scores of some natural parameters, mapped to the coordinates, and secants."""
+
+    parameters: tuple[str, ...]
+    chain: Array
+    """d parameter / d x, (P, F)."""
+    secants: tuple[Secant, ...] = ()
+
+    def render(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
+        """Derivatives (F, L N) in the task's media."""
+        if self.parameters:
+            estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, self.parameters, samples=task.samples, seed=seed)
+            scores = np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1)
+        else:
+            scores = np.zeros((0, self.secants[0].slope(host, task, view, seed).size))
+        rows = np.asarray(self.chain.T @ scores)
+        for secant in self.secants:
+            rows[secant.coordinate] = secant.slope(host, task, view, seed)
+        return rows
+
+
+@dataclass(frozen=True)
 class Residual:
     """Render minus reference of one block (L, N), from two seeds."""
 
@@ -80,8 +117,7 @@ class JacobianBlock:
     """Two estimates of a block's derivatives to the fit's coordinates, (F, L N) each. Pickles without them."""
 
     task: BlockTask
-    parameters: tuple[str, ...]
-    chain: Array
+    how: Differentiation
     seeds: tuple[int, int]
     trace: TraceRow
     arrays: tuple[Array, Array] | None = field(default=None, repr=False)
@@ -95,7 +131,7 @@ class JacobianBlock:
     def derivatives(self, host: EngineHost) -> tuple[Array, Array]:
         """The two estimates, rendered again where they are not at hand."""
         if self.arrays is None:
-            self.arrays = _render_jacobians(host, self.task, self.parameters, self.chain, self.seeds)
+            self.arrays = _render_jacobians(host, self.task, self.how, self.seeds)
         return self.arrays
 
 
@@ -115,11 +151,11 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     return Residual(stacks[0].mean - block.reference, stacks[1].mean - block.reference, trace_row("image", task, start))
 
 
-def jacobian_task(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> JacobianBlock:
+def jacobian_task(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int]) -> JacobianBlock:
     """Render a block's derivatives with two seeds."""
     start = time.time()
-    arrays = _render_jacobians(host, task, parameters, chain, seeds)
-    return JacobianBlock(task, parameters, chain, seeds, trace_row("jacobian", task, start), arrays)
+    arrays = _render_jacobians(host, task, how, seeds)
+    return JacobianBlock(task, how, seeds, trace_row("jacobian", task, start), arrays)
 
 
 def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual, near: Near | None) -> Products:
@@ -138,17 +174,14 @@ def _regions(block: Block, near: Near) -> list[Region]:
     return [(near[tooth], np.tile(block.parts.tooth == tooth, lights)) for tooth in np.unique(block.parts.tooth)]
 
 
-def gradient_task(
-    host: EngineHost, task: BlockTask, similar: Tissue, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]
-) -> tuple[Gradient, TraceRow]:
+def gradient_task(host: EngineHost, task: BlockTask, similar: Tissue, how: Differentiation, seeds: tuple[int, int]) -> tuple[Gradient, TraceRow]:
     """A block's stochastic gradient: residual from one seed, derivatives from another."""
     start, block = time.time(), read_block(task.block)
     stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0])
     residual, weight = stack.mean - block.reference, block.fit_weight
-    found: JacobianEstimate = host.call("jacobian", task.recipe, similar, block.fitted_view, parameters, samples=task.samples, seed=seeds[1])
-    slopes = np.tensordot(np.asarray(found.jacobian, dtype=np.float64), weight * residual, axes=2)
+    slopes = how.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1])
     loss = 0.5 * float((weight * (residual**2 - stack.variance)).sum())
-    return Gradient(np.asarray(chain.T @ slopes), loss), trace_row("gradient", task, start)
+    return Gradient(slopes @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
 
 
 def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
@@ -213,11 +246,11 @@ class StackProblem(Generic[Optics]):
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
         run, label = self.passes.executor, f"{self._prefix}-{step}"
-        tissue, similar, parameters, chain = self.jacobian_media(x)
+        tissue, similar, how = self.jacobian_media(x)
         seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
         pending = []
         for task in self.passes.tasks(label, tissue, samples):
-            jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), parameters, chain, seeds)
+            jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, seeds)
             image = run.submit(f"{label}-image-{task.index}", image_task, task, (self.seed(step, "image-1"), self.seed(step, "image-2")))
             pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, self.near))
         products: list[Products] = run.gather(pending)
@@ -229,9 +262,9 @@ class StackProblem(Generic[Optics]):
 
     def gradient(self, x: Array, *, samples: int, step: int) -> Gradient:
         """See adam.Problem: one task per block, summed in block order."""
-        tissue, similar, parameters, chain = self.jacobian_media(x)
+        tissue, similar, how = self.jacobian_media(x)
         seeds = self.seed(step, "image"), self.seed(step, "jacobian")
-        parts = self.passes.run(f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, parameters, chain, seeds)
+        parts = self.passes.run(f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, how, seeds)
         self.passes.record([row for _, row in parts])
         total: Gradient = parts[0][0]
         for part, _ in parts[1:]:
@@ -254,20 +287,44 @@ class StackProblem(Generic[Optics]):
         tissue = self.domain.tissue_at(x, self.base)
         return tissue if self.image_g is None else similar_tissue(tissue, self.image_g)
 
-    def jacobian_media(self, x: Array) -> tuple[Optics, Optics, tuple[str, ...], Array]:
-        """Media of the image and of the derivatives, the parameters to differentiate, and d parameter / d x."""
-        if self.jacobian_g is None:
-            return self._image_media(x), self.domain.tissue_at(x, self.base), self.domain.parameters, self.domain.chain(x)
-        names = tuple(dict.fromkeys(n for p in self.domain.parameters for n in _similar_parameters(p)))
+    def jacobian_media(self, x: Array) -> tuple[Optics, Optics, Differentiation]:
+        """Media of the image and of the derivatives, and how to differentiate."""
+        tissue = self.domain.tissue_at(x, self.base)
+        similar = tissue if self.jacobian_g is None else similar_tissue(tissue, self.jacobian_g)
+        own = self.scored
+        names = own if self.jacobian_g is None else tuple(dict.fromkeys(n for p in own for n in _similar_parameters(p)))
+        chain = self.chain(x, names, self.jacobian_g)
+        secants = tuple(self._secant(x, k, similar) for k, c in enumerate(self.domain.coordinates) if c.kind in SECANT_STEP)
+        return self._image_media(x), similar, Differentiation(names, chain, secants)
 
-        # The map to similar media is smooth and closed, so central differences of it are exact to rounding.
+    @property
+    def scored(self) -> tuple[str, ...]:
+        """Parameters of the domain whose derivatives are scores."""
+        return tuple(name for name in self.domain.parameters if kind_of(name) not in SECANT_STEP)
+
+    def chain(self, x: Array, names: tuple[str, ...], g: float | None) -> Array:
+        """Derivatives (P, F) of natural parameters to x, those of similar media of mean cosine g where it is given."""
+        if g is None and not self.domain.cosines:
+            return self.domain.chain(x)[[self.domain.parameters.index(name) for name in names]]
+
+        # The map is smooth and closed, so central differences of it are exact to rounding.
         def values(at: Array) -> Array:
-            tissue = similar_tissue(self.domain.tissue_at(at, self.base), float(self.jacobian_g or 0.0))
-            return np.array([tissue.value(name) for name in names])
+            tissue = self.domain.tissue_at(at, self.base)
+            seen = tissue if g is None else similar_tissue(tissue, g)
+            return np.array([seen.value(name) for name in names])
 
         shifts = 1e-5 * np.eye(len(x))
-        chain = np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
-        return self._image_media(x), similar_tissue(self.domain.tissue_at(x, self.base), self.jacobian_g), names, chain
+        return np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
+
+    def _secant(self, x: Array, k: int, similar: Optics) -> Secant:
+        # One-sided where a bound is near. A cosine's media are the images' own, as it is what similar media do not have.
+        coordinate, (low, high) = self.domain.coordinates[k], (bound[k] for bound in self.domain.bounds)
+        ends = [float(np.clip(x[k] + sign * SECANT_STEP[coordinate.kind], low, high)) for sign in (-1, 1)]
+        if coordinate.kind == "cosine":
+            below, above = (self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base) for end in ends)
+        else:
+            below, above = (similar.with_values({coordinate.targets[0]: end}) for end in ends)
+        return Secant(k, below, above, ends[1] - ends[0])
 
     @property
     def _prefix(self) -> str:
@@ -283,26 +340,9 @@ def _similar_parameters(name: str) -> tuple[str, ...]:
     return (f"{part}.sigma", f"{part}.alpha") if leaf in {"sigma", "alpha"} else (name,)
 
 
-def _render_jacobians(host: EngineHost, task: BlockTask, parameters: tuple[str, ...], chain: Array, seeds: tuple[int, int]) -> tuple[Array, Array]:
+def _render_jacobians(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int]) -> tuple[Array, Array]:
     view = read_block(task.block).fitted_view
-    scored = tuple(name for name in parameters if kind_of(name) != "shape")
-
-    def render(seed: int) -> Array:
-        estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, scored, samples=task.samples, seed=seed)
-        scores = dict(zip(scored, estimate.jacobian, strict=True))
-        natural = np.stack([scores[name] if name in scores else _secant(host, task, view, name, seed) for name in parameters])
-        return np.asarray(chain.T @ natural.reshape(len(natural), -1))
-
-    return render(seeds[0]), render(seeds[1])
-
-
-def _secant(host: EngineHost, task: BlockTask, view: View, name: str, seed: int) -> Array:
-    """Derivative (L, N) to a blend weight by a difference of images with common random numbers; one-sided where a bound is near."""
-    low, high = BOUNDS["shape"]
-    value = task.tissue.value(name)
-    ends = max(value - SHAPE_STEP, low), min(value + SHAPE_STEP, high)
-    below, above = (host.call("images", task.recipe, task.tissue.with_values({name: end}), view, samples=task.samples, seed=seed).mean for end in ends)
-    return np.asarray((above - below) / (ends[1] - ends[0]))
+    return how.render(host, task, view, seeds[0]), how.render(host, task, view, seeds[1])
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:

@@ -14,12 +14,12 @@ stain.*       texture of stains, in turn with the media        exact     a fixed
 ============  ===============================================  ========  =======================================================
 
 Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several times less for equal noise, and
-their derivatives to sigma are several times less noisy, at an image error of 1 to 2 %. So they carry the fit to its neighbourhood. In the last stage
+their derivatives to sigma are several times less noisy, at an image error of 1 to 15 %. So they carry the fit to its neighbourhood. In the last stage
 residuals come from the exact media and only the Jacobian from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
 
-sigma and g are nearly one parameter in a thick medium. With one lobe g1 is held at the literature's centre and sigma, reported at that g, absorbs the
-rest; reduced quantities do not depend on the choice. With two lobes g1, beta and g2 are free under weak Gaussian priors. Absorption of a thin enamel cap
-is nearly invisible, so its exponent carries a prior two decades wide.
+sigma and g are nearly one parameter in a thick medium. With one lobe the mean cosine is a coordinate at constant reduced scattering and absorption, from the
+first exact stage on, under a weak prior: it decides how much light turns back after few scatterings. With two lobes g1, beta and g2 are free under weak
+Gaussian priors. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from services.core.errors import SettingsError
 from services.fit.anatomy.stain_uv import StainLayout
 from services.fit.closing import Held
 from services.fit.next_capture import Sensor, advice
-from services.fit.optics.domain import Coordinate, Domain, similar_medium
+from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.priors import HELD_G, SHAPE, WEAK, Priors, priors_of
+from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
 from services.fit.passes import StackProblem, orders_task
 from services.fit.reweighting import reweighted
 from services.fit.solve import adam, table_search
@@ -97,7 +97,8 @@ class ChannelSchedule(Stages[Tissue]):
         return ("enamel", "dentin") if self.has_dentin else ("enamel",)
 
     def _held(self, domain: Domain) -> Held:
-        return {(part,): WEAK[f"{part}.g1"] for part in self.media if f"{part}.g1" not in domain.parameters}
+        free = {name.rpartition(".")[0] for name in domain.parameters if name.endswith((".g1", ".cosine"))}
+        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in free}
 
     def _others(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
@@ -119,8 +120,8 @@ class ChannelSchedule(Stages[Tissue]):
         tissue = tissue.with_values(spec.held)
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
+        domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
         if self.modes:
-            domain = self._with_shape(domain)
             problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
             tissue, solution = self._iterate(problem, options, solution.samples)
 
@@ -190,6 +191,11 @@ class ChannelSchedule(Stages[Tissue]):
         # The media's parameters that are not held.
         domain = media_domain(self.media, leaves, self._priors)
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
+
+    def _with_cosines(self, domain: Domain) -> Domain:
+        # Of media whose density is fitted and whose lobe is not given.
+        fitted = [part for part in self.media if f"{part}.sigma" in domain.parameters and f"{part}.g1" not in self.spec.held]
+        return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
 
     def _with_shape(self, domain: Domain) -> Domain:
         return Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",), *SHAPE) for k in range(self.modes)))

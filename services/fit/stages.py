@@ -26,10 +26,10 @@ from services.fit.solve.normal_equations import NormalEquations
 
 IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
-
+SIMILAR_TOLERANCE = 0.02
+"""The same of a stage in similar media."""
 CLOSING_TRIALS = 2
 """Lengths tried of the step after the closing measurement."""
-
 LEAST_SAMPLES = 4
 """Paths per pixel, however many pixels there are."""
 
@@ -126,6 +126,11 @@ class Stages(ABC, Generic[Optics]):
         samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
 
+    def in_similar_media(self, options: Options) -> Options:
+        """Limits of a stage whose images are off by more than a few samples resolve: it only finds the neighbourhood."""
+        most = min(2 * self.spec.samples_per_pixel, options.max_samples)
+        return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
+
     def at_full_resolution(self) -> Options:
         """Go on with full images; returns the limits there."""
         self.passes = replace(self.passes, blocks=self.files.full.blocks)
@@ -200,7 +205,7 @@ class Stages(ABC, Generic[Optics]):
     def _solve(self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float) -> tuple[Optics, Solution]:
         # A stage in similar media.
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
-        return self._iterate(problem, options, samples)
+        return self._iterate(problem, self.in_similar_media(options), samples)
 
     def _evaluate(self, label: str, tissue: Tissue | Mouth, samples: int, level: Level) -> Evaluation:
         passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
@@ -213,7 +218,7 @@ class Stages(ABC, Generic[Optics]):
 
     def _announce(self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None) -> None:
         # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
-        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse)
+        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, max(self.spec.samples_per_pixel // 2, LEAST_SAMPLES), self.files.coarse)
         fitted, held_out = evaluation.fitted, evaluation.held_out
         leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         values = {f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves} | self._others(tissue)

@@ -34,10 +34,15 @@ def test_peer_that_never_gets_there_has_a_lower_bound() -> None:
     assert (found.efficiency_ratio, found.lower_bound) == (90.0 / 9.0, True)
 
 
+def test_our_time_ends_when_no_later_start_is_worse() -> None:
+    ours = [row("dentine", 2.0, 0.02), row("dentine", 5.0, 0.2), row("dentine", 9.0, 0.0225), row("dentine", 12.0, 0.02)]
+    assert summary(ours, [row(PEER, 90.0, 0.02)], target=0.022).efficiency_ratio == 90.0 / 9.0
+
+
 def test_picture_shows_every_rate_and_the_bound() -> None:
     peers = [row(PEER, 10.0, 0.3, 0.02), row(PEER, 50.0, 0.3, 0.02), row(PEER, 10.0, 0.4, 0.05), row(PEER, 90.0, 0.1, 0.05)]
     rows = [*OURS, *peers, summary(OURS, peers[2:], target=0.022)]
-    (axes,) = picture([one.model_dump() for one in rows]).axes
+    axes: Any = picture([one.model_dump() for one in rows]).axes[0]
     labels = {line.get_label(): len(line.get_xydata()) for line in axes.get_lines()}
     assert labels == {"dentine": 3, f"{PEER}, rate 0.02": 2, f"{PEER}, rate 0.05, over 10 times our time": 2}
 

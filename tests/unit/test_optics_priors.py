@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from services.fit.optics.domain import similar_medium
+from services.fit.optics.domain import HELD_G, similar_medium
 from services.fit.optics.parameters import Medium
-from services.fit.optics.priors import HELD_G, LEAST_SD, LITERATURE_TABLE, WEAK, literature, priors_of, towards
+from services.fit.optics.priors import LEAST_SD, LITERATURE_TABLE, WEAK, literature, priors_of, towards
 from services.fit.schedule import media_domain, shared_domain
 from tests.support.shared_data import shared_path
 

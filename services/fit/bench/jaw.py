@@ -23,7 +23,7 @@ from services.core.records import FitReport, FolderCapture, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, read_record
 from services.fit.bench import Row
-from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, sensor_noise
+from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, prepare, sensor_noise
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.platform import prepare_device
 
@@ -134,9 +134,8 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     from services.fit.jaw_views import label_views
     from services.fit.observations import channel_scene, read_channel, read_observations
     from services.fit.transport.engine import Engine
-    from services.preprocess.stage import run as prepare
 
-    prepare(spec, LocalContext(job))
+    prepare(job, spec)
     observations = read_observations(job, spec)
     scene = channel_scene(observations, CHANNEL, [known_dentin(tooth) for tooth in observations.teeth], spec)
     return PreparedTooth(job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene))

@@ -155,11 +155,15 @@ def _descend(judge: Judge, fit: StockFit, rows: list[ToothRow], until_s: float) 
 
 
 def summary(ours: list[ToothRow], peer: list[ToothRow], target: float) -> ToothRow:
-    """The peer's time to the target over ours; of its last point, and a lower bound, where it never got there."""
-    first = next(row for row in ours if row.error <= target)
+    """The peer's time to the target over ours; of its last point, and a lower bound, where it never got there.
+
+    The peer is there when it first shows the target; we are when no later point, of another start say, is above it by more than the judge's error.
+    """
+    above = [k for k, row in enumerate(ours) if row.error - row.error_se > target]
+    settled = ours[min(above[-1] + 1, len(ours) - 1) if above else 0]
     reached = next((row for row in peer if row.error <= target), None)
     last = reached or peer[-1]
-    changes = {"benchmark": "tooth-summary", "efficiency_ratio": last.seconds / first.seconds, "lower_bound": reached is None}
+    changes = {"benchmark": "tooth-summary", "efficiency_ratio": last.seconds / settled.seconds, "lower_bound": reached is None}
     return last.model_copy(update=changes)
 
 

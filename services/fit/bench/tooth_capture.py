@@ -85,15 +85,21 @@ class PreparedTooth:
         return float((2 * variance @ variance) ** 0.25 / np.sqrt(reference @ reference - variance.sum()))
 
 
+def prepare(job: Path, spec: JobSpec) -> None:
+    """The stage before the fit; benchmarks begin with a capture and so are the one place that knows two services."""
+    from services.preprocess.stage import run
+
+    run(spec, LocalContext(job))
+
+
 def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
     """Prepare a capture below ``job``, unless that is done, and build its scene."""
     from services.fit.driver import dentin_shape
     from services.fit.transport.platform import prepare_device
-    from services.preprocess.stage import run as prepare
 
     prepare_device()
     if not is_published(job, "prepared"):
-        prepare(spec, LocalContext(job))
+        prepare(job, spec)
     observations = read_observations(job, spec)
     (tooth,) = observations.teeth
     dentin = dentin_shape(tooth, observations.manifest.cameras, spec)

@@ -16,8 +16,10 @@ from typing import Any
 
 from services.core.errors import InputError
 from services.core.records import FitReport, JobSpec
+from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.bench import Row
+from services.fit.bench.tooth_capture import prepare
 
 PIXEL_MM, CAMERAS, LIGHTS, SAMPLES = 0.064, 3, 54, 64
 CACHE = Path(".cache")
@@ -25,7 +27,7 @@ QUICK_PIXEL_MM, QUICK_LIGHTS = 0.5, 8
 
 
 class ScaleRow(Row):
-    """One whole job, preparation and export included."""
+    """Preparation and fit of one capture."""
 
     workers: int
     fit_seconds: float
@@ -68,13 +70,19 @@ def _capture(quick: bool) -> Path:
 
 
 def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
-    from services.api.pipeline import run_job
+    import dask
+    from distributed import Client, LocalCluster
 
     spec = JobSpec.model_validate({"capture": capture, "boundary": "matched", "dentin": "known", "workers": workers})
     idle = (os.cpu_count() or 1) - os.getloadavg()[0]
-    with tempfile.TemporaryDirectory() as name:
+    with (
+        tempfile.TemporaryDirectory() as name,
+        dask.config.set({"distributed.worker.daemon": False}),
+        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster) as client,
+    ):
         began = time.perf_counter()
-        run_job(spec, Path(name), workers=workers)
+        client.submit(_stages, spec, Path(name)).result()
         seconds = time.perf_counter() - began
         report = open_stage(Path(name), "fit", FitReport)[1]
     if not report.held_out_error:
@@ -85,6 +93,14 @@ def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
         fit_seconds=report.seconds, pixels_per_view=pixels, images=images, idle_cores=idle,
     )  # fmt: skip
     return report, row
+
+
+def _stages(spec: JobSpec, root: Path) -> None:
+    # Runs on a worker; the fit spreads its passes from there.
+    from services.fit.stage import run as fit
+
+    prepare(root, spec)
+    fit(spec, LocalContext(root))
 
 
 def _size(capture: Path) -> tuple[int, int]:

@@ -6,6 +6,7 @@ parameter    natural                d natural / d x          kept inside
 sigma        exp(x), per mm         sigma                    1e-3 to 1e3 per mm
 alpha        1 - 10^-x              10^-x ln 10              1 - alpha from 1e-7 to 0.9
 g1, g2       tanh x                 sech^2 x                 abs(g) < 0.9991
+cosine       tanh x                 sech^2 x                 -0.50 to 0.97
 beta         logistic x             beta (1 - beta)          6e-4 to 1 - 6e-4
 reflectance  as beta                as beta                  as beta
 shape        x                      1                        0 to 1, projected
@@ -17,14 +18,14 @@ The bounds only keep a wild step representable in float32; a fit that ends on on
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import SettingsError
-from services.fit.optics.parameters import Medium, Mouth, Optics, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Optics, Tissue
 
 LN10 = math.log(10.0)
 
@@ -32,14 +33,17 @@ BOUNDS = {
     "sigma": (math.log(1e-3), math.log(1e3)),
     "alpha": (-math.log10(0.9), 7.0),
     "g1": (-3.85, 3.85),
+    "cosine": (-0.55, 2.1),
     "g2": (-3.85, 3.85),
     "beta": (-7.4, 7.4),
     "reflectance": (-7.4, 7.4),
     "shape": (0.0, 1.0),
 }
-STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "g2": 0.35, "beta": 1.0, "reflectance": 1.0, "shape": 0.25}
+HELD_G = 0.8
+"""Mean cosine at which sigma and alpha are coordinates where the cosine is one too, and that a single lobe has where it is not."""
+STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "cosine": 0.35, "g2": 0.35, "beta": 1.0, "reflectance": 1.0, "shape": 0.25}
 """Length over which the image is roughly linear in each coordinate; a trust radius of 1 means one of these."""
-UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "g2": "1", "beta": "1", "reflectance": "1", "shape": "1"}
+UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "cosine": "1", "g2": "1", "beta": "1", "reflectance": "1", "shape": "1"}
 LOGISTIC = frozenset({"beta", "reflectance"})
 
 
@@ -60,7 +64,7 @@ def to_dual(kind: str, value: float) -> float:
         x = math.log(max(value, tiny))
     elif kind == "alpha":
         x = -math.log10(max(1.0 - value, tiny))
-    elif kind in {"g1", "g2"}:
+    elif kind in {"g1", "g2", "cosine"}:
         x = math.copysign(high, value) if abs(value) >= 1.0 else math.atanh(value)
     elif kind in LOGISTIC:
         x = math.log(max(value, tiny)) - math.log(max(1.0 - value, tiny))
@@ -75,7 +79,7 @@ def to_natural(kind: str, x: float) -> float:
         return math.exp(x)
     if kind == "alpha":
         return -math.expm1(-x * LN10)
-    if kind in {"g1", "g2"}:
+    if kind in {"g1", "g2", "cosine"}:
         return math.tanh(x)
     if kind in LOGISTIC:
         return 1.0 / (1.0 + math.exp(-x)) if x >= 0 else math.exp(x) / (1.0 + math.exp(x))
@@ -88,7 +92,7 @@ def natural_derivative(kind: str, x: float) -> float:
         return math.exp(x)
     if kind == "alpha":
         return LN10 * math.exp(-x * LN10)
-    if kind in {"g1", "g2"}:
+    if kind in {"g1", "g2", "cosine"}:
         return 1.0 / math.cosh(x) ** 2
     if kind in LOGISTIC:
         decay = math.exp(-abs(x))
@@ -160,17 +164,29 @@ class Domain:
         shared = (tooth < 0)[:, None] | (tooth < 0)
         return np.where(shared, 1, np.where(tooth[:, None] == tooth, 0, 2))
 
-    def x_of(self, tissue: Tissue | Mouth) -> NDArray[np.float64]:
+    @property
+    def cosines(self) -> tuple[str, ...]:
+        """Parts whose mean cosine is a coordinate. Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity."""
+        return tuple(part for c in self.coordinates if c.kind == "cosine" for part in [c.targets[0].rpartition(".")[0]])
+
+    def x_of(self, tissue: Optics) -> NDArray[np.float64]:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""
-        return np.array([to_dual(c.kind, tissue.value(c.targets[0])) for c in self.coordinates])
+        held = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
+
+        def value(name: str) -> float:
+            part, _, leaf = name.rpartition(".")
+            return tissue.medium(part).mean_cosine if leaf == "cosine" else held.value(name)
+
+        return np.array([to_dual(c.kind, value(c.targets[0])) for c in self.coordinates])
 
     def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Optics) -> Optics:
         """``base`` with this domain's parameters at x."""
         values = {target: to_natural(c.kind, float(v)) for c, v in zip(self.coordinates, x, strict=True) for target in c.targets}
-        return base.with_values(values)
+        cosines = {part: values.pop(f"{part}.cosine") for part in self.cosines}
+        return _at_cosines(_at_cosines(base, dict.fromkeys(cosines, HELD_G)).with_values(values), cosines)
 
     def chain(self, x: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of each parameter to each coordinate, (P, F): maps derivatives to natural parameters onto coordinates."""
+        """Derivative of each parameter to each coordinate, (P, F): maps derivatives to natural parameters onto coordinates. Not with ``cosines``."""
         matrix = np.zeros((len(self.parameters), len(self.coordinates)))
         row = 0
         for column, (c, v) in enumerate(zip(self.coordinates, x, strict=True)):
@@ -185,6 +201,14 @@ def similar_medium(medium: Medium, g: float) -> Medium:
     scattering, absorption = medium.sigma_s_reduced / (1 - g), (1 - medium.alpha) * medium.sigma
     sigma = scattering + absorption
     return Medium(sigma, scattering / sigma, g1=g)
+
+
+def _at_cosines(tissue: Optics, cosines: Mapping[str, float]) -> Optics:
+    # Some parts' media replaced by similar ones.
+    for part, cosine in cosines.items():
+        medium = similar_medium(tissue.medium(part), cosine)
+        tissue = tissue.with_values({f"{part}.{leaf}": getattr(medium, leaf) for leaf in MEDIUM_FIELDS})
+    return tissue
 
 
 def similar_tissue(tissue: Optics, g: float) -> Optics:

@@ -13,10 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from services.fit.optics.domain import similar_medium, to_dual
+from services.fit.optics.domain import HELD_G, similar_medium, to_dual
 from services.fit.optics.parameters import Medium
 
-HELD_G = 0.8
 LEAST_SD = {"sigma": 0.2, "alpha": 0.1}
 """However well few teeth agree, a prior towards them is no narrower."""
 
@@ -31,6 +30,8 @@ _LEAVES = {
 }
 WEAK: Priors = MappingProxyType({f"{part}.{leaf}": prior for part in ("enamel", "dentin") for leaf, prior in _LEAVES.items()})
 """g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
+COSINE = (to_dual("cosine", 0.7), 0.35)
+"""Of the mean cosine of one lobe that stands for two: 0.48 to 0.84 (one sigma). Similarity of second order asks for 0.5 to 0.7 where lobes are those of teeth."""
 SHAPE = (0.6, 0.3)
 """Of a blend weight: those nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3 to 1."""
 

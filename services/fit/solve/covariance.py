@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from types import MappingProxyType
 
 import numpy as np
@@ -201,7 +202,10 @@ def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, s
             continue
         for leaf in MEDIUM_FIELDS:
             name = f"{part}.{leaf}"
-            out[name] = _raw(tissue, name, known if name in fitted else None)
+            if f"{part}.cosine" in fitted and leaf in {"sigma", "alpha", "g1"}:
+                out[name] = _derived(tissue, known, part, attrgetter(leaf), UNITS[leaf])
+            else:
+                out[name] = _raw(tissue, name, known if name in fitted else None)
         for leaf, (unit, quantity) in DERIVED.items():
             out[f"{part}.{leaf}"] = _derived(tissue, known, part, quantity, unit)
     for k in range(len(tissue.shape) if isinstance(tissue, Tissue) else 0):
