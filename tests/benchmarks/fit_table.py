@@ -30,7 +30,7 @@ from services.fit.anatomy.thickness import thickness_image
 from services.fit.bench.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
 from services.fit.optics.parameters import Tissue
 from services.fit.schedule import ChannelSchedule
-from services.fit.stage import fitted_tooth, run
+from services.fit.stage import fitted_teeth, run
 from services.fit.transport.platform import prepare_device
 from tests.support.truths import SIDE_LIGHTS, Truth, write_capture
 
@@ -195,7 +195,7 @@ CASES: dict[str, Row] = {"homogeneous": homogeneous, "known": known, "free": fre
 def thickness_mm(fit: Fit) -> NDArray[np.float64]:
     """Enamel's fitted thickness (N,) at the pixels of the middle camera that see the incisal half of the crown."""
     observations = fit.prepared.observations
-    found = fitted_tooth(observations.folder, observations.teeth[0].fdi, observations.manifest.cameras, fit.prepared.spec, fit.report)
+    (found,) = fitted_teeth(observations.folder, observations.manifest, fit.prepared.spec, fit.report)
     assert found.dentin is not None
     camera = observations.manifest.cameras[1]
     return np.asarray(thickness_image(found.outer, found.dentin, camera)[_incisal_half(fit)])

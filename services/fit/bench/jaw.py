@@ -117,8 +117,9 @@ def write_photographs(folder: Path, case: Case) -> None:
     """Let stock Mitsuba render the jaw, and add sensor noise."""
     from services.fit.anatomy.phantom_jaw import write_jaw_phantom
 
-    rig = {"cameras": CAMERAS, "lights": LIGHTS, "held_out": HELD_OUT}
-    write_jaw_phantom(folder, subject=SUBJECT, pixel_mm=case.pixel_mm, samples=case.photograph_samples, renderer="mitsuba", **rig)
+    write_jaw_phantom(
+        folder, subject=SUBJECT, pixel_mm=case.pixel_mm, cameras=CAMERAS, lights=LIGHTS, held_out=HELD_OUT, samples=case.photograph_samples, renderer="mitsuba"
+    )
     random = np.random.default_rng(SUBJECT)
     for image in read_record(folder / "capture.json", FolderCapture).images:
         assert image.variance_file is not None
