@@ -292,6 +292,7 @@ def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
 
 _BENCHMARKS = MappingProxyType(
     {
+        "jaw": "services.fit.bench.jaw:run",
         "slab": "services.fit.bench.slab:run",
         "stability": "services.fit.bench.stability:run",
         "tooth": "services.fit.bench.tooth:run",

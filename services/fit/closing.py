@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,22 +12,24 @@ from numpy.typing import NDArray
 from services.fit.blocks import read_block
 from services.fit.engine_host import EngineHost
 from services.fit.optics.domain import similar_medium, to_natural
-from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 from services.fit.passes import SECANT_STEP, BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
+Held = Mapping[tuple[str, ...], tuple[float, float]]
+"""Media whose mean cosine was held and may be wrong alike, with the mean and standard deviation of its prior in the unbounded domain."""
 
 SHIFT_SAMPLES = 2
 """Images of changed media have so many times fewer paths: they enter a variance, not the answer."""
 
 
-def measure_closing(problem: StackProblem[Tissue], x: Array, whiten: Array, held: dict[str, tuple[float, float]], samples: int) -> ClosingSums:
+def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held: Held, samples: int) -> ClosingSums:
     """Sums at x, in block order.
 
     Args:
         whiten: T (F, F), x = T y.
-        held: parts whose mean cosine was held, with the mean and standard deviation of its prior in the unbounded domain.
+        held: each entry costs four images.
         samples: paths per pixel and seed.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
@@ -35,7 +38,7 @@ def measure_closing(problem: StackProblem[Tissue], x: Array, whiten: Array, held
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
     exact = problem.scored
     borrowed = np.array([c.kind in SECANT_STEP for c in problem.domain.coordinates])
-    ends = tuple((_with_cosine(tissue, part, mean - sd), _with_cosine(tissue, part, mean + sd)) for part, (mean, sd) in held.items())
+    ends = tuple((_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd)) for parts, (mean, sd) in held.items())
     pending = []
     for task in problem.passes.tasks(label, tissue, samples):
         jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, first)
@@ -59,7 +62,7 @@ def closing_task(
     borrowed: NDArray[np.bool_],
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
-    ends: tuple[tuple[Tissue, Tissue], ...],
+    ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
 ) -> tuple[ClosingSums, tuple[TraceRow, ...]]:
     """One block's share. ``chain`` (P, F) maps the rendered exact derivatives onto coordinates."""
     start, block = time.time(), read_block(task.block)
@@ -88,8 +91,6 @@ def closing_task(
     return sums, (jacobian.trace, trace_row("closing", task, start))
 
 
-def _with_cosine(tissue: Tissue, part: str, dual: float) -> Tissue:
-    cosine = to_natural("g1", dual)
-    if part == "enamel":
-        return replace(tissue, enamel=similar_medium(tissue.enamel, cosine))
-    return replace(tissue, dentin=similar_medium(tissue.dentin, cosine))
+def _with_cosine(tissue: Optics, parts: tuple[str, ...], dual: float) -> Optics:
+    media = {part: similar_medium(tissue.medium(part), to_natural("g1", dual)) for part in parts}
+    return tissue.with_values({f"{part}.{leaf}": float(getattr(medium, leaf)) for part, medium in media.items() for leaf in MEDIUM_FIELDS})

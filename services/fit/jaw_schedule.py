@@ -24,10 +24,11 @@ from functools import partial
 
 import numpy as np
 
+from services.fit.closing import Held
 from services.fit.jaw_starts import ToothStart, typical
 from services.fit.optics.domain import Coordinate, Domain, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.optics.priors import priors_of
+from services.fit.optics.priors import WEAK, priors_of
 from services.fit.passes import Near, StackProblem
 from services.fit.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 from services.fit.stages import ChannelFit, Stages
@@ -52,10 +53,10 @@ class JawSchedule(Stages[Mouth]):
     def run(self) -> ChannelFit[Mouth]:
         """Fit the channel."""
         samples = self.spec.samples_per_pixel
-        options = replace(self.options(self.files.coarse), parts=len(self.teeth))
+        options = self.in_similar_media(self.options(self.files.coarse))
         mouth = self._best_starts() if any(self.dentin) else self.start
         mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
-        options = replace(self.at_full_resolution(), parts=len(self.teeth))
+        options = self.at_full_resolution()
         exact = self._problem(self._retied(mouth), "exact", None)
         mouth, solution = self._iterate(exact, options, self.fewer(min(solution.samples, EXACT_SAMPLES * samples)))
         return self._finish(replace(exact, base=mouth, stage="final"), solution)
@@ -70,8 +71,7 @@ class JawSchedule(Stages[Mouth]):
         ends = []
         for k, ratio in enumerate(START_RATIOS):
             start = replace(self.start, teeth=tuple(map(partial(_layered, ratio), self.start.teeth, self.dentin)))
-            limits = replace(self.short(START_STEPS), parts=len(self.teeth))
-            ends.append(self._iterate(self._problem(start, f"start.{k}", SIMILAR_G), limits, self.spec.samples_per_pixel)[0])
+            ends.append(self._iterate(self._problem(start, f"start.{k}", SIMILAR_G), self.short(START_STEPS), self.spec.samples_per_pixel)[0])
         samples = min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
 
         def compute() -> list[list[float]]:
@@ -89,6 +89,17 @@ class JawSchedule(Stages[Mouth]):
         """See Stages."""
         teeth = [f"{k}.{part}" for k, has_dentin in enumerate(self.dentin) for part in (("enamel", "dentin") if has_dentin else ("enamel",))]
         return (*teeth, *(() if self.start.gums is None else ("gums",)))
+
+    @property
+    def things(self) -> int:
+        """See Stages."""
+        return len(self.teeth)
+
+    def _held(self, domain: Domain) -> Held:  # noqa: ARG002 - a jaw's coordinates hold every mean cosine
+        # Media of one tissue are wrong alike: 29 of them, each on its own, would cost more than the fit.
+        kinds = {"enamel": WEAK["enamel.g1"], "dentin": WEAK["dentin.g1"], "gums": WEAK["enamel.g1"]}
+        alike = {tuple(part for part in self.media if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()}
+        return {parts: prior for parts, prior in alike.items() if parts}
 
     def _others(self, tissue: Mouth) -> dict[str, float]:
         return {} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance}

@@ -26,13 +26,10 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from services.core.errors import SettingsError
 from services.fit.anatomy.stain_uv import StainLayout
-from services.fit.closing import measure_closing
+from services.fit.closing import Held
 from services.fit.next_capture import Sensor, advice
 from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
@@ -40,11 +37,8 @@ from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
 from services.fit.passes import StackProblem, orders_task
 from services.fit.reweighting import reweighted
 from services.fit.solve import adam, table_search
-from services.fit.solve.closing import ClosingSums
-from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
-from services.fit.solve.gauss_newton import Options, Result, Solution
+from services.fit.solve.gauss_newton import Options, Solution
 from services.fit.solve.losses import is_reweighted
-from services.fit.solve.normal_equations import NormalEquations
 from services.fit.stages import ChannelFit, Stages
 from services.fit.stain_passes import StainStage
 
@@ -61,8 +55,6 @@ REWEIGHTINGS = 2
 """Rounds of a loss that follows residuals, after the first exact stage."""
 STAIN_SAMPLES = 2
 """Least paths per pixel of a step of the stains, over those of the start; as many as the media needed in the end."""
-CLOSING_TRIALS = 2
-"""Lengths tried of the step after the closing measurement."""
 START_STEPS = 2
 ADAM_BURST = 10
 """Steps of Adam between two journal entries and reports, each of which costs an evaluation of all images."""
@@ -103,6 +95,10 @@ class ChannelSchedule(Stages[Tissue]):
     def media(self) -> tuple[str, ...]:
         """See Stages."""
         return ("enamel", "dentin") if self.has_dentin else ("enamel",)
+
+    def _held(self, domain: Domain) -> Held:
+        free = {name.rpartition(".")[0] for name in domain.parameters if name.endswith((".g1", ".cosine"))}
+        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in free}
 
     def _others(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
@@ -264,34 +260,6 @@ class ChannelSchedule(Stages[Tissue]):
         self.pause()
         best, _ = self.journal.once(f"{self.scope}/starts", compute)
         return ends[best]
-
-    def _close(
-        self, problem: StackProblem[Tissue], solution: Solution, equations: NormalEquations, samples: int
-    ) -> tuple[StackProblem[Tissue], Solution, Uncertainty]:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.
-        domain, x = problem.domain, solution.x
-        if problem.jacobian_g is None or solution.result is Result.STALLED:
-            return super()._close(problem, solution, equations, samples)
-        known = whitening(domain, equations)
-        free = {name.rpartition(".")[0] for name in domain.parameters if name.endswith((".g1", ".cosine"))}
-        held = {part: WEAK[f"{part}.g1"] for part in self.media if part not in free}
-
-        def compute() -> dict[str, Any]:
-            sums = measure_closing(problem, x, known.transform, held, samples)
-            step, (mean, precision) = closing_step(domain, x, equations, sums), domain.prior
-            for trial in range(CLOSING_TRIALS):
-                compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
-                change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-                if change <= Options().sure_z * compared.se:
-                    return {"sums": sums.record(), "step": step.tolist()}
-                step = 0.3 * step
-            return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
-
-        self.pause()
-        entry, _ = self.journal.once(f"{self.scope}/closing", compute)
-        step = np.array(entry["step"])
-        measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
-        return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:
         # A second lobe starts at its prior's centre, the first keeps the mean cosine.

@@ -8,7 +8,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic
 
+import numpy as np
+
 from services.core.records import JobSpec
+from services.fit.closing import Held, measure_closing
 from services.fit.evaluate import Evaluation, Shown, evaluate
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Level
@@ -16,14 +19,17 @@ from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
-from services.fit.solve.covariance import Uncertainty, uncertainty
-from services.fit.solve.gauss_newton import Options, Solution, State
+from services.fit.solve.closing import ClosingSums
+from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
+from services.fit.solve.gauss_newton import Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 
 IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SIMILAR_TOLERANCE = 0.02
 """The same of a stage in similar media."""
+CLOSING_TRIALS = 2
+"""Lengths tried of the step after the closing measurement."""
 LEAST_SAMPLES = 4
 """Paths per pixel, however many pixels there are."""
 
@@ -94,6 +100,15 @@ class Stages(ABC, Generic[Optics]):
     def _others(self, tissue: Optics) -> dict[str, float]:
         """What they list beside media."""
 
+    @abstractmethod
+    def _held(self, domain: Domain) -> Held:
+        """Mean cosines that this domain holds, as the closing measurement takes them."""
+
+    @property
+    def things(self) -> int:
+        """How many things the fit is about that images tell apart, such as teeth."""
+        return 1
+
     @property
     def scope(self) -> str:
         """Begins the journal's keys of this fit."""
@@ -103,13 +118,18 @@ class Stages(ABC, Generic[Optics]):
         """Limits of a stage on images of this resolution; it has converged within ``IMAGE_TOLERANCE``."""
         most = self.spec.max_samples_per_pixel
         samples = self.fewer(most) if level is self.files.full else most
-        return Options(max_steps=self.spec.max_steps, max_samples=samples, tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal)
+        return Options(max_steps=self.spec.max_steps, max_samples=samples, tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal, parts=self.things)
 
     def short(self, steps: int) -> Options:
         """Limits of a stage that only prepares the next: so many steps, few samples."""
         options = self.options(self.files.coarse)
         samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
+
+    def in_similar_media(self, options: Options) -> Options:
+        """Limits of a stage whose images are off by more than a few samples resolve: it only finds the neighbourhood."""
+        most = min(2 * self.spec.samples_per_pixel, options.max_samples)
+        return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
 
     def at_full_resolution(self) -> Options:
         """Go on with full images; returns the limits there."""
@@ -157,21 +177,35 @@ class Stages(ABC, Generic[Optics]):
         return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation, problem, samples)
 
     def _close(
-        self,
-        problem: StackProblem[Optics],
-        solution: Solution,
-        equations: NormalEquations,
-        samples: int,  # noqa: ARG002 - of a fit that measures
+        self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # How sure the answer is, of what is known already; a fit may measure more, and move once more by it.
-        return problem, solution, uncertainty(problem.domain, solution.x, equations)
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.
+        domain, x = problem.domain, solution.x
+        if problem.jacobian_g is None or solution.result is Result.STALLED:
+            return problem, solution, uncertainty(domain, x, equations)
+        known = whitening(domain, equations)
+
+        def compute() -> dict[str, Any]:
+            sums = measure_closing(problem, x, known.transform, self._held(domain), samples)
+            step, (mean, precision) = closing_step(domain, x, equations, sums, self.things), domain.prior
+            for trial in range(CLOSING_TRIALS):
+                compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
+                change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+                if change <= Options().sure_z * compared.se:
+                    return {"sums": sums.record(), "step": step.tolist()}
+                step = 0.3 * step
+            return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
+
+        self.pause()
+        entry, _ = self.journal.once(f"{self.scope}/closing", compute)
+        step = np.array(entry["step"])
+        measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
+        return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
     def _solve(self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float) -> tuple[Optics, Solution]:
-        # A stage in similar media, whose images are off by more than a few samples resolve: it only finds the neighbourhood.
-        samples_most = min(2 * self.spec.samples_per_pixel, options.max_samples)
-        options = replace(options, max_samples=samples_most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
+        # A stage in similar media.
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
-        return self._iterate(problem, options, samples)
+        return self._iterate(problem, self.in_similar_media(options), samples)
 
     def _evaluate(self, label: str, tissue: Tissue | Mouth, samples: int, level: Level) -> Evaluation:
         passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from services.core.errors import CaptureInputError, InputError, JobCancelledError, MeshError
+from services.fit.closing import _with_cosine
 from services.fit.jaw_schedule import arch_place, nearby
 from services.fit.jaw_starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
 from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
@@ -95,3 +96,21 @@ def test_a_mouth_has_coordinates_like_a_tooth() -> None:
     for part in ("0.enamel", "1.dentin", "gums"):
         assert similar.medium(part).sigma_s_reduced == pytest.approx(mouth.medium(part).sigma_s_reduced)
         assert similar.medium(part).mean_cosine == 0.0
+
+
+def test_coordinates_of_one_tooth_are_related() -> None:
+    domain = Domain(tuple(Coordinate((name,)) for name in ("0.enamel.sigma", "0.dentin.alpha", "11.enamel.sigma", "gums.sigma", "cavity.reflectance")))
+    assert domain.relation.tolist() == [[0, 0, 2, 1, 1], [0, 0, 2, 1, 1], [2, 2, 0, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 1]]
+    alone = Domain((Coordinate(("enamel.sigma", "dentin.sigma")), Coordinate(("shape.0",))))
+    assert not alone.relation.any()
+
+
+def test_media_of_one_tissue_take_another_mean_cosine_together() -> None:
+    mouth = Mouth((tissue(2.0), tissue(3.0)), Medium(8.0, 0.96, g1=0.8), 0.3)
+    moved = _with_cosine(mouth, ("0.enamel", "1.enamel", "gums"), math.atanh(0.6))
+    for part in ("0.enamel", "1.enamel", "gums"):
+        assert moved.medium(part).mean_cosine == pytest.approx(0.6)
+        for leaf in ("sigma_s_reduced", "alpha_reduced"):
+            assert getattr(moved.medium(part), leaf) == pytest.approx(getattr(mouth.medium(part), leaf))
+    assert [tooth.dentin for tooth in moved.teeth] == [tooth.dentin for tooth in mouth.teeth]
+    assert moved.reflectance == mouth.reflectance

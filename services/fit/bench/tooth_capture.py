@@ -16,7 +16,7 @@ from services.core.stage import LocalContext
 from services.core.store import is_published
 from services.fit.evaluate import ErrorSums, error_sums
 from services.fit.observations import Observations, ViewStack, read_channel, read_observations
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View, single_tooth
 
@@ -56,7 +56,7 @@ def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> 
 
 @dataclass(frozen=True)
 class PreparedTooth:
-    """A prepared capture in one channel, and what judges a fit of it: exact media, the same for everyone measured."""
+    """A prepared capture in one channel, of a tooth or a jaw, and what judges a fit of it: exact media, the same for everyone measured."""
 
     job: Path
     """Folder with the stage ``prepared``."""
@@ -65,7 +65,7 @@ class PreparedTooth:
     views: tuple[ViewStack, ...]
     engine: Engine
 
-    def errors(self, tissue: Tissue, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
+    def errors(self, tissue: Tissue | Mouth, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
         """On fitted and on held-out images, by two renders of so many paths per pixel."""
         fitted, held_out = ErrorSums(), ErrorSums()
         for number, view in enumerate(self.views):

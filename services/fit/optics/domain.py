@@ -155,6 +155,16 @@ class Domain:
         return mean, precision
 
     @property
+    def relation(self) -> NDArray[np.int_]:
+        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums or wall, 2 of two teeth. All 0 for a tooth alone."""
+        owners = [name.partition(".")[0] for name in (c.targets[0] for c in self.coordinates)]
+        tooth = np.array([int(owner) if owner.isdigit() else -1 for owner in owners])
+        if (tooth < 0).all():
+            return np.zeros((len(tooth), len(tooth)), dtype=int)
+        shared = (tooth < 0)[:, None] | (tooth < 0)
+        return np.where(shared, 1, np.where(tooth[:, None] == tooth, 0, 2))
+
+    @property
     def cosines(self) -> tuple[str, ...]:
         """Parts whose mean cosine is a coordinate. Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity."""
         return tuple(part for c in self.coordinates if c.kind == "cosine" for part in [c.targets[0].rpartition(".")[0]])

@@ -125,15 +125,19 @@ class Response:
     """E (F, F), shrunk."""
 
 
-def response(sums: ClosingSums, prior: Array) -> Response:
+def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_]) -> Response:
     """Shrink the measured response towards the believed curvature.
 
     Args:
         prior: whitened precision T' Lambda T, which joins the measured data.
+        relation: kind of each entry (F, F); entries of one kind are thought to scatter alike.
     """
     excess = sums.response + prior - np.eye(len(prior))
     noise = np.maximum(sums.response_variance, 1e-30)
-    between = _between_variance(excess, noise)
+    between = np.zeros_like(excess)
+    for kind in np.unique(relation):
+        alike = relation == kind
+        between[alike] = _between_variance(excess[alike], noise[alike])
     shrunk, left = excess * between / (between + noise), noise * between / (between + noise)
 
     # A singular value that noise could have made is not believed to be smaller than noise.

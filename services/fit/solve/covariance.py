@@ -102,7 +102,7 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Whitening:
-    """Coordinates y, x = T y, of unit curvature, and the scaled directions (F, K) whose curvature drowns in its own noise."""
+    """Coordinates y, x = T y, of unit curvature, each the nearest to one of x, and the scaled directions (F, K) whose curvature drowns in its own noise."""
 
     transform: Array
     open_directions: Array
@@ -118,7 +118,7 @@ def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
     is_open = eigenvalues < np.maximum(NOISE_FACTOR * noise, tiny)
     believed = np.where(is_open, np.maximum(noise, tiny), eigenvalues)
     curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
-    return Whitening(scale[:, None] * axes / np.sqrt(np.maximum(curvature, tiny)), vectors[:, is_open])
+    return Whitening(scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T), vectors[:, is_open])
 
 
 @dataclass(frozen=True)
@@ -141,17 +141,17 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
     return Pooled((1 - share) * known + share * sums.gradient, (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise, (1 - share) * carried)
 
 
-def closing_step(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> Array:
-    """The last Newton step by the measured response: along what is not open, no longer than one scale, inside the bounds."""
+def closing_step(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums, things: int = 1) -> Array:
+    """The last Newton step by the measured response: along what is not open, no longer than one scale for each of so many things, inside the bounds."""
     mean, precision = domain.prior
     known = whitening(domain, equations)
     t = known.transform
-    solved = response(sums, t.T @ np.diag(precision) @ t)
+    solved = response(sums, t.T @ np.diag(precision) @ t, domain.relation)
     gradient = _pooled(t, equations, sums, solved).gradient + t.T @ (precision * (x - mean))
     scaled = -t @ solved.inverse @ gradient / domain.scale
     scaled = scaled - known.open_directions @ (known.open_directions.T @ scaled)
     low, high = domain.bounds
-    return np.asarray(np.clip(x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled))), low, high) - x)
+    return np.asarray(np.clip(x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - x)
 
 
 def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None) -> Uncertainty:
@@ -172,7 +172,7 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: Clos
         meat = meat + _positive(t.T @ equations.gradient_noise @ t)
         left = t.T @ (equations.gradient + precision * (x - mean))
     else:
-        solved, moved = response(sums, prior), np.linalg.solve(t, np.zeros(count) if step is None else step)
+        solved, moved = response(sums, prior, domain.relation), np.linalg.solve(t, np.zeros(count) if step is None else step)
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
         meat = meat + _positive(pooled.noise) + sums.shift_covariance + np.diag(solved.variance @ (moved + pooled.carried) ** 2)
         left = pooled.gradient + t.T @ (precision * (x - mean)) + np.linalg.solve(inverse, moved) - prior @ moved
