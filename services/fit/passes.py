@@ -39,6 +39,8 @@ Near = tuple[tuple[int, ...], ...]
 
 SECANT_STEP = {"shape": 0.2, "cosine": 0.35}
 """Half the step of the differences that give derivatives to coordinates of these kinds; about their scale in a fit."""
+COSINE_SHARE = 4
+"""Images of other cosines are exact ones and cost most of a step; they get so many times fewer paths, and a column of the Jacobian may be noisy."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,13 @@ class Secant:
     low: Tissue | Mouth
     high: Tissue | Mouth
     width: float
+    share: int = 1
+    """Of the task's samples, one part in so many."""
 
     def slope(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
         """Derivative of a block's images, (L N,)."""
-        low, high = (host.call("images", task.recipe, tissue, view, samples=task.samples, seed=seed).mean for tissue in (self.low, self.high))
+        samples = max(task.samples // self.share, 1)
+        low, high = (host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean for tissue in (self.low, self.high))
         return np.asarray((high - low) / self.width).reshape(-1)
 
 
@@ -324,7 +329,7 @@ class StackProblem(Generic[Optics]):
             below, above = (self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base) for end in ends)
         else:
             below, above = (similar.with_values({coordinate.targets[0]: end}) for end in ends)
-        return Secant(k, below, above, ends[1] - ends[0])
+        return Secant(k, below, above, ends[1] - ends[0], COSINE_SHARE if coordinate.kind == "cosine" else 1)
 
     @property
     def _prefix(self) -> str:
