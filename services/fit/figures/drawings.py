@@ -125,7 +125,8 @@ def _jaw(cast: Cast, case: Case) -> Drawn:
     return Drawn(
         mosaic(rows, columns, [" ".join(image) for image in shown], scale=4),
         f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, {len(case.cameras)} views under two of "
-        f"{len(case.fitted_lights)} fitted lights: error {_percent(fit)} on all fitted images, {_percent(unseen)} under the light that was not fitted. {DIFFERENCE}",
+        f"{len(case.fitted_lights)} fitted lights: error {_percent(fit)} on all fitted images, {_percent(unseen)} under "
+        f"the light that was not fitted. {DIFFERENCE}",
     )
 
 
