@@ -67,10 +67,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m services.fit.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the figures (default: figures)")
     parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas (default: all)")
-    parser.add_argument("--quick", action="store_true", help="smaller captures and fits of few samples, for a check")
+    parser.add_argument("--quick", action="store_true", help="smaller captures of the procedural incisor and fits of few samples, for a check")
     options = parser.parse_args(arguments)
     try:
-        names, cast = chosen_figures(options.only), Cast(QUICK if options.quick else FULL, options.out / "work", real_tooth())
+        names, cast = chosen_figures(options.only), Cast(QUICK if options.quick else FULL, options.out / "work", None if options.quick else real_tooth())
         cast.work.mkdir(parents=True, exist_ok=True)
         for name in names:
             if name == "environment" and memorial() is None:

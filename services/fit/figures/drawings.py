@@ -9,7 +9,7 @@ import numpy as np
 
 from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
 from services.fit.figures.cases import Case
-from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, JAW_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
+from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
 from services.fit.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
 from services.fit.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
 from services.fit.optics.domain import similar_tissue
@@ -115,17 +115,18 @@ def whole_jaw(cast: Cast, subject: int) -> Drawn:
 def _jaw(cast: Cast, case: Case) -> Drawn:
     fitted = Fitted(case.fitted(cast.work))
     comparisons = fitted.compared(cast.effort.shown_samples)
-    shown = [(camera, light) for camera in ("c0", "c1", "c2") for light in ("l0", "l3")]
+    shown = [(camera, light) for camera in case.cameras for light in ("l0", "l3")]
     rows = [_drawn(comparisons, image) for image in shown]
     columns = [Column(name) for name in ("photo", "fit", "difference")]
-    images = [[image for image in comparisons if (image[1] in JAW_LIGHTS) == is_fitted] for is_fitted in (True, False)]
+    images = [[image for image in comparisons if case.is_fitted(*image) == is_fitted] for is_fitted in (True, False)]
     fit, unseen = (error_of(comparisons, some) for some in images)
     states = [tooth.state for tooth in fitted.report.teeth.values()]
     counts = ", ".join(f"{states.count(state)} {state}" for state in ("fitted", "tied", "failed") if state in states)
     return Drawn(
         mosaic(rows, columns, [" ".join(image) for image in shown], scale=4),
-        f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, three views under two of five fitted lights: error "
-        f"{_percent(fit)} on all fitted images, {_percent(unseen)} under the light that was not fitted. {DIFFERENCE}",
+        f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, {len(case.cameras)} views under two of "
+        f"{len(case.fitted_lights)} fitted lights: error {_percent(fit)} on all fitted images, {_percent(unseen)} under "
+        f"the light that was not fitted. {DIFFERENCE}",
     )
 
 

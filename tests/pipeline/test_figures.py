@@ -1,0 +1,32 @@
+"""A figure from nothing: capture and fit by the command line, renders beside photographs, a caption with their errors; then again from what is kept."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from services.fit.attempt import UNEXPLAINED
+from services.fit.figures.__main__ import main
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_figure_is_made_from_nothing_and_its_fit_used_again(tmp_path: Path) -> None:
+    arguments = ["--quick", "--only", "fig13", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    caption = (tmp_path / "fig13.txt").read_text()
+    fitted, unseen = (float(number) for number in re.findall(r"([\d.]+) % on", caption))
+    # A fit that is called converged explains its images this well.
+    assert 0 < fitted < 100 * UNEXPLAINED
+    assert 0 < unseen < 100 * UNEXPLAINED
+    with Image.open(tmp_path / "fig13.png") as image:
+        assert np.asarray(image).std() > 30
+    reports = {path: path.stat().st_mtime_ns for path in tmp_path.glob("work/*/job/fit/*.json")}
+    assert reports
+    assert main(arguments) == 0
+    assert {path: path.stat().st_mtime_ns for path in reports} == reports
+    assert (tmp_path / "fig13.txt").read_text() == caption
