@@ -22,7 +22,7 @@ from services.fit.observations import ChannelFiles, Observations, ViewStack
 from services.fit.passes import Passes, TraceRow
 from services.fit.pictures import write_pictures, write_preview
 from services.fit.seeds import Seeds
-from services.fit.stages import ChannelFit, StepReport
+from services.fit.stages import ChannelFit, StepReport, history_key
 
 CHECKPOINT = "fit-checkpoint"
 UNEXPLAINED = 0.15
@@ -89,8 +89,8 @@ class Attempt:
             data = asdict(step)
             place = step.channel if step.tooth is None else f"{step.channel}, tooth {step.tooth}"
             message = f"{place} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
+            journal.once(history_key(step.channel, step.step), lambda: data)
             self.context.report(StageEvent(stage="fit", kind="step", message=message, done=done(step.step), data=data))
-            journal.once(f"{step.channel}/history/{step.step}", lambda: data)
             if step.step % PREVIEW_EVERY == 1 and step.tooth is None:
                 for preview in write_preview(self.context.root, step, evaluation, observations.manifest, views):
                     self.context.report(StageEvent(stage="fit", kind="preview", data=preview))

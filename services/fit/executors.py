@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -43,12 +44,13 @@ class DaskExecutor:
     """Runs tasks on any worker; a worker's tasks share its one child process."""
 
     def __init__(self, client: Any, factory: str, prefix: str) -> None:
-        self._client, self._prefix, self._plugin = client, prefix, plugin_name(factory)
+        self._client, self._prefix, self._plugin, self._submitted = client, prefix, plugin_name(factory), itertools.count()
         client.register_plugin(_EnginePlugin(factory), name=self._plugin)
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
-        """See Executor."""
-        return self._client.submit(run_on_worker, self._plugin, task, *args, key=f"{self._prefix}-{key}", pure=False, retries=ALLOWED_RETRIES)
+        """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own."""
+        own = f"{self._prefix}-{next(self._submitted)}-{key}"
+        return self._client.submit(run_on_worker, self._plugin, task, *args, key=own, pure=False, retries=ALLOWED_RETRIES)
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """See Executor."""

@@ -179,9 +179,9 @@ class ChannelSchedule(Stages[Tissue]):
             last = problem_now, *self._iterate(problem_now, limits, samples)
             return last[1]
 
-        def tell(stage: str, step: int, stained: Tissue, verdict: str, is_new: bool) -> None:
+        def tell(stage: str, step: int, stained: Tissue, verdict: str) -> None:
             self.steps += 1
-            if is_new:
+            if not self.is_told:
                 self._announce(stage, step, stained, samples, verdict)
 
         stage = StainStage(self.passes, self.journal, layout, samples, self.pause, tell)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from services.core.geometry import Tooth
 
 ENGINE = "services.fit.transport.engine:Engine"
-CHECKPOINT = "fit-checkpoint"
 
 
 def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:

@@ -55,6 +55,11 @@ class StepReport:
     """FDI number, while a jaw's fit looks at one tooth alone."""
 
 
+def history_key(channel: str, step: int) -> str:
+    """The journal's key of a step's report."""
+    return f"{channel}/history/{step}"
+
+
 @dataclass(frozen=True)
 class ChannelFit(Generic[Optics]):
     """A channel's result."""
@@ -114,6 +119,11 @@ class Stages(ABC, Generic[Optics]):
         """Begins the journal's keys of this fit."""
         return self.passes.seeds.channel
 
+    @property
+    def is_told(self) -> bool:
+        """Whether the step just taken is in the history; one that was cut off before its report is not."""
+        return history_key(self.files.channel, self.steps) in self.journal.entries
+
     def options(self, level: Level) -> Options:
         """Limits of a stage on images of this resolution; it has converged within ``IMAGE_TOLERANCE``."""
         most = self.spec.max_samples_per_pixel
@@ -154,11 +164,11 @@ class Stages(ABC, Generic[Optics]):
         state = solver.init(problem.domain.x_of(problem.base), samples)
         while not solver.terminate(state):
             self.pause()
-            entry, is_new = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))
+            entry, _ = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))
             self.steps -= state.step
             state = kind.state_from(entry)
             self.steps += state.step
-            if is_new:
+            if not self.is_told:
                 self._tell(problem, state)
         solution = solver.finish(state)
         return problem.domain.tissue_at(solution.x, problem.base), solution

@@ -64,8 +64,8 @@ class StainStage:
     samples: int
     """Paths per pixel of every pass."""
     pause: Callable[[], None]
-    tell: Callable[[str, int, Tissue, str, bool], None]
-    """Told of every step: stage, step in it, tissue, what happened, and whether it is new."""
+    tell: Callable[[str, int, Tissue, str], None]
+    """Told of every step: stage, step in it, tissue and what happened."""
 
     def run(self, tissue: Tissue, refit: Callable[[Tissue, int, bool], Tissue]) -> Tissue | None:
         """Fit the texture of a tooth whose media are fitted.
@@ -107,10 +107,10 @@ class StainStage:
             return solve(state, self.sums(f"{stage}-{step}", self._with(tissue, state), seeds)).record()
 
         self.pause()
-        entry, is_new = self.journal.once(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
+        entry, _ = self.journal.once(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
         moved = StainState.of(entry)
         size = float(np.sqrt(np.mean((moved.depth - state.depth) ** 2)))
-        self.tell(stage, step + 1, self._with(tissue, moved), f"texels moved by {size:.3f}", is_new)
+        self.tell(stage, step + 1, self._with(tissue, moved), f"texels moved by {size:.3f}")
         return moved
 
     def _with(self, tissue: Tissue, state: StainState) -> Tissue:

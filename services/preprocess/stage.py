@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import teeth_folder
@@ -13,6 +13,8 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import MANIFEST, StageWriter, create_array, open_stage, write_record
 
 if TYPE_CHECKING:
+    import zarr
+
     from services.preprocess.source import Source
 
 
@@ -28,7 +30,6 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     import numpy as np
 
     from services.preprocess.brightness import Brightness
-    from services.preprocess.motion import stored_step
     from services.preprocess.quality import QualityReport, assess, unusable_note, write_picture
     from services.preprocess.subject import NOTHING, read_subject
     from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
@@ -49,22 +50,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     images_in_all = sum(len(source.lights_of(k)) for k in range(len(cameras)))
     context.report(StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras."))
 
-    # One chunk per image, so that each is written once
     height, width = max(c.size[1] for c in cameras), max(c.size[0] for c in cameras)
-    planes, stack = (len(cameras), len(lights), height, width), ("camera", "light", "y", "x")
-    store = writer.folder / "prepared.zarr"
-    radiance, variance = (
-        create_array(store, name, (*planes, len(channels)), (1, 1, height, width, len(channels)), "float32", (*stack, "channel"))
-        for name in ("radiance", "variance")
-    )
-    valid = create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
-    surface = create_array(store, "surface", (len(cameras), height, width), (1, height, width), "int16", ("camera", "y", "x"))
-    motion = None
-    if source.measures_motion:
-        step = stored_step((height, width))
-        grid = (-(-height // step), -(-width // step))
-        motion = create_array(store, "motion", (len(cameras), len(lights), *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
-        motion.attrs["step_px"] = step
+    planes = (len(cameras), len(lights), height, width)
+    radiance, variance, valid, surface, motion = _create_arrays(writer.folder / "prepared.zarr", planes, len(channels), with_motion=source.measures_motion)
 
     brightness, reports, done, seen = Brightness(), [], 0, np.zeros(len(teeth), dtype=np.int64)
     for k, camera in enumerate(cameras):
@@ -109,10 +97,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
                 )
 
     valid_pixels = sum(report.valid_pixels for report in reports)
-    if valid_pixels == 0 and brightness.dark:
-        raise CaptureInputError(f"Every image of {source.root} is dark: no tooth is above the noise in any; check exposure and lights, then capture again.")
     if valid_pixels == 0:
-        raise CaptureInputError(f"No image of {source.root} has a valid tooth pixel; look at its exposure, noise and masks.")
+        what = "is dark: no tooth is above the noise" if brightness.dark else "lacks a valid tooth pixel"
+        raise CaptureInputError(f"Every image of {source.root} {what}; check exposure, lights, noise and masks, then capture again.")
     brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in teeth)
     notes = [*source.notes, *brightness.notes(), *unusable_note(reports)]
@@ -140,6 +127,28 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     writer.publish(manifest)
     context.report(StageEvent(stage="prepare", kind="finished", message=f"{valid_pixels} valid pixels in {done} images.", done=1.0))
     return manifest
+
+
+def _create_arrays(
+    store: Path, planes: tuple[int, int, int, int], channels: int, *, with_motion: bool
+) -> tuple[zarr.Array[Any], zarr.Array[Any], zarr.Array[Any], zarr.Array[Any], zarr.Array[Any] | None]:
+    """Radiance, variance, valid, surface and, where it is measured, motion; one chunk per image, so that each is written once."""
+    from services.preprocess.motion import stored_step
+
+    cameras, _, height, width = planes
+    stack = ("camera", "light", "y", "x")
+    radiance, variance = (
+        create_array(store, name, (*planes, channels), (1, 1, height, width, channels), "float32", (*stack, "channel")) for name in ("radiance", "variance")
+    )
+    valid = create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
+    surface = create_array(store, "surface", (cameras, height, width), (1, height, width), "int16", ("camera", "y", "x"))
+    if not with_motion:
+        return radiance, variance, valid, surface, None
+    step = stored_step((height, width))
+    grid = (-(-height // step), -(-width // step))
+    motion = create_array(store, "motion", (*planes[:2], *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
+    motion.attrs["step_px"] = step
+    return radiance, variance, valid, surface, motion
 
 
 def _open_source(spec: JobSpec, root: Path) -> Source:

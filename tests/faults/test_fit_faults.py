@@ -17,6 +17,7 @@ from distributed import Client, LocalCluster
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import open_stage
+from services.fit.executors import DaskExecutor
 from services.fit.stage import run
 from tests.support.prepared import FAKE, write_prepared
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
@@ -96,6 +97,15 @@ def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(client: Cl
     fit_once(tmp_path / "here", FAKE, **options)
     assert answer(tmp_path / "cluster") == answer(tmp_path / "here")
     assert {row["kind"] for row in trace(tmp_path / "cluster")} >= {"stain" if "stains" in options else "gradient" if "solver" in options else "image"}
+
+
+def echo(_host: object, number: int) -> int:
+    return number
+
+
+def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
+    run_on = DaskExecutor(client, FAKE, "names")
+    assert run_on.gather([run_on.submit("same", echo, number) for number in range(5)]) == list(range(5))
 
 
 def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:

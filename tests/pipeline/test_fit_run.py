@@ -154,6 +154,20 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
     assert min(e.data["step"] for e in events if e.kind == "step") == stop_at + 1
 
 
+def test_a_step_cut_off_before_its_report_is_told_by_the_next_attempt(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+    _, report, _ = finished
+    write_prepared(tmp_path)
+    fit(tmp_path)
+    journal = tmp_path / "fit-checkpoint" / "journal.json"
+    stored = json.loads(journal.read_text())
+    del stored["entries"]["green/history/2"]
+    journal.write_text(json.dumps(stored))
+    events: list[StageEvent] = []
+    assert without_time(fit(tmp_path, attempt=2, events=events)) == without_time(report)
+    assert [event.data["step"] for event in events if event.kind == "step"] == [2]
+    assert len(json.loads((tmp_path / "fit" / "history.json").read_text())) == report.steps
+
+
 def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
     _, report, _ = finished
     write_prepared(tmp_path)

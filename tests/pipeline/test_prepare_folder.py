@@ -238,7 +238,7 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
         CaptureInputError,
         r"times as bright as a white surface .* intensities per steradian with mm",
     ),
-    "all images dark": (darken_all, CaptureInputError, r"Every image of .* is dark.*check exposure and lights"),
+    "all images dark": (darken_all, CaptureInputError, r"Every image of .* is dark.*check exposure, lights"),
     "tooth out of view": (edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)), CaptureInputError, r"No tooth .* camera front"),
 }
 
