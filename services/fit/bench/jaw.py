@@ -45,7 +45,7 @@ class Case:
     """Of the job."""
 
 
-FULL = Case(1.0, 512, 256, {"max_samples_per_pixel": 256})
+FULL = Case(1.0, 512, 64, {"max_samples_per_pixel": 256})
 QUICK = Case(3.0, 32, 32, {"samples_per_pixel": 8, "max_samples_per_pixel": 16, "max_steps": 2, "search_candidates": 400})
 
 
