@@ -37,7 +37,7 @@ class JawFigure(Figure):
     """One tooth's number, with what noise makes of it."""
 
     resolution: float = 0.0
-    """Of a medium one standard error; of images the error that the photographs' noise looks like. Relative, as the number."""
+    """Of a medium one standard error of its logarithm, where errors are even; of images the error that the photographs' noise looks like."""
 
     @property
     def is_beyond_noise(self) -> bool:
@@ -87,7 +87,8 @@ def figures(folder: Path, options: dict[str, Any], workers: int = 1) -> Iterator
             ("dentin.alpha_reduced", true.dentin.alpha_reduced, DENTIN_MUST, DENTIN_GOAL),
         ):
             found, whole = tooth.parameters[CHANNEL][name], 1 - value if name.endswith("alpha_reduced") else value
-            off, error = abs(found.value - value) / whole, (found.se or 0.0) / whole
+            measured = 1 - found.value if name.endswith("alpha_reduced") else found.value
+            off, error = abs(measured / whole - 1), (found.se or 0.0) / measured
             yield JawFigure("jaw", fdi, name, off, must, goal, cost.processor_s, note + ("" if found.determined else ", not determined"), error)
 
 
