@@ -15,21 +15,23 @@ import resource
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from services.core.records import FitReport, JobSpec
 from services.core.store import open_stage
-from services.fit.jaw_views import label_views
-from services.fit.observations import read_channel, read_observations
+from services.fit.bench.jaw import prepared_jaw, reported_mouth
+from services.fit.bench.tooth_capture import PreparedTooth
+from services.fit.jaw_views import showing
+from services.fit.optics.parameters import Mouth
 from tests.benchmarks.fit_table import Figure
 from tests.support.jaw_truth import CHANNEL, JawTruth, read_jaw_truth, write_jaw_capture
 
 IMAGE_MUST, ENAMEL_MUST, DENTIN_MUST = 0.05, 0.15, 0.10
 IMAGE_GOAL, ENAMEL_GOAL, DENTIN_GOAL = 0.02, 0.05, 0.04
+IMAGE = "image, held out"
+JUDGE_SAMPLES = 512
 
 
 @dataclass(frozen=True)
@@ -37,12 +39,12 @@ class JawFigure(Figure):
     """One tooth's number, with what noise makes of it."""
 
     resolution: float = 0.0
-    """Of a medium one standard error; of images the error that the photographs' noise looks like. Relative, as the number."""
+    """Of a medium one standard error of its logarithm, where errors are even; of images the error that noise of photographs and renders looks like."""
 
     @property
     def is_beyond_noise(self) -> bool:
         """Whether it misses its limit by more than three times what noise does; squares of image errors are what noise adds to."""
-        if self.figure.startswith("image"):
+        if self.figure == IMAGE:
             return self.value**2 > self.must**2 + 3 * self.resolution**2
         return self.value > self.must + 3 * self.resolution
 
@@ -74,47 +76,38 @@ def fit(folder: Path, options: dict[str, Any], workers: int) -> tuple[JawTruth, 
 def figures(folder: Path, options: dict[str, Any], workers: int = 1) -> Iterator[JawFigure]:
     """Every visible tooth's numbers, those of all images together first."""
     truth, spec, report, cost = fit(folder, options, workers)
-    resolved = _resolutions(folder / "job", spec)
+    images = judged(prepared_jaw(folder / "job", spec), reported_mouth(report, truth.mouth), JUDGE_SAMPLES)
     ended = f"{report.steps} steps, {'converged' if report.converged else 'not converged'}; {cost}"
-    yield JawFigure("jaw", "all", "image, held out", report.held_out_error[CHANNEL], IMAGE_MUST, IMAGE_GOAL, cost.processor_s, ended, resolved["all"])
-    for (fdi, tooth), true in zip(report.teeth.items(), truth.mouth.teeth, strict=True):
+    value, resolution = next(images)
+    yield JawFigure("jaw", "all", IMAGE, value, IMAGE_MUST, IMAGE_GOAL, cost.processor_s, ended, resolution)
+    for (fdi, tooth), true, (value, resolution) in zip(report.teeth.items(), truth.mouth.teeth, images, strict=True):
         if tooth.state != "fitted":
             continue
         note = f"{tooth.pixels} pixels"
-        yield JawFigure("jaw", fdi, "image, held out", tooth.held_out_error[CHANNEL], IMAGE_MUST, IMAGE_GOAL, cost.processor_s, note, resolved[fdi])
-        for name, value, must, goal in (
+        yield JawFigure("jaw", fdi, IMAGE, value, IMAGE_MUST, IMAGE_GOAL, cost.processor_s, note, resolution)
+        for name, right, must, goal in (
             ("enamel.sigma_s_reduced", true.enamel.sigma_s_reduced, ENAMEL_MUST, ENAMEL_GOAL),
-            ("dentin.alpha_reduced", true.dentin.alpha_reduced, DENTIN_MUST, DENTIN_GOAL),
+            ("dentin.alpha_reduced", 1 - true.dentin.alpha_reduced, DENTIN_MUST, DENTIN_GOAL),
         ):
-            found, whole = tooth.parameters[CHANNEL][name], 1 - value if name.endswith("alpha_reduced") else value
-            off, error = abs(found.value - value) / whole, (found.se or 0.0) / whole
-            yield JawFigure("jaw", fdi, name, off, must, goal, cost.processor_s, note + ("" if found.determined else ", not determined"), error)
+            estimate = tooth.parameters[CHANNEL][name]
+            found = 1 - estimate.value if name.endswith("alpha_reduced") else estimate.value
+            known = note if estimate.determined else f"{note}, not determined"
+            yield JawFigure("jaw", fdi, name, abs(found / right - 1), must, goal, cost.processor_s, known, (estimate.se or 0.0) / found)
+
+
+def judged(prepared: PreparedTooth, mouth: Mouth, samples: int) -> Iterator[tuple[float, float]]:
+    """Held-out error of all images and then of each tooth's pixels, with the error that noise of photographs and renders looks like."""
+    for views in (prepared.views, *(showing(prepared.views, k) for k in range(len(mouth.teeth)))):
+        own = replace(prepared, views=views)
+        held_out = own.errors(mouth, samples=samples, seed=23)[1]
+        signal = held_out.reference_squared - held_out.reference_variance
+        yield held_out.error or 0.0, (own.resolution() ** 4 + held_out.product_noise / signal**2) ** 0.25
 
 
 def _processor_s() -> float:
     # Of this process and of children that have ended.
     usage = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(one.ru_utime + one.ru_stime for one in usage)
-
-
-def _resolutions(job: Path, spec: JobSpec) -> dict[str, float]:
-    # By FDI number: one standard deviation of the square of the held-out error by the photographs' noise, as an error.
-    observations = read_observations(job, spec)
-    reference, variance, shown = [], [], []
-    for view in label_views(read_channel(observations, CHANNEL, spec), observations):
-        chosen = view.valid & view.held_out[:, None]
-        assert view.parts is not None
-        reference.append(view.reference[chosen])
-        variance.append(view.variance[chosen])
-        shown.append(np.broadcast_to(view.parts.shown, chosen.shape)[chosen])
-    r, v, part = (np.concatenate(arrays) for arrays in (reference, variance, shown))
-
-    def resolution(pixels: np.ndarray[Any, np.dtype[np.bool_]]) -> float:
-        r_own, v_own = r[pixels], v[pixels]
-        return float((2 * v_own @ v_own) ** 0.25 / np.sqrt(r_own @ r_own - v_own.sum()))
-
-    teeth = {str(tooth.fdi): part == k for k, tooth in enumerate(observations.teeth)}
-    return {name: resolution(pixels) for name, pixels in ({"all": np.ones(len(part), dtype=bool)} | teeth).items() if pixels.any()}
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from services.core.records import FitReport, FolderCapture, JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.core.store import StageWriter, read_record
+from services.core.store import StageWriter, is_published, read_record
 from services.fit.bench import Row
 from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, prepare, sensor_noise
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
@@ -45,7 +45,7 @@ class Case:
     """Of the job."""
 
 
-FULL = Case(1.0, 512, 256, {"max_samples_per_pixel": 256})
+FULL = Case(1.0, 512, 64, {"max_samples_per_pixel": 256})
 QUICK = Case(3.0, 32, 32, {"samples_per_pixel": 8, "max_samples_per_pixel": 16, "max_steps": 2, "search_candidates": 400})
 
 
@@ -130,13 +130,14 @@ def write_photographs(folder: Path, case: Case) -> None:
 
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
-    """Prepare a jaw's capture below ``job`` and build its scene."""
+    """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel shows."""
     from services.fit.jaw_driver import known_dentin
     from services.fit.jaw_views import label_views
     from services.fit.observations import channel_scene, read_channel, read_observations
     from services.fit.transport.engine import Engine
 
-    prepare(job, spec)
+    if not is_published(job, "prepared"):
+        prepare(job, spec)
     observations = read_observations(job, spec)
     scene = channel_scene(observations, CHANNEL, [known_dentin(tooth) for tooth in observations.teeth], spec)
     return PreparedTooth(job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene))
