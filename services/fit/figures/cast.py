@@ -117,7 +117,7 @@ class Cast:
 
     @property
     def lone_view(self) -> Case:
-        """The procedural incisor from one side, eight lights of twelve fitted: small, for what takes many fits."""
+        """The procedural incisor from one side, nine lights of twelve fitted: small, for what takes many fits."""
         capture = self._phantom("lone-view", self.effort.lone_mm, 2 * self.effort.photo_samples, cameras=1, lights=12)
         return Case("lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job))
 

@@ -29,10 +29,11 @@ def read_environment(path: Path) -> Array:
     Raises:
         InputError: no such file.
     """
-    import mitsuba as mi
-
     if not path.is_file():
         raise InputError(f"Environment image {path} does not exist; give an equirectangular EXR or HDR file.")
+    prepare_device()
+    import mitsuba as mi
+
     image = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False), dtype=np.float64)
     height = len(image)
     solid_angle = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
@@ -41,6 +42,7 @@ def read_environment(path: Path) -> Array:
 
 def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:
     """An emitter of one channel (H, W) around a tooth whose z axis is occlusal, the top of the image towards the roots, as a person sits."""
+    prepare_device()
     import mitsuba as mi
 
     place = mi.ScalarTransform4f()
