@@ -228,7 +228,7 @@ class Stages(ABC, Generic[Optics]):
 
     def _announce(self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None) -> None:
         # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
-        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, max(self.spec.samples_per_pixel // 2, LEAST_SAMPLES), self.files.coarse)
+        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse)
         fitted, held_out = evaluation.fitted, evaluation.held_out
         leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         values = {f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves} | self._others(tissue)
