@@ -47,6 +47,10 @@ class Camera(Record):
         image = local @ np.asarray(self.K).T
         return image[:, :2] / image[:, 2:3], local[:, 2]
 
+    def pixel_mm(self, point_mm: NDArray[np.float64]) -> float:
+        """Edge of a pixel at a world point (3,), mm."""
+        return float(self.project(point_mm[None])[1][0] / self.K[0][0])
+
     def rays(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World-space origin (3,) and unit directions (N, 3) through pixel coordinates."""
         pose = np.asarray(self.camera_from_world)

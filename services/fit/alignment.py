@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.geometry import Camera
 from services.core.records import MaskBit
 from services.core.store import reading
 from services.fit.evaluate import Evaluation
@@ -85,7 +84,7 @@ def _compared(
     seen = np.flatnonzero(np.any([view.valid.any(axis=1) for view in views], axis=0))
     store, index = observations.folder / "prepared.zarr", observations.manifest.channels.index(channel)
     names = [camera.name for camera in observations.manifest.cameras]
-    centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0, keepdims=True)
+    centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
     pairs = []
     with reading(store / "radiance") as radiance, reading(store / "variance") as variance, reading(store / "valid") as bits:
         for view in views:
@@ -100,13 +99,9 @@ def _compared(
                 noise = np.nan_to_num(np.asarray(variance[number, light])[:height, :width, index].astype(np.float64))
                 render = np.full((height, width), np.nan)
                 render[pixels[:, 1], pixels[:, 0]] = values
-                images.append(_Compared(photo, noise, render, _pixel_mm(view.camera, centre_mm)))
+                images.append(_Compared(photo, noise, render, view.camera.pixel_mm(centre_mm)))
             pairs.append((view, images))
     return pairs
-
-
-def _pixel_mm(camera: Camera, centre_mm: Array) -> float:
-    return float(camera.project(centre_mm)[1][0] / camera.K[0][0])
 
 
 def _offset(view: ViewStack, images: list[_Compared], tooth: int | None) -> Offset | None:

@@ -132,7 +132,7 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
     """
     if spec.dentin == "known":
         assert tooth.dentin is not None
-        return DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
+        return DentinShape.known(tooth.dentin)
     if spec.dentin == "fit":
         from services.fit.anatomy.blend import dentin_blend_shape
         from services.fit.anatomy.dimensions import upper_tooth
@@ -145,6 +145,5 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
 
 def pixel_edge_mm(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> float:
     """Median over cameras of the spacing of fitted pixels at the tooth."""
-    centre_mm = tooth.outer.vertices_mm.mean(axis=0, keepdims=True)
-    sizes = [camera.project(centre_mm)[1][0] / camera.K[0][0] for camera in cameras]
-    return float(np.median(sizes)) * spec.pixel_step
+    centre_mm = tooth.outer.vertices_mm.mean(axis=0)
+    return float(np.median([camera.pixel_mm(centre_mm) for camera in cameras])) * spec.pixel_step

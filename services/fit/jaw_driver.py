@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import FitReport, JobSpec
@@ -67,7 +65,7 @@ class JawDriver:
             raise SettingsError("A jaw is fitted with one lobe per medium; set lobes to 1, or fit its teeth one by one with kind 'tooth'.")
         observations = read_observations(attempt.context.root, spec)
         observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
-        dentins = [known_dentin(tooth) for tooth in observations.teeth]
+        dentins = known_dentins(observations.teeth)
         for tooth in observations.teeth if spec.dentin != "none" else ():
             if tooth.dentin is None:
                 attempt.log(f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh.")
@@ -99,9 +97,9 @@ def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> To
     return replace(tooth, dentin=Mesh(shape.vertices_mm((SHAPE[0],) * len(shape.modes_mm)), shape.base.faces))
 
 
-def known_dentin(tooth: Tooth) -> DentinShape | None:
-    """Its dentin as a surface that does not move."""
-    return None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
+def known_dentins(teeth: Sequence[Tooth]) -> list[DentinShape | None]:
+    """Each tooth's dentin as a surface that does not move."""
+    return [None if tooth.dentin is None else DentinShape.known(tooth.dentin) for tooth in teeth]
 
 
 @dataclass

@@ -31,7 +31,7 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surf
     # through (optical depth 16); of a thin boundary the first reflection is left out, as highlights are.
     lights = uniform_room(200)
     core = sphere(1.2)
-    dentin = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
+    dentin = DentinShape.known(core)
     scene = single_tooth(sphere(2.0), dentin, FAR_MM * lights, np.full(len(lights), FAR_MM**2 * 4 * np.pi / len(lights)), boundary)
     tissue = Tissue(Medium(2, 1, 0.8, 0.5, -0.2), Medium(4, 1, 1, 0.3))
     view = whole_view(camera_at((0.3, 1, 0.2), size=4, span_mm=0.8))

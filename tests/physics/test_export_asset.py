@@ -59,7 +59,7 @@ class Rig:
     ) -> tuple[np.ndarray, np.ndarray]:
         dentin = self.tooth.dentin
         assert dentin is not None
-        shape = DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
+        shape = DentinShape.known(dentin)
         recipe = single_tooth(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
         tissue = TISSUE
         if stains is not None:

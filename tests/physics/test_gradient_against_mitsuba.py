@@ -31,7 +31,7 @@ FALSE_ALARM = 1e-3
 
 def test_gradients_agree_with_prbvolpath(tmp_path: Path) -> None:
     outer, core = ellipsoid(SEMI_AXES_MM), dentin_shape().vertices_mm((0.5, 0.4))
-    dentin = DentinShape(type(outer)(core, outer.faces), np.zeros((0, len(core), 3)))
+    dentin = DentinShape.known(type(outer)(core, outer.faces))
     files = tmp_path / "outer.ply", tmp_path / "dentin.ply"
     write_mesh(files[0], outer)
     write_mesh(files[1], dentin.base)

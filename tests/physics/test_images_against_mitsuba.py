@@ -34,7 +34,7 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
     importlib.import_module("services.fit.export.shipped.thin_boundary").register()
     outer, shape = ellipsoid(SEMI_AXES_MM), dentin_shape()
     core = shape.vertices_mm((0.5, 0.4))
-    dentin = DentinShape(type(outer)(core, outer.faces), np.zeros((0, len(core), 3)))
+    dentin = DentinShape.known(type(outer)(core, outer.faces))
     camera = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0)
     write_mesh(tmp_path / "outer.ply", outer)
     write_mesh(tmp_path / "dentin.ply", dentin.base)
@@ -63,7 +63,7 @@ def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least
         Medium(enamel["sigma_t"], enamel["albedo"], enamel["beta"], enamel["g1"], enamel["g2"]), Medium(inner["sigma_t"], inner["albedo"], g1=inner["g"])
     )
     assert tooth.dentin is not None
-    dentin = DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3)))
+    dentin = DentinShape.known(tooth.dentin)
     lights = np.array([light.position_mm for light in capture.lights])
     engine = Engine(single_tooth(tooth.outer, dentin, lights, np.array([light.intensity[0] for light in capture.lights])))
     camera = capture.cameras[0]

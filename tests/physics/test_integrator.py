@@ -104,7 +104,7 @@ def engine_images(
     tissue: Tissue, light: int, seed: int, boundary: Boundary = "matched", intensity: float = INTENSITY, *, layered: bool = True
 ) -> tuple[Array, Array]:
     """What the project's own engine sees, mean and its variance."""
-    dentin = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3))) if layered else None
+    dentin = DentinShape.known(CORE) if layered else None
     engine = Engine(single_tooth(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
     image = engine.images(tissue, whole_view(CAMERA), samples=512, seed=seed, batches=BATCHES)
     return image.mean[0].reshape(SIZE, SIZE), image.variance[0].reshape(SIZE, SIZE)

@@ -38,7 +38,7 @@ TISSUE = Tissue(Medium(1.5, 0.98, 0.9, 0.6, -0.3), Medium(4.0, 0.75, 0.3, 0.6, -
 def test_a_gradual_border_looks_as_in_mitsuba(tmp_path: Path) -> None:
     prepare_device()
     outer, core = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.7)
-    known = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
+    known = DentinShape.known(core)
     lights = LIGHTS_MM[[1, 3]]
     scene = replace(single_tooth(outer, known, lights, np.full(2, INTENSITY)), border_width_mm=WIDTH_MM)
     camera = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0)

@@ -174,7 +174,7 @@ def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     lobes = Medium(4.0, 0.85, 0.8, 0.5, -0.2)
     tissue = Tissue(Medium(1.5, 0.95, table=over_equal_cosines(values)), lobes)
     outer, core = ellipsoid(SEMI_AXES_MM), dentin_shape().vertices_mm((0.5, 0.4))
-    dentin = DentinShape(type(outer)(core, outer.faces), np.zeros((0, len(core), 3)))
+    dentin = DentinShape.known(type(outer)(core, outer.faces))
     write_mesh(tmp_path / "outer.ply", outer)
     write_mesh(tmp_path / "dentin.ply", dentin.base)
     camera, light = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0), LIGHTS_MM[1]

@@ -180,7 +180,7 @@ def test_dentin_has_room_inside_enamel() -> None:
     outer = ellipsoid(axes)
 
     def scene(dentin: Mesh) -> SceneRecipe:
-        return single_tooth(outer, DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3))), LIGHTS_MM, np.ones(5))
+        return single_tooth(outer, DentinShape.known(dentin), LIGHTS_MM, np.ones(5))
 
     centred = ellipsoid(axes - 0.3)
     shifted = Mesh(centred.vertices_mm + np.array([0.0, 0.5, 0.0]), centred.faces)
@@ -199,7 +199,7 @@ def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.Mo
     # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100 times too bright.
     monkeypatch.setattr("services.fit.transport.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
-    known = DentinShape(outer, np.zeros((0, len(outer.vertices_mm), 3)))
+    known = DentinShape.known(outer)
     enamel, dentin, view = Medium(3, 0.99, g1=0.8), Medium(8, 0.98, g1=0.7), whole_view(camera_at((0, 1, 0)))
     intensities = np.full(5, 1e5)
     coincident = Engine(single_tooth(outer, known, LIGHTS_MM, intensities)).images(Tissue(enamel, dentin), view, samples=64, seed=1).mean.sum()

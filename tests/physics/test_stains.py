@@ -39,7 +39,7 @@ def test_a_stained_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     (tooth,) = stained_recipe("matched").teeth
     assert tooth.dentin is not None
     core = tooth.dentin.vertices_mm(TISSUE.shape)
-    known = DentinShape(type(tooth.outer)(core, tooth.outer.faces), np.zeros((0, len(core), 3)))
+    known = DentinShape.known(type(tooth.outer)(core, tooth.outer.faces))
     scene = replace(
         stained_recipe("matched"), teeth=(replace(tooth, dentin=known),), light_positions_mm=LIGHTS_MM[[1, 3]], light_intensities=np.full(2, INTENSITY)
     )

@@ -145,8 +145,8 @@ class DirectFakeEngine(FakeEngine):
     shared_noise = 0.3
 
 
-class SlowFakeEngine(FakeEngine):
-    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are the fake engine's."""
+class Slowly(FakeEngine):
+    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are those of the engine it is mixed with."""
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
         time.sleep(0.01)
@@ -155,3 +155,7 @@ class SlowFakeEngine(FakeEngine):
     def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
         time.sleep(0.02)
         return super().jacobian(tissue, view, names, samples=samples, seed=seed)
+
+
+class SlowFakeEngine(Slowly):
+    """The fake engine, slowly."""

@@ -1,17 +1,14 @@
 """The fake engine for a whole mouth: every pixel shows the tooth or the gums at its middle, and the wall brightens all of them."""
 
-# ruff: noqa: ARG002 - signatures are those of what is replaced
 from __future__ import annotations
-
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.anatomy.rays import RayScene, pixel_rays
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, View
-from tests.support.fake_engine import FakeEngine
+from services.fit.transport.recipe import SceneRecipe, View
+from tests.support.fake_engine import FakeEngine, Slowly
 
 Array = NDArray[np.float64]
 
@@ -45,13 +42,5 @@ class FakeMouthEngine(FakeEngine):
         return np.where((mesh < 0) | (mesh >= len(self.recipe.teeth)), len(self.recipe.teeth), mesh)
 
 
-class SlowFakeMouthEngine(FakeMouthEngine):
-    """Takes long enough per pass that a kill lands in mid-fit."""
-
-    def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
-        time.sleep(0.01)
-        return super().images(tissue, view, samples=samples, seed=seed)
-
-    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
-        time.sleep(0.02)
-        return super().jacobian(tissue, view, names, samples=samples, seed=seed)
+class SlowFakeMouthEngine(Slowly, FakeMouthEngine):
+    """The same, slowly."""

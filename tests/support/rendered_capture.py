@@ -78,7 +78,7 @@ def rendered_tooth(tissue: Tissue, *, samples: int, seed: int, pixels: int = 10,
     directions = ((0.2, 1.0, 0.1), (-1.0, 0.3, 0.2))[:views]
     cameras = tuple(camera_at(d, pixels).model_copy(update={"name": f"c{k}"}) for k, d in enumerate(directions))
     base = ellipsoid(SEMI_AXES_MM - ENAMEL_MM)
-    dentin = DentinShape(base, np.zeros((0, len(base.vertices_mm), 3)))
+    dentin = DentinShape.known(base)
     lights = np.vstack([LIGHTS_MM, HELD_OUT_LIGHT_MM])
     recipe = single_tooth(ellipsoid(SEMI_AXES_MM), dentin, lights, np.full(len(lights), INTENSITY))
     engine = Engine(recipe)

@@ -49,7 +49,7 @@ def recipe(fdi: tuple[int, ...] = FDI, *, dentin: bool = True) -> SceneRecipe:
     def tooth(number: int) -> ToothSurfaces:
         centre = (PLACES_MM[number], 0.0, 0.0)
         core = revolved((2.3, 3.4), centre)
-        known = DentinShape(core, np.zeros((0, len(core.vertices_mm), 3)))
+        known = DentinShape.known(core)
         return ToothSurfaces(revolved((3.0, 4.0), centre), known if dentin else None)
 
     box = trimesh.creation.box((28.0, 9.0, 5.0)).subdivide_to_size(4.0)

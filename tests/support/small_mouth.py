@@ -86,7 +86,7 @@ def wall() -> Mesh:
 
 def mouth_recipe(boundary: Boundary) -> SceneRecipe:
     """The scene, whose solids overlap."""
-    known = DentinShape(CORE, np.zeros((0, len(CORE.vertices_mm), 3)))
+    known = DentinShape.known(CORE)
     teeth = (ToothSurfaces(ROOTED, known), ToothSurfaces(FREE))
     return SceneRecipe(teeth, LIGHTS_MM, np.full(2, INTENSITY), boundary, IOR, gums=gums(), gums_ior=GUMS_IOR, cavity=wall())
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Mesh, teeth_folder
 from services.core.meshfiles import read_mesh, write_mesh
-from services.fit.bench.tooth_capture import sensor_noise
+from services.fit.bench.tooth_capture import photograph
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "truths"
 SIDE_LIGHTS = ("l2", "l4", "l6")
@@ -94,10 +94,9 @@ def write_capture(name: str, target: Path, seed: int, *, tested_camera: str | No
     for image in images:
         light = lights.index(image["light"])
         mean, variance = truth.mean[image["camera"]][light], truth.standard_error[image["camera"]][light] ** 2
-        noise = sensor_noise(mean)
-        noisy = mean + np.sqrt(noise) * random.standard_normal(mean.shape)
-        np.save(target / image["file"], noisy[..., None].astype(np.float32))
-        np.save(target / image["variance_file"], (variance + noise)[..., None].astype(np.float32))
+        noisy, spread = photograph(mean, variance, random)
+        np.save(target / image["file"], noisy[..., None])
+        np.save(target / image["variance_file"], spread[..., None])
     (target / "capture.json").write_text(json.dumps(description | {"images": images}))
     folder = teeth_folder(target, int(truth.fdi))
     for part, mesh in truth.meshes.items():

@@ -240,7 +240,7 @@ def test_a_seed_repeats_and_seeds_differ(subject: Jaw, average: Jaw) -> None:
 
 def test_the_engine_takes_the_whole_jaw(subject: Jaw) -> None:
     lights = dome_lights(3, ("green",), seed=1)
-    teeth = tuple(ToothSurfaces(t.outer, DentinShape(t.dentin, np.zeros((0, len(t.dentin.vertices_mm), 3)))) for t in subject.teeth)
+    teeth = tuple(ToothSurfaces(t.outer, DentinShape.known(t.dentin)) for t in subject.teeth)
     recipe = SceneRecipe(
         teeth,
         np.array([light.position_mm for light in lights]),

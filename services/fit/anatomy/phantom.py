@@ -173,7 +173,7 @@ def _render(
 
     recipe = single_tooth(
         outer=tooth.outer,
-        dentin=None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3))),
+        dentin=None if tooth.dentin is None else DentinShape.known(tooth.dentin),
         light_positions_mm=np.array([light.position_mm for light in lights]),
         light_intensities=np.array([light.intensity[channel] for light in lights]),
         boundary=boundary,

@@ -48,10 +48,7 @@ class JawSurfaces:
 
     def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
         """The scene for the project's engine; dentin stays as it is."""
-        surfaces = [
-            ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape(tooth.dentin, np.zeros((0, len(tooth.dentin.vertices_mm), 3))))
-            for tooth in self.teeth
-        ]
+        surfaces = [ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin)) for tooth in self.teeth]
         positions, intensities = np.array([light.position_mm for light in lights]), np.array([light.intensity[channel] for light in lights])
         return SceneRecipe(tuple(surfaces), positions, intensities, boundary, IOR, gums=self.gums, gums_ior=GUMS_IOR, cavity=self.cavity)
 

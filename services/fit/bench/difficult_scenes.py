@@ -124,7 +124,7 @@ def _box() -> Mesh:
 
 
 def _recipe(outer: Mesh, dentin: Mesh | None) -> SceneRecipe:
-    known = None if dentin is None else DentinShape(dentin, np.zeros((0, len(dentin.vertices_mm), 3)))
+    known = None if dentin is None else DentinShape.known(dentin)
     return single_tooth(outer, known, _towards_lights(DISTANCE_MM), np.full(len(DIRECTIONS), DISTANCE_MM**2))
 
 

@@ -35,7 +35,7 @@ class IncisorStack:
 
     def recipe(self, dentin: DentinShape | None = None) -> SceneRecipe:
         """The scene for this engine, with the tooth's own dentin unless told otherwise; faces do not reflect."""
-        known = DentinShape(self.dentin, np.zeros((0, len(self.dentin.vertices_mm), 3)))
+        known = DentinShape.known(self.dentin)
         return single_tooth(self.outer, dentin or known, self.light_positions_mm, self.light_intensities)
 
     def tooth_view(self, engine: Engine, tissue: Tissue) -> View:

@@ -23,7 +23,7 @@ from services.core.records import FitReport, FolderCapture, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, read_record
 from services.fit.bench import Row
-from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, prepare, sensor_noise
+from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, photograph, prepare
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.platform import prepare_device
 
@@ -124,14 +124,14 @@ def write_photographs(folder: Path, case: Case) -> None:
     for image in read_record(folder / "capture.json", FolderCapture).images:
         assert image.variance_file is not None
         mean, variance = (np.load(folder / file).astype(np.float64) for file in (image.file, image.variance_file))
-        added = sensor_noise(mean)
-        np.save(folder / image.file, (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32))
-        np.save(folder / image.variance_file, (variance + added).astype(np.float32))
+        noisy, spread = photograph(mean, variance, random)
+        np.save(folder / image.file, noisy)
+        np.save(folder / image.variance_file, spread)
 
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel shows."""
-    from services.fit.jaw_driver import known_dentin
+    from services.fit.jaw_driver import known_dentins
     from services.fit.jaw_views import label_views
     from services.fit.observations import channel_scene, read_channel, read_observations
     from services.fit.transport.engine import Engine
@@ -139,7 +139,7 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     if not is_published(job, "prepared"):
         prepare(job, spec)
     observations = read_observations(job, spec)
-    scene = channel_scene(observations, CHANNEL, [known_dentin(tooth) for tooth in observations.teeth], spec)
+    scene = channel_scene(observations, CHANNEL, known_dentins(observations.teeth), spec)
     return PreparedTooth(job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene))
 
 

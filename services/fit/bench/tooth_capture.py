@@ -39,6 +39,12 @@ def sensor_noise(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(image > 0, (NOISE_RELATIVE * image) ** 2 + (NOISE_FLOOR * image.max()) ** 2, 0.0)
 
 
+def photograph(mean: NDArray[np.float64], variance: NDArray[np.float64], random: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A rendered image with a camera's noise added, and its variance with that noise's, both as stored."""
+    added = sensor_noise(mean)
+    return (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32), (variance + added).astype(np.float32)
+
+
 def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> None:
     """Copy one camera of a folder capture and add sensor noise."""
     shutil.copytree(source / "teeth", target / "teeth")
@@ -49,9 +55,9 @@ def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> 
     random = np.random.default_rng(seed)
     for image in description["images"]:
         mean, variance = (np.load(source / image[key]).astype(np.float64) for key in ("file", "variance_file"))
-        added = sensor_noise(mean)
-        np.save(target / image["file"], (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32))
-        np.save(target / image["variance_file"], (variance + added).astype(np.float32))
+        noisy, spread = photograph(mean, variance, random)
+        np.save(target / image["file"], noisy)
+        np.save(target / image["variance_file"], spread)
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,15 @@ TeethFiles = Mapping[str, tuple[Path, Path | None]]
 """By name of the tooth: PLY files of its enamel's outer surface and of its dentin, if any."""
 
 
+def lit_scene(light_mm: Sequence[Any], intensity: Any) -> SceneDict:
+    """A scene of nothing but a point light, and how it is rendered."""
+    return {
+        "type": "scene",
+        "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
+        "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
+    }
+
+
 def nested_scene(
     teeth: TeethFiles,
     tissue: Tissue,
@@ -105,23 +114,19 @@ def nested_scene(
     Args:
         stains: by name of the tooth, as in ``boundary_dict``; its outer PLY then has texture coordinates.
     """
-    scene: SceneDict = {
-        "type": "scene",
-        "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
-        "medium_enamel": medium_dict(tissue.enamel),
-        "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
-    }
+    scene = lit_scene(light_mm, intensity) | {"medium_enamel": medium_dict(tissue.enamel)}
     if any(dentin is not None for _, dentin in teeth.values()):
         scene["medium_dentin"] = medium_dict(tissue.dentin)
     enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        scene[f"outer_{name}"] = _surface(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
+        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
         if dentin is not None:
-            scene[f"dentin_{name}"] = _surface(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
+            scene[f"dentin_{name}"] = surface_dict(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
 
 
-def _surface(path: Path, bsdf: SceneDict) -> SceneDict:
+def surface_dict(path: Path, bsdf: SceneDict) -> SceneDict:
+    """A PLY file's triangles, flat."""
     return {"type": "ply", "filename": path.as_posix(), "face_normals": True, "bsdf": bsdf}
 
 

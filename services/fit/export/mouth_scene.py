@@ -10,7 +10,7 @@ from services.core.geometry import Camera, Mesh, Tooth
 from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.anatomy.separation import separate
-from services.fit.export.mitsuba_scene import MAX_DEPTH, ROULETTE_DEPTH, SceneDict, boundary_dict, medium_dict, sensor_dict
+from services.fit.export.mitsuba_scene import SceneDict, boundary_dict, lit_scene, medium_dict, sensor_dict, surface_dict
 from services.fit.optics.parameters import Mouth
 
 SurfaceFiles = Mapping[str, Path]
@@ -54,11 +54,7 @@ def mouth_scene(
     Args:
         fdi: FDI numbers in the order of the mouth's teeth.
     """
-    scene: SceneDict = {
-        "type": "scene",
-        "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
-        "light": {"type": "point", "position": list(light_mm), "intensity": intensity},
-    }
+    scene = lit_scene(light_mm, intensity)
     for number, tissue in zip(fdi, mouth.teeth, strict=True):
         scene |= {f"medium_enamel_{number}": medium_dict(tissue.enamel), f"medium_dentin_{number}": medium_dict(tissue.dentin)}
     if mouth.gums is not None:
@@ -66,7 +62,7 @@ def mouth_scene(
 
     def between(path: Path, contrast: float, inside: str, outside: str | None = None) -> SceneDict:
         sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | ({"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {})
-        return _mesh(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
+        return surface_dict(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
 
     for name, path in files.items():
         kind, _, whose = name.partition("_")
@@ -82,9 +78,5 @@ def mouth_scene(
             scene[name] = between(path, gums_ior, "gums")
         else:
             wall = {"type": "diffuse", "reflectance": {"type": "uniform", "value": mouth.reflectance}}
-            scene[name] = _mesh(path, {"type": "twosided", "nested": wall})
+            scene[name] = surface_dict(path, {"type": "twosided", "nested": wall})
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
-
-
-def _mesh(path: Path, bsdf: SceneDict) -> SceneDict:
-    return {"type": "ply", "filename": path.as_posix(), "face_normals": True, "bsdf": bsdf}

@@ -19,7 +19,7 @@ from services.core.errors import InputError
 from services.core.records import FolderCapture, JobSpec
 from services.core.settings import read_job
 from services.core.store import read_record, write_record
-from services.fit.bench.tooth_capture import sensor_noise
+from services.fit.bench.tooth_capture import photograph
 
 Array = NDArray[np.float64]
 JOB = "job.toml"
@@ -119,9 +119,9 @@ def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str
         mean, variance = (np.load(source / file).astype(np.float64) for file in (image.file, image.variance_file))
         if image.camera in added:
             mean = mean + added[image.camera][..., None]
-        noise = sensor_noise(mean)
-        np.save(target / image.file, (mean + np.sqrt(noise) * random.standard_normal(mean.shape)).astype(np.float32))
-        np.save(target / image.variance_file, (variance + noise).astype(np.float32))
+        noisy, spread = photograph(mean, variance, random)
+        np.save(target / image.file, noisy)
+        np.save(target / image.variance_file, spread)
     cameras = tuple(camera for camera in description.cameras if camera.name in case.cameras)
     write_record(target / "capture.json", description.model_copy(update={"cameras": cameras, "images": tuple(images)}))
 

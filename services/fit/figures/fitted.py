@@ -19,7 +19,7 @@ from services.fit.evaluate import ErrorSums, error_sums
 from services.fit.export.pictures import Picture
 from services.fit.export.stains import kept_stains
 from services.fit.figures.cases import job_of
-from services.fit.jaw_driver import fixed_dentin, known_dentin
+from services.fit.jaw_driver import fixed_dentin, known_dentins
 from services.fit.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Tissue
 from services.fit.transport.engine import Engine
@@ -106,7 +106,7 @@ class Fitted:
         if self.spec.kind == "tooth":
             (tooth,) = self.observations.teeth
             return [dentin_shape(tooth, self.observations.manifest.cameras, self.spec)]
-        return [known_dentin(tooth) for tooth in self.observations.teeth]
+        return known_dentins(self.observations.teeth)
 
     def renderer(self, channel: str) -> Engine:
         """The scene under all lights."""

@@ -19,6 +19,11 @@ class DentinShape:
     modes_mm: NDArray[np.float64]
     """Displacements B_m - B0, (M, V, 3); M = 0 for a known surface."""
 
+    @staticmethod
+    def known(surface: Mesh) -> DentinShape:
+        """A surface that does not move."""
+        return DentinShape(surface, np.zeros((0, len(surface.vertices_mm), 3)))
+
     def vertices_mm(self, shape: tuple[float, ...]) -> NDArray[np.float64]:
         """Vertices (V, 3) for blend weights c."""
         return self.base.vertices_mm + np.tensordot(np.asarray(shape, dtype=np.float64), self.modes_mm, axes=1)
