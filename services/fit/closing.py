@@ -13,7 +13,7 @@ from services.fit.blocks import read_block
 from services.fit.engine_host import EngineHost
 from services.fit.optics.domain import similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
-from services.fit.passes import SECANT_STEP, BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import BlockTask, Differentiation, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
@@ -36,13 +36,12 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
     tissue, similar, how = problem.jacobian_media(x)
     first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
-    exact = problem.scored
-    borrowed = np.array([c.kind in SECANT_STEP for c in problem.domain.coordinates])
+    slopes, borrowed = problem.slopes(x), np.array([c.kind == "shape" for c in problem.domain.coordinates])
     ends = tuple((_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd)) for parts, (mean, sd) in held.items())
     pending = []
     for task in problem.passes.tasks(label, tissue, samples):
         jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, first)
-        arguments = (whiten, exact, problem.chain(x, exact, None), borrowed, second, images, ends)
+        arguments = (whiten, slopes, borrowed, second, images, ends)
         pending.append(run.submit(f"{label}-{task.index}", closing_task, task, jacobian, *arguments))
     parts: list[tuple[ClosingSums, tuple[TraceRow, ...]]] = run.gather(pending)
     problem.passes.record([row for _, trace in parts for row in trace])
@@ -57,20 +56,15 @@ def closing_task(
     task: BlockTask,
     jacobian: JacobianBlock,
     whiten: Array,
-    exact: tuple[str, ...],
-    chain: Array,
+    slopes: Differentiation,
     borrowed: NDArray[np.bool_],
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
 ) -> tuple[ClosingSums, tuple[TraceRow, ...]]:
-    """One block's share. ``chain`` (P, F) maps the rendered exact derivatives onto coordinates."""
+    """One block's share. Rows of ``slopes`` that are ``borrowed`` are those of the Jacobian instead."""
     start, block = time.time(), read_block(task.block)
     view = block.fitted_view
-
-    def slopes(seed: int) -> Array:
-        natural = host.call("jacobian", task.recipe, task.tissue, view, exact, samples=task.samples, seed=seed).jacobian
-        return np.asarray(chain.T @ np.asarray(natural, dtype=np.float64).reshape(len(exact), -1))
 
     def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:
         return np.asarray(host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64).reshape(-1)
@@ -81,7 +75,7 @@ def closing_task(
     sums = closing_sums(
         whiten,
         jacobian.derivatives(host),
-        (slopes(seeds[0]), slopes(seeds[1])),
+        (slopes.render(host, task, view, seeds[0]), slopes.render(host, task, view, seeds[1])),
         borrowed,
         (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
         np.array(moved).reshape(len(ends), 2, renders[0].size),

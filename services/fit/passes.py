@@ -16,8 +16,9 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Generic
 
 import numpy as np
@@ -37,10 +38,10 @@ Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]
 """For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
 
-SECANT_STEP = {"shape": 0.2, "cosine": 0.35}
-"""Half the step of the differences that give derivatives to coordinates of these kinds; about their scale in a fit."""
-COSINE_SHARE = 4
-"""Images of other cosines are exact ones and cost most of a step; they get so many times fewer paths, and a column of the Jacobian may be noisy."""
+WITHOUT_SCORES = frozenset({"shape", "cosine"})
+"""Kinds of coordinates whose derivatives are always differences."""
+SCORES_SHARE = 4
+"""Scores that are left where others became differences are quiet: they get so many times fewer paths."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,22 @@ class TraceRow:
 
 
 @dataclass(frozen=True)
+class Reach:
+    """How far from a coordinate's value the images lie whose difference gives its derivative, and their share of a task's paths, one part in so many."""
+
+    below: float
+    above: float
+    share: int
+
+
+REACH: Mapping[str, Reach] = MappingProxyType({"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)})
+"""By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that a wide difference is no derivative."""
+
+SLOPE_REACH = Reach(0.35, 0.35, 4)
+"""Of a cosine where the derivative itself is wanted, which falls by half over the wide difference."""
+
+
+@dataclass(frozen=True)
 class BlockTask:
     """What every task on a block is told."""
 
@@ -70,20 +87,13 @@ class BlockTask:
 
 @dataclass(frozen=True)
 class Secant:
-    """The derivative to one coordinate as a difference of images with common random numbers: quieter than border terms, and for a cosine than scores."""
+    """The derivative to one coordinate as a difference of images: quieter than border terms or scores."""
 
     coordinate: int
     low: Tissue | Mouth
     high: Tissue | Mouth
     width: float
-    share: int = 1
-    """Of the task's samples, one part in so many."""
-
-    def slope(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
-        """Derivative of a block's images, (L N,)."""
-        samples = max(task.samples // self.share, 1)
-        low, high = (host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean for tissue in (self.low, self.high))
-        return np.asarray((high - low) / self.width).reshape(-1)
+    share: int
 
 
 @dataclass(frozen=True)
@@ -94,17 +104,32 @@ class Differentiation:
     chain: Array
     """d parameter / d x, (P, F)."""
     secants: tuple[Secant, ...] = ()
+    share: int = 1
+    """Of the task's paths that scores get, one part in so many."""
 
     def render(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
-        """Derivatives (F, L N) in the task's media."""
-        if self.parameters:
-            estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, self.parameters, samples=task.samples, seed=seed)
-            scores = np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1)
-        else:
-            scores = np.zeros((0, self.secants[0].slope(host, task, view, seed).size))
-        rows = np.asarray(self.chain.T @ scores)
+        """Derivatives (F, L N); scores are of the task's media."""
+        images: dict[tuple[int, int], Array] = {}
+
+        def image(tissue: Tissue | Mouth, samples: int) -> Array:
+            # What several secants share is rendered once.
+            key = id(tissue), samples
+            if key not in images:
+                images[key] = np.asarray(host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64).reshape(-1)
+            return images[key]
+
+        slopes: dict[int, Array] = {}
         for secant in self.secants:
-            rows[secant.coordinate] = secant.slope(host, task, view, seed)
+            samples = max(task.samples // secant.share, 1)
+            slopes[secant.coordinate] = (image(secant.high, samples) - image(secant.low, samples)) / secant.width
+        if self.parameters:
+            samples = max(task.samples // self.share, 1)
+            estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed)
+            rows = np.asarray(self.chain.T @ np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1))
+        else:
+            rows = np.zeros((self.chain.shape[1], next(iter(slopes.values())).size))
+        for coordinate, slope in slopes.items():
+            rows[coordinate] = slope
         return rows
 
 
@@ -296,16 +321,27 @@ class StackProblem(Generic[Optics]):
         """Media of the image and of the derivatives, and how to differentiate."""
         tissue = self.domain.tissue_at(x, self.base)
         similar = tissue if self.jacobian_g is None else similar_tissue(tissue, self.jacobian_g)
-        own = self.scored
+        secant = tuple(k for k, c in enumerate(self.domain.coordinates) if self._is_secant(c.kind))
+        own = tuple(target for k, c in enumerate(self.domain.coordinates) if k not in secant for target in c.targets)
         names = own if self.jacobian_g is None else tuple(dict.fromkeys(n for p in own for n in _similar_parameters(p)))
         chain = self.chain(x, names, self.jacobian_g)
-        secants = tuple(self._secant(x, k, similar) for k, c in enumerate(self.domain.coordinates) if c.kind in SECANT_STEP)
-        return self._image_media(x), similar, Differentiation(names, chain, secants)
+        secants = tuple(self._secant(x, k, tissue, REACH[self.domain.coordinates[k].kind]) for k in secant)
+        share = SCORES_SHARE if any(self.domain.coordinates[k].kind == "sigma" for k in secant) else 1
+        return self._image_media(x), similar, Differentiation(names, chain, secants, share)
 
     @property
     def scored(self) -> tuple[str, ...]:
-        """Parameters of the domain whose derivatives are scores."""
-        return tuple(name for name in self.domain.parameters if kind_of(name) not in SECANT_STEP)
+        """Parameters of the domain whose derivatives can be scores."""
+        return tuple(name for name in self.domain.parameters if kind_of(name) not in WITHOUT_SCORES)
+
+    def slopes(self, x: Array) -> Differentiation:
+        """How to differentiate the images' own media, except to blend weights."""
+        tissue, cosines = self._image_media(x), [k for k, c in enumerate(self.domain.coordinates) if c.kind == "cosine"]
+        return Differentiation(self.scored, self.chain(x, self.scored, None), tuple(self._secant(x, k, tissue, SLOPE_REACH) for k in cosines))
+
+    def _is_secant(self, kind: str) -> bool:
+        # Scores of extinction are noisy, but in a jaw they are of all teeth at once.
+        return kind in WITHOUT_SCORES or (kind == "sigma" and self.jacobian_g is not None and isinstance(self.base, Tissue))
 
     def chain(self, x: Array, names: tuple[str, ...], g: float | None) -> Array:
         """Derivatives (P, F) of natural parameters to x, those of similar media of mean cosine g where it is given."""
@@ -321,15 +357,17 @@ class StackProblem(Generic[Optics]):
         shifts = 1e-5 * np.eye(len(x))
         return np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
 
-    def _secant(self, x: Array, k: int, similar: Optics) -> Secant:
+    def _secant(self, x: Array, k: int, tissue: Optics, reach: Reach) -> Secant:
         # One-sided where a bound is near. A cosine's media are the images' own, as it is what similar media do not have.
-        coordinate, (low, high) = self.domain.coordinates[k], (bound[k] for bound in self.domain.bounds)
-        ends = [float(np.clip(x[k] + sign * SECANT_STEP[coordinate.kind], low, high)) for sign in (-1, 1)]
-        if coordinate.kind == "cosine":
-            below, above = (self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base) for end in ends)
-        else:
-            below, above = (similar.with_values({coordinate.targets[0]: end}) for end in ends)
-        return Secant(k, below, above, ends[1] - ends[0], COSINE_SHARE if coordinate.kind == "cosine" else 1)
+        coordinate, (lower, upper) = self.domain.coordinates[k], (bound[k] for bound in self.domain.bounds)
+        low = float(np.clip(x[k] - reach.below, lower, upper))
+        high = max(float(np.clip(x[k] + reach.above, lower, upper)), low + 0.5 * (reach.below + reach.above))
+
+        def media(end: float) -> Optics:
+            moved = tissue if end == x[k] else self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base)
+            return moved if coordinate.kind == "cosine" or self.jacobian_g is None else similar_tissue(moved, self.jacobian_g)
+
+        return Secant(k, media(low), media(high), high - low, reach.share)
 
     @property
     def _prefix(self) -> str:

@@ -193,8 +193,8 @@ class ChannelSchedule(Stages[Tissue]):
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
 
     def _with_cosines(self, domain: Domain) -> Domain:
-        # Of media whose density is fitted and whose lobe is not given.
-        fitted = [part for part in self.media if f"{part}.sigma" in domain.parameters and f"{part}.g1" not in self.spec.held]
+        # Of the enamel where its density is fitted and its lobe is not given: what lies below it is lit by light that has scattered often.
+        fitted = [part for part in self.media[:1] if f"{part}.sigma" in domain.parameters and f"{part}.g1" not in self.spec.held]
         return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
 
     def _with_shape(self, domain: Domain) -> Domain:

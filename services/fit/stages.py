@@ -28,6 +28,10 @@ IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SIMILAR_TOLERANCE = 0.02
 """The same of a stage in similar media."""
+SLOPE_ERROR = 0.5
+"""Relative error of what Jacobians of similar media promise for exact images, however short the step."""
+CLOSING_SHARE = 2
+"""The closing measurement has so many times fewer paths: it joins what all exact steps know."""
 CLOSING_TRIALS = 2
 """Lengths tried of the step after the closing measurement."""
 LEAST_SAMPLES = 4
@@ -151,6 +155,8 @@ class Stages(ABC, Generic[Optics]):
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
 
     def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int) -> tuple[Optics, Solution]:
+        if problem.jacobian_g != problem.image_g:
+            options = replace(options, slope_error=SLOPE_ERROR)
         solver = gauss_newton.GaussNewton(problem.domain, options)
         return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
 
@@ -196,7 +202,7 @@ class Stages(ABC, Generic[Optics]):
         known = whitening(domain, equations)
 
         def compute() -> dict[str, Any]:
-            sums = measure_closing(problem, x, known.transform, self._held(domain), samples)
+            sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
             step, (mean, precision) = closing_step(domain, x, equations, sums, self.things), domain.prior
             for trial in range(CLOSING_TRIALS):
                 compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)

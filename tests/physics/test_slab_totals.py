@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 
 from services.fit.slab.simulate import Layer, Sums
-from tests.support.slab_tables import SOURCES, SlabCase, simulate, total_cases
+from tests.support.slab_tables import SOURCES, SlabCase, is_costly, simulate, total_cases
 from tests.support.z_scores import require_unbiased, z_scores
 
 TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
-COSTLY_DEPTH = 50
-"""Finite white slabs beyond this depth scatter hundreds of times per path: up to a minute each, and at the wider tolerance only."""
 
 
 def simulate_totals(case: SlabCase, tolerance: float, seed: int) -> Sums:
     """Totals whose standard error is a third of the tolerance."""
     return simulate(case, lambda sums: float(sums.standard_error().max() / (tolerance / 3)), seed)
-
-
-def is_costly(case: SlabCase) -> bool:
-    return COSTLY_DEPTH < case.layers[0].thickness_mm < np.inf
 
 
 def require_totals(cases: list[SlabCase], tolerance: float, seed: int) -> None:

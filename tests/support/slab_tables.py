@@ -15,6 +15,8 @@ from tests.support.shared_data import shared_path
 SOURCES = ("normal", "diffuse")
 BOUNDARIES = {"none": "matched", "thin": "thin", "smooth": "smooth"}
 """The tables' names, and the project's."""
+COSTLY_DEPTH = 50
+"""Finite white slabs beyond this depth scatter hundreds of times per path: up to a minute each, and at the wider tolerance only."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class SlabCase:
         """1 % of each derivative, or of 1e-3 of the largest one of the same case and source (derivatives, 2)."""
         size = np.abs(self.values[1:])
         return 0.01 * np.maximum(size, 1e-3 * size.max())
+
+
+def is_costly(case: SlabCase) -> bool:
+    """Whether a slab is deep and white."""
+    return COSTLY_DEPTH < case.layers[0].thickness_mm < np.inf
 
 
 def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int, *, border_terms_only: bool = False) -> Sums:

@@ -85,6 +85,8 @@ class Options:
     """A change counts as real beyond so many standard errors: a worse step passes with probability at most 1.3e-3."""
     model_error: float = 0.5
     """Relative error of the promised change per unit of step length; at length 1 the promise counts little."""
+    slope_error: float = 0.0
+    """The same at any length, where derivatives are not those of the images: the comparison then always has a say."""
     tolerance: float = 0.0
     """Converged when a further step promises no more than noise does, and noise is worth no more than this change of F."""
     least_radius: float = 1e-3
@@ -188,7 +190,7 @@ class GaussNewton:
                 raise NonFiniteError(f"The loss is not finite at step {state.step}; check the capture for invalid radiance.")
 
             # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
-            model, model_se = noise_gain - promised, math.hypot(equations.step_noise(step), options.model_error * length * promised)
+            model, model_se = noise_gain - promised, math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * length) * promised)
             total, total_se = _combine(change, compared.se, model, model_se)
             contradicted = abs(change - model) > options.sure_z * math.hypot(compared.se, model_se)
             if total + options.sure_z * total_se < 0 and change - options.sure_z * compared.se < 0 and not (contradicted and change > 0):
