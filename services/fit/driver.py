@@ -13,6 +13,7 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.fit.alignment import offsets_told
 from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
+from services.fit.anatomy.thickness import ThicknessMap, thickness_map
 from services.fit.attempt import Attempt, judge, worst_error
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
@@ -106,6 +107,8 @@ class FitDriver:
         )
         converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
+        shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
+        thickness = fitted_thickness(observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance)
         return FitReport(
             converged=converged,
             advice=" ".join(advice),
@@ -113,7 +116,9 @@ class FitDriver:
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
             steps=sum(fit.steps for fit in fits.values()),
-            shape=fits[first].tissue.shape,
+            shape=shape,
+            shape_covariance=covariance,
+            enamel_thickness=None if thickness is None else thickness.mean,
             correlations=correlations,
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
@@ -141,6 +146,25 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
         centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
         return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm), crown=upper_tooth(tooth.fdi % 10))
     return None
+
+
+def shape_covariance(known: Uncertainty) -> tuple[tuple[float, ...], ...]:
+    """Covariance of the blend weights; empty where they were not fitted."""
+    own = [k for k, coordinate in enumerate(known.domain.coordinates) if coordinate.kind == "shape"]
+    return tuple(tuple(row) for row in known.covariance[np.ix_(own, own)].tolist())
+
+
+def fitted_thickness(
+    tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec, shape: tuple[float, ...], covariance: tuple[tuple[float, ...], ...]
+) -> ThicknessMap | None:
+    """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not see the tooth.
+
+    Args:
+        tooth: as prepared.
+        covariance: of the blend weights; empty where they were not fitted.
+    """
+    dentin = dentin_shape(tooth, cameras, spec)
+    return None if dentin is None else thickness_map(tooth.outer, dentin, shape, np.array(covariance) if covariance else None, cameras[0])
 
 
 def pixel_edge_mm(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> float:

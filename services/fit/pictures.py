@@ -12,7 +12,7 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import PreparedManifest
 from services.core.store import write_atomic
 from services.fit.anatomy.stain_uv import ToothStains
-from services.fit.anatomy.thickness import thickness_image
+from services.fit.anatomy.thickness import ThicknessMap
 from services.fit.evaluate import Evaluation
 from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
@@ -108,9 +108,14 @@ def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest
 
 
 def read_pictures(
-    folder: Path, channels: tuple[str, ...], tooth: Tooth | None, cameras: tuple[Camera, ...], stains: ToothStains | None = None
+    folder: Path,
+    channels: tuple[str, ...],
+    tooth: Tooth | None,
+    cameras: tuple[Camera, ...],
+    thickness: ThicknessMap | None = None,
+    stains: ToothStains | None = None,
 ) -> ReportPictures:
-    """What the report shows; the thickness of enamel and stains where it is about one tooth."""
+    """What the report shows; the thickness of enamel and stains where it is about one tooth, both as the first camera sees them."""
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)
         pictures = []
@@ -119,6 +124,5 @@ def read_pictures(
             pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
     if tooth is None:
         return ReportPictures(channels, tuple(pictures))
-    thickness_mm = None if tooth.dentin is None else thickness_image(tooth.outer, tooth.dentin, cameras[0])
     seen = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
-    return ReportPictures(channels, tuple(pictures), thickness_mm, cameras[0].name, seen, () if stains is None else tuple(stains.textures))
+    return ReportPictures(channels, tuple(pictures), thickness, cameras[0].name, seen, () if stains is None else tuple(stains.textures))

@@ -31,6 +31,7 @@ from services.core.errors import SettingsError
 from services.fit.anatomy.stain_uv import StainLayout
 from services.fit.closing import Held
 from services.fit.next_capture import Sensor, advice
+from services.fit.observations import COARSE_PIXELS
 from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
@@ -48,7 +49,7 @@ START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature table."""
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
-"""Paths per pixel at which the exact stages begin, over those of the start; they double as noise asks."""
+"""Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise asks."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
 REWEIGHTINGS = 2
@@ -126,7 +127,7 @@ class ChannelSchedule(Stages[Tissue]):
             tissue, solution = self._iterate(problem, options, solution.samples)
 
         options = self.at_full_resolution()
-        exact_samples = self.fewer(min(solution.samples, EXACT_SAMPLES * samples))
+        exact_samples = self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels)))
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         tissue, solution = self._iterate(problem, options, exact_samples)

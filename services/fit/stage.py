@@ -64,6 +64,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     import numpy as np
 
     from services.core.meshfiles import read_mesh
+    from services.fit.driver import fitted_thickness
     from services.fit.export.asset import errors_json, parameters_json, write_asset
     from services.fit.export.report import write_report
     from services.fit.export.stains import kept_stains
@@ -100,7 +101,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     history = json.loads((fit_folder / "history.json").read_text())
     title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"
     facts = {"title": title, "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
-    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, stains)
+    thickness = None if spec.kind == "jaw" else fitted_thickness(teeth[0], prepared.cameras, spec, report.shape, report.shape_covariance)
+    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, thickness, stains)
     write_report(context.root / "report.html", report, pictures, history, facts)
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
     write_atomic(context.root / "errors.json", _json(errors_json(report)))

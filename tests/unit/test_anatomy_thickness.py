@@ -11,7 +11,7 @@ from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras
-from services.fit.anatomy.thickness import enamel_thickness_mm, thickness_image, uncertain_thickness
+from services.fit.anatomy.thickness import enamel_thickness_mm, thickness_image, thickness_map, uncertain_thickness
 from services.fit.transport.recipe import DentinShape
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import SEMI_AXES_MM, dentin_shape, ellipsoid, sphere
@@ -74,3 +74,25 @@ def test_errors_against_many_drawn_shapes() -> None:
     seen = np.array([enamel_thickness_mm(points, Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)) for c in drawn])
     np.testing.assert_allclose(found.errors_mm, seen.std(axis=0), rtol=0.16)
     assert abs(found.mean_error_mm / seen.mean(axis=1).std() - 1) < 0.16
+
+
+def test_a_camera_sees_thickness_and_its_error_at_the_same_pixels() -> None:
+    ball, outer = sphere(3.5), sphere(4.0)
+    shape = DentinShape(ball, -0.4 * sphere(1.0).vertices_mm[None])
+    (camera,) = dome_cameras(1, 0.5, (outer,))
+    found = thickness_map(outer, shape, (0.3,), np.array([[0.05**2]]), camera)
+    assert found is not None
+    assert found.errors_mm is not None
+    np.testing.assert_array_equal(np.isfinite(found.image_mm), np.isfinite(found.errors_mm))
+    # As above, and where a ray meets a flat face of the ball instead of a vertex.
+    np.testing.assert_allclose(found.image_mm[np.isfinite(found.image_mm)], 0.62, atol=0.03)
+    np.testing.assert_allclose(found.errors_mm[np.isfinite(found.errors_mm)], 0.02, rtol=0.03)
+    assert found.mean.se == pytest.approx(0.02, rel=0.03)
+    assert found.mean.determined
+
+    # Known, it is the plain image; of another place nothing is seen.
+    known = thickness_map(outer, shape, (0.3,), None, camera)
+    assert known is not None
+    assert known.errors_mm is None
+    np.testing.assert_array_equal(known.image_mm, thickness_image(outer, Mesh(shape.vertices_mm((0.3,)), ball.faces), camera))
+    assert thickness_map(Mesh(outer.vertices_mm + np.array([0.0, 500.0, 0.0]), outer.faces), shape, (0.3,), None, camera) is None

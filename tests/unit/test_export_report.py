@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from services.core.records import Correlation, Estimate, FitReport
+from services.fit.anatomy.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import Picture
 from services.fit.export.report import THIN_CAVEAT, ReportPictures, write_report
@@ -70,19 +71,34 @@ def pictures(**changes: Any) -> ReportPictures:
     return ReportPictures(**{"channels": ("green",), "pictures": shown} | changes)
 
 
+def thickness(**changes: Any) -> ThicknessMap:
+    mean = Estimate(value=0.7, se=0.06, unit="mm", determined=True)
+    return ThicknessMap(**{"image_mm": np.full((6, 5), 0.7), "errors_mm": np.full((6, 5), 0.08), "mean": mean} | changes)
+
+
 def page(path: Path, fit: FitReport, shown: ReportPictures, **context: Any) -> Page:
     write_report(path / "report.html", fit, shown, HISTORY, {"title": "Tooth 11", "boundary": "matched"} | context)
     return Page((path / "report.html").read_text(encoding="utf-8"))
 
 
 def test_the_page_needs_nothing_else_and_knows_both_schemes(tmp_path: Path) -> None:
-    shown = page(tmp_path, report(), pictures(thickness_mm=np.full((6, 5), 0.7), thickness_camera="c0"))
-    assert len(shown.addresses) == 7
+    shown = page(tmp_path, report(), pictures(thickness=thickness(), camera="c0"))
+    assert len(shown.addresses) == 8
     assert all(address.startswith("data:image/png;base64,") for address in shown.addresses)
     assert not {"script", "link", "iframe"} & set(shown.tags)
     source = (tmp_path / "report.html").read_text()
     assert "prefers-color-scheme: dark" in source
     assert not re.search(r"https?://|@import|url\(", source)
+
+
+def test_thickness_is_given_with_its_error(tmp_path: Path) -> None:
+    text = page(tmp_path, report(), pictures(thickness=thickness(), camera="c0")).text
+    assert "seen by camera c0; mean 0.70 ± 0.06 mm" in text
+    assert "Its standard error, seen by camera c0; mean 0.08 mm" in text
+    known = thickness(errors_mm=None, mean=Estimate(value=0.7, se=None, unit="mm", determined=True))
+    text = page(tmp_path, report(), pictures(thickness=known, camera="c0")).text
+    assert "mean 0.70 mm" in text
+    assert "standard error, seen" not in text
 
 
 def test_held_out_error_leads(tmp_path: Path) -> None:

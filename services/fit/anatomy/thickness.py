@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
+from services.core.records import Estimate
 from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.anatomy.rays import RayScene, pixel_rays
 from services.fit.transport.recipe import DentinShape
@@ -55,10 +56,51 @@ def uncertain_thickness(
     return UncertainThickness(values, errors, float(values.mean()), float(np.sqrt(max(of_mean @ covariance @ of_mean, 0.0))))
 
 
+@dataclass(frozen=True)
+class ThicknessMap:
+    """Enamel thickness where a camera sees the tooth, mm."""
+
+    image_mm: NDArray[np.float64]
+    """(H, W), NaN off the tooth."""
+    errors_mm: NDArray[np.float64] | None
+    """One standard error (H, W); None where the dentin is known."""
+    mean: Estimate
+    """Over what is seen, mm."""
+
+
+def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], covariance: NDArray[np.float64] | None, camera: Camera) -> ThicknessMap | None:
+    """What a camera sees of a fitted dentin; None where it does not see the tooth.
+
+    Args:
+        covariance: of the weights (M, M); None where they are known.
+    """
+    seen, points_mm = _seen(outer, camera)
+    if not seen.any():
+        return None
+    if covariance is None:
+        values_mm = enamel_thickness_mm(points_mm, Mesh(shape.vertices_mm(weights), shape.base.faces))
+        return ThicknessMap(_image(seen, values_mm, camera), None, Estimate(value=float(values_mm.mean()), se=None, unit="mm", determined=True))
+    found = uncertain_thickness(points_mm, shape, np.asarray(weights), covariance)
+    return ThicknessMap(
+        _image(seen, found.values_mm, camera),
+        _image(seen, found.errors_mm, camera),
+        Estimate(value=found.mean_mm, se=found.mean_error_mm, unit="mm", determined=found.mean_error_mm < found.mean_mm / 2),
+    )
+
+
 def thickness_image(outer: Mesh, dentin: Mesh, camera: Camera) -> NDArray[np.float64]:
     """Enamel thickness in mm at the surface point that each pixel sees, (H, W); NaN off the tooth."""
+    seen, points_mm = _seen(outer, camera)
+    return _image(seen, enamel_thickness_mm(points_mm, dentin) if seen.any() else np.zeros(0), camera)
+
+
+def _seen(outer: Mesh, camera: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    # Which pixels (H W,) see the tooth, and where.
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
-    image = np.full(len(hits.hit), np.nan)
-    if hits.hit.any():
-        image[hits.hit] = enamel_thickness_mm(hits.points_mm[hits.hit], dentin)
+    return hits.hit, hits.points_mm[hits.hit]
+
+
+def _image(seen: NDArray[np.bool_], values: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    image = np.full(len(seen), np.nan)
+    image[seen] = values
     return image.reshape(camera.size[1], camera.size[0])

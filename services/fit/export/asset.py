@@ -138,6 +138,9 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
     for fdi, tooth in report.teeth.items():
         for channel, own in tooth.parameters.items():
             tables[channel] |= {f"{fdi}.{name}": estimate for name, estimate in own.items()}
+    if report.enamel_thickness is not None:
+        for table in tables.values():
+            table["enamel.thickness"] = report.enamel_thickness
     return {channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in tables.items()}
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from services.core.records import Correlation, Estimate, FitReport, ToothReport
 from services.core.store import write_atomic
+from services.fit.anatomy.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import DIVERGING, SEQUENTIAL, ColourStops, Picture, data_uri, enlarge, scalar_map, signed_map, tone_map, white_level
 
@@ -50,10 +51,10 @@ class ReportPictures:
     channels: tuple[str, ...]
     pictures: tuple[Picture, ...]
     """One fitted and one held-out light per camera is enough."""
-    thickness_mm: NDArray[np.floating] | None = None
-    """Enamel thickness seen by one camera (H, W), NaN off the tooth; see ``anatomy.thickness.thickness_image``."""
-    thickness_camera: str = ""
-    """Also that of the stains."""
+    thickness: ThicknessMap | None = None
+    """Of the enamel, seen by one camera."""
+    camera: str = ""
+    """Which, also of the stains."""
     stains: NDArray[np.floating] | None = None
     """Transmittance of the stains (H, W, C), NaN off the tooth; see ``export.stains.stain_image``."""
     stained: tuple[str, ...] = ()
@@ -255,19 +256,19 @@ def _decimals(se: float) -> int:
     return int(np.clip(1 - math.floor(math.log10(se)), 0, 8)) if se > 0 and math.isfinite(se) else 4
 
 
-def _thickness(pictures: ReportPictures) -> dict[str, str] | None:
-    if pictures.thickness_mm is None or not np.isfinite(pictures.thickness_mm).any():
+def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
+    found = pictures.thickness
+    if found is None:
         return None
-    values = np.asarray(pictures.thickness_mm, dtype=np.float64)
-    high = max(0.5, math.ceil(2 * float(np.nanpercentile(values, 99))) / 2)
-    return {
-        "image": data_uri(enlarge(scalar_map(values, (0.0, high)), 240)),
-        "camera": pictures.thickness_camera,
-        "high": f"{high:g} mm",
-        "mean": f"{np.nanmean(values):.2f} mm",
-        "width": str(values.shape[1]),
-        "height": str(values.shape[0]),
-    }
+    high = max(0.5, math.ceil(2 * float(np.nanpercentile(found.image_mm, 99))) / 2)
+    spread = "" if found.mean.se is None else f" ± {found.mean.se:.2f}"
+    maps = [("Distance from the outer surface to dentin", found.image_mm, high, f"{found.mean.value:.2f}{spread} mm")]
+    if found.errors_mm is not None:
+        most = max(0.05, math.ceil(20 * float(np.nanpercentile(found.errors_mm, 99))) / 20)
+        maps.append(("Its standard error", found.errors_mm, most, f"{np.nanmean(found.errors_mm):.2f} mm"))
+    drawn = [(what, data_uri(enlarge(scalar_map(values, (0.0, most)), 240)), f"{most:g} mm", mean) for what, values, most, mean in maps]
+    height, width = found.image_mm.shape
+    return {"maps": drawn, "camera": pictures.camera, "width": str(width), "height": str(height)}
 
 
 def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
@@ -278,7 +279,7 @@ def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
     drawn = [(name, scalar_map(pictures.stains[..., k], (low, 1.0))) for k, name in enumerate(pictures.stained)]
     return {
         "images": [(name, data_uri(enlarge(image, 240)), f"{np.nanmean(pictures.stains[..., k]):.2f}") for k, (name, image) in enumerate(drawn)],
-        "camera": pictures.thickness_camera,
+        "camera": pictures.camera,
         "low": f"{low:g}",
         "width": str(pictures.stains.shape[1]),
         "height": str(pictures.stains.shape[0]),

@@ -1,0 +1,42 @@
+"""What the driver takes from an uncertainty for the report."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.core.geometry import Tooth
+from services.core.records import JobSpec
+from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.rig import dome_cameras
+from services.fit.driver import fitted_thickness, shape_covariance
+from services.fit.optics.domain import Coordinate, Domain
+from services.fit.solve.covariance import Uncertainty
+
+
+def known(*names: str) -> Uncertainty:
+    count = len(names)
+    covariance = np.arange(count**2, dtype=np.float64).reshape(count, count)
+    return Uncertainty(Domain(tuple(Coordinate((name,)) for name in names)), np.zeros(count), covariance, np.zeros((count, 0)), np.eye(count))
+
+
+def test_the_blend_weights_covariance_is_cut_out_of_the_whole() -> None:
+    assert shape_covariance(known("enamel.sigma", "shape.0", "dentin.sigma", "shape.1")) == ((5.0, 7.0), (13.0, 15.0))
+    assert shape_covariance(known("enamel.sigma", "dentin.sigma")) == ()
+
+
+def test_thickness_has_an_error_only_where_the_dentin_was_fitted() -> None:
+    incisor = build_incisor()
+    tooth = Tooth(11, incisor.outer, incisor.dentin)
+    cameras = dome_cameras(1, 1.0, (tooth.outer,))
+    given = fitted_thickness(tooth, cameras, JobSpec.model_validate({"capture": "c", "dentin": "known"}), (), ())
+    assert given is not None
+    assert given.mean.se is None
+    fitted = JobSpec.model_validate({"capture": "c", "dentin": "fit"})
+    spread = fitted_thickness(tooth, cameras, fitted, (0.5, 0.5, 0.5), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
+    assert spread is not None
+    assert spread.mean.se is not None
+    # Independent weights of 0.1 move the mean by some hundredths of a millimetre, and each point's by at least as much in the root mean square.
+    assert 0.005 < spread.mean.se < 0.1
+    assert spread.errors_mm is not None
+    assert np.sqrt(np.nanmean(spread.errors_mm**2)) >= spread.mean.se
+    assert fitted_thickness(tooth, cameras, JobSpec.model_validate({"capture": "c", "dentin": "none"}), (), ()) is None
