@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from services.fit.blocks import Block, StoredFile, read_block
 from services.fit.engine_host import EngineHost
 from services.fit.executors import Executor
-from services.fit.optics.domain import Domain, kind_of, similar_tissue
+from services.fit.optics.domain import Domain, kind_of, natural_derivative, similar_tissue, to_natural
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.seeds import Seeds
 from services.fit.solve.adam import Gradient
@@ -367,7 +367,11 @@ class StackProblem(Generic[Optics]):
             moved = tissue if end == x[k] else self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base)
             return moved if coordinate.kind == "cosine" or self.jacobian_g is None else similar_tissue(moved, self.jacobian_g)
 
-        return Secant(k, media(low), media(high), high - low, reach.share)
+        # Images are linear in the cosine itself farther than in its coordinate.
+        width = high - low
+        if coordinate.kind == "cosine":
+            width = (to_natural("cosine", high) - to_natural("cosine", low)) / natural_derivative("cosine", float(x[k]))
+        return Secant(k, media(low), media(high), width, reach.share)
 
     @property
     def _prefix(self) -> str:

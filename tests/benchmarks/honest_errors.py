@@ -3,11 +3,13 @@
 python -m tests.benchmarks.honest_errors --fits 100 --out honest_errors.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --out honest_errors_drawn.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --out honest_errors_formula.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --shape --out honest_errors_shape.json
 
 Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
 six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits hold; with
 more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
 ``--formula`` puts a formula in place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
+With ``--shape`` the dentin's blend weights are drawn and fitted too, and enamel's mean thickness is judged.
 """
 
 from __future__ import annotations
@@ -17,17 +19,20 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from services.core.records import JobSpec
+from services.core.meshfiles import read_teeth
+from services.core.records import JobSpec, PreparedManifest
 from services.core.stage import LocalContext
+from services.core.store import open_stage
+from services.fit.driver import fitted_thickness
 from services.fit.optics.domain import to_natural
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.priors import WEAK
+from services.fit.optics.priors import COSINE, WEAK
 from services.fit.stage import ENGINE, run
 from services.fit.transport.platform import prepare_device
 from tests.support.fake_engine import DirectFakeEngine
@@ -50,11 +55,12 @@ def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> T
     return Tissue(media["enamel"], media["dentin"])
 
 
-def drawn_tissue(rng: np.random.Generator) -> Tissue:
-    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits."""
-    mean, sd = WEAK["enamel.g1"]
+def drawn_tissue(rng: np.random.Generator, *, with_shape: bool = False) -> Tissue:
+    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits, blend weights where they are wanted."""
+    cosines = {"enamel": COSINE, "dentin": WEAK["dentin.g1"]}
     reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
-    return tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part in CENTRE})
+    tissue = tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part, (mean, sd) in cosines.items()})
+    return replace(tissue, shape=tuple(rng.uniform(0.2, 0.8, 3).tolist())) if with_shape else tissue
 
 
 class Subject(Protocol):
@@ -80,26 +86,32 @@ def fit_rows(tooth: Subject, truth: Tissue, seed: int, options: dict[str, object
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         tooth.photograph(root, seed)
-        spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "known", "seed": seed, **options})
+        spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "fit" if truth.shape else "known", "seed": seed, **options})
         report = run(spec, LocalContext(root), engine=engine)
+        stage, prepared = open_stage(root, "prepared", PreparedManifest)
+        (outer,) = read_teeth(stage, prepared.fdi)
+        thickness = fitted_thickness(outer, prepared.cameras, spec, truth.shape, ())
         last = json.loads((root / "fit" / "history.json").read_text())[-1]
-    for part in CENTRE:
-        for leaf in LEAVES:
-            estimate, true = report.parameters["green"][f"{part}.{leaf}"], float(getattr(getattr(truth, part), leaf))
-            yield {
-                "fit": seed,
-                "quantity": f"{part}.{leaf}",
-                "truth": true,
-                "value": estimate.value,
-                "se": estimate.se,
-                "z": (estimate.value - true) / estimate.se if estimate.se else None,
-                "determined": estimate.determined,
-                "converged": report.converged,
-                "steps": report.steps,
-                "samples": last["samples"],
-                "verdict": last["verdict"],
-                "g": [truth.enamel.g1, truth.dentin.g1],
-            }
+    found = {f"{part}.{leaf}": (report.parameters["green"][f"{part}.{leaf}"], getattr(getattr(truth, part), leaf)) for part in CENTRE for leaf in LEAVES}
+    if truth.shape:
+        assert report.enamel_thickness is not None
+        assert thickness is not None
+        found["enamel.thickness"] = report.enamel_thickness, thickness.mean.value
+    for name, (estimate, true) in found.items():
+        yield {
+            "fit": seed,
+            "quantity": name,
+            "truth": float(true),
+            "value": estimate.value,
+            "se": estimate.se,
+            "z": (estimate.value - float(true)) / estimate.se if estimate.se else None,
+            "determined": estimate.determined,
+            "converged": report.converged,
+            "steps": report.steps,
+            "samples": last["samples"],
+            "verdict": last["verdict"],
+            "g": [truth.enamel.g1, truth.dentin.g1],
+        }
 
 
 def summary(rows: list[dict[str, object]]) -> list[dict[str, object]]:
@@ -130,6 +142,7 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--truths", type=int, default=1)
     parser.add_argument("--formula", action="store_true", help="a formula in place of light transport")
+    parser.add_argument("--shape", action="store_true", help="draw and fit the dentin's shape; only with --formula and drawn truths")
     parser.add_argument("--paths", type=int, default=65536, help="of the truth, per pixel")
     parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
@@ -139,6 +152,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
+    if arguments.shape and (not arguments.formula or arguments.truths == 1):
+        parser.error("--shape needs --formula and more than one of --truths")
     prepare_device(arguments.threads)
     options: dict[str, object] = {
         "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000,
@@ -146,7 +161,7 @@ def main() -> None:
     }  # fmt: skip
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})
-    truths = [held] if arguments.truths == 1 else [drawn_tissue(rng) for _ in range(arguments.truths)]
+    truths = [held] if arguments.truths == 1 else [drawn_tissue(rng, with_shape=arguments.shape) for _ in range(arguments.truths)]
     teeth: dict[int, Subject] = {}
     for number in range(arguments.first, arguments.first + arguments.fits):
         which = number % len(truths)
