@@ -195,7 +195,7 @@ class Stages(ABC, Generic[Optics]):
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it unless it is surely worse.
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where images say it is better.
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             return problem, solution, uncertainty(domain, x, equations)
@@ -207,7 +207,7 @@ class Stages(ABC, Generic[Optics]):
             for trial in range(CLOSING_TRIALS):
                 compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
                 change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-                if change <= Options().sure_z * compared.se:
+                if change <= -compared.se:
                     return {"sums": sums.record(), "step": step.tolist()}
                 step = 0.3 * step
             return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}

@@ -13,7 +13,7 @@ the optimum the comparison decides, close to it, where losses hardly differ, the
 * otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
 
 A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore settles it on the minimum of all
-that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts; its error is then that of the pooled
+that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts (surely, or at all where derivatives are not the images' own); its error is then that of the pooled
 gradient, and unbiased.
 """
 
@@ -230,7 +230,7 @@ class GaussNewton:
         compared = problem.compare(x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials)
         mean, precision = self.domain.prior
         change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-        if change > self.options.sure_z * compared.se:
+        if change > (0.0 if self.options.slope_error else self.options.sure_z * compared.se):
             return state
         if length > 1:
             # Too far for one linear model: look again from there.
