@@ -13,8 +13,8 @@ the optimum the comparison decides, close to it, where losses hardly differ, the
 * otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
 
 A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore settles it on the minimum of all
-that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts (surely, or at all where derivatives are not the images' own); its error is then that of the pooled
-gradient, and unbiased.
+that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts (surely, or at all where derivatives are
+not the images' own); its error is then that of the pooled gradient, and unbiased.
 """
 
 from __future__ import annotations
