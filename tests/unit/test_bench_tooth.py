@@ -34,6 +34,12 @@ def test_peer_that_never_gets_there_has_a_lower_bound() -> None:
     assert (found.efficiency_ratio, found.lower_bound) == (90.0 / 9.0, True)
 
 
+def test_ratio_at_the_error_that_the_peer_ended_with_is_no_bound() -> None:
+    peer = [row(PEER, 10.0, 0.3), row(PEER, 80.0, 0.1), row(PEER, 90.0, 0.1)]
+    found = summary(OURS, peer, peer[-1].error, "tooth-at-its-end")
+    assert (found.benchmark, found.efficiency_ratio, found.lower_bound) == ("tooth-at-its-end", 80.0 / 5.0, False)
+
+
 def test_our_time_ends_when_no_later_start_is_worse() -> None:
     ours = [row("dentine", 2.0, 0.02), row("dentine", 5.0, 0.2), row("dentine", 9.0, 0.0225), row("dentine", 12.0, 0.02)]
     assert summary(ours, [row(PEER, 90.0, 0.02)], target=0.022).efficiency_ratio == 90.0 / 9.0
