@@ -1,8 +1,8 @@
 """A tooth's fit: held-out error against processor time, ours and the stock recipe, on the smallest real case.
 
 Everyone fits the same noisy photographs of five lights, from nothing to parameters: extinction and albedo of enamel and dentin, the peer with g held, the
-product as it is. Scenes are loaded and kernels compiled on the clock. At marks along the way everyone's parameters are judged alike, off the clock: three held-out lights, exact media,
-1,024 paths per pixel and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
+product as it is. Scenes are loaded and kernels compiled on the clock. At marks along the way everyone's parameters are judged alike, off the clock: three
+held-out lights, exact media, 1,024 paths per pixel and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
 
 Everyone has one thread, and seconds are its processor time, which other jobs on the machine hardly move. The peer chooses one of three learning rates, five
 minutes each, by its error on the fitted images; the best one goes on until 40 minutes, of which those five count. Its ratio is its time to the target over
