@@ -213,7 +213,7 @@ class FitReport(Record):
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
     shape_covariance: tuple[tuple[float, ...], ...] = Field(default=(), description="of the blend weights; empty where they were not fitted")
-    enamel_thickness: Estimate | None = Field(default=None, description="mean over the pixels in which the first camera sees the tooth; null without dentin")
+    enamel_thickness: Estimate | None = Field(default=None, description="mean over what the first camera sees of the tooth; null if nothing, or without dentin")
     teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
     correlations: dict[str, Correlation] = Field(default={}, description="per channel: correlation of the fitted coordinates")
     told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")

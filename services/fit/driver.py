@@ -160,7 +160,7 @@ def fitted_thickness(
     """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not see the tooth.
 
     Args:
-        tooth: as prepared.
+        tooth: with its dentin where the job says that it is known.
         covariance: of the blend weights; empty where they were not fitted.
     """
     dentin = dentin_shape(tooth, cameras, spec)

@@ -70,7 +70,7 @@ REACH: Mapping[str, Reach] = MappingProxyType({"shape": Reach(0.2, 0.2, 1), "sig
 """By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that a wide difference is no derivative."""
 
 SLOPE_REACH = Reach(0.35, 0.35, 4)
-"""Of a cosine where the derivative itself is wanted, which falls by half over the wide difference."""
+"""Of a cosine in the closing measurement, where the derivative itself is wanted."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ Similar media have the same reduced scattering and absorption at mean cosine 0 (
 their derivatives to sigma are several times less noisy, at an image error of 1 to 15 %. So they carry the fit to its neighbourhood. In the last stage
 residuals come from the exact media and only the Jacobian from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
 
-sigma and g are nearly one parameter in a thick medium. With one lobe the mean cosine is a coordinate at constant reduced scattering and absorption, from the
-first exact stage on, under a weak prior: it decides how much light turns back after few scatterings. With two lobes g1, beta and g2 are free under weak
-Gaussian priors. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
+sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at constant reduced scattering and
+absorption, from the first exact stage on, under a weak prior: it decides how much light turns back after few scatterings. With two lobes g1, beta and g2
+are free under weak Gaussian priors. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
 """
 
 from __future__ import annotations

@@ -88,14 +88,14 @@ def fit_rows(tooth: Subject, truth: Tissue, seed: int, options: dict[str, object
         tooth.photograph(root, seed)
         spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "fit" if truth.shape else "known", "seed": seed, **options})
         report = run(spec, LocalContext(root), engine=engine)
-        stage, prepared = open_stage(root, "prepared", PreparedManifest)
-        (outer,) = read_teeth(stage, prepared.fdi)
-        thickness = fitted_thickness(outer, prepared.cameras, spec, truth.shape, ())
+        thickness = None
+        if truth.shape:
+            stage, prepared = open_stage(root, "prepared", PreparedManifest)
+            thickness = fitted_thickness(read_teeth(stage, prepared.fdi)[0], prepared.cameras, spec, truth.shape, ())
         last = json.loads((root / "fit" / "history.json").read_text())[-1]
     found = {f"{part}.{leaf}": (report.parameters["green"][f"{part}.{leaf}"], getattr(getattr(truth, part), leaf)) for part in CENTRE for leaf in LEAVES}
-    if truth.shape:
+    if thickness is not None:
         assert report.enamel_thickness is not None
-        assert thickness is not None
         found["enamel.thickness"] = report.enamel_thickness, thickness.mean.value
     for name, (estimate, true) in found.items():
         yield {

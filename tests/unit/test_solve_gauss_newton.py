@@ -208,3 +208,29 @@ def test_trust_region_step_is_the_constrained_minimum() -> None:
             other = rng.standard_normal(3)
             other *= radius * rng.uniform(0, 1) / np.linalg.norm(other)
             assert value <= g @ other + 0.5 * other @ h @ other + 1e-9
+
+
+@dataclass
+class Overpromising(Quadratic):
+    """Derivatives of another loss than the one compared: they promise where nothing is to be gained."""
+
+    seen: float = 0.0
+    """Standard error of a comparison."""
+
+    def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
+        return LossChange(0.4, self.seen**2, 1.0)
+
+
+def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> None:
+    # The promise, 408 x 0.07^2 = 2, is for a fifth of a unit of length, so that the model's own error is 0.2; the comparison sees nothing, 0.4 +- 1.
+    problem = Overpromising(np.diag([816.0, 816.0]), np.array([0.07, 0.0]), seen=1.0)
+    domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
+    start = np.zeros(2)
+    trusting, doubting = (GaussNewton(domain, Options(max_samples=64, slope_error=error)) for error in (0.0, 0.5))
+    taken = trusting.step(problem, trusting.init(start, 64))
+    assert taken.accepted == 1
+    refused = doubting.step(problem, doubting.init(start, 64))
+    assert refused.accepted == 0
+    # Nor does the last step go there, as the comparison is not even on its side.
+    assert refused.result is Result.NOISE_LIMITED
+    np.testing.assert_array_equal(refused.x, start)

@@ -74,12 +74,13 @@ def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], c
     Args:
         covariance: of the weights (M, M); None where they are known.
     """
+    if covariance is None:
+        image = thickness_image(outer, Mesh(shape.vertices_mm(weights), shape.base.faces), camera)
+        mean = float(image[np.isfinite(image)].mean()) if np.isfinite(image).any() else None
+        return None if mean is None else ThicknessMap(image, None, Estimate(value=mean, se=None, unit="mm", determined=True))
     seen, points_mm = _seen(outer, camera)
     if not seen.any():
         return None
-    if covariance is None:
-        values_mm = enamel_thickness_mm(points_mm, Mesh(shape.vertices_mm(weights), shape.base.faces))
-        return ThicknessMap(_image(seen, values_mm, camera), None, Estimate(value=float(values_mm.mean()), se=None, unit="mm", determined=True))
     found = uncertain_thickness(points_mm, shape, np.asarray(weights), covariance)
     return ThicknessMap(
         _image(seen, found.values_mm, camera),

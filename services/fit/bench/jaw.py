@@ -23,7 +23,7 @@ from services.core.records import FitReport, FolderCapture, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, read_record
 from services.fit.bench import Row
-from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, photograph, prepare
+from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, prepare, write_photograph
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.platform import prepare_device
 
@@ -123,10 +123,7 @@ def write_photographs(folder: Path, case: Case) -> None:
     random = np.random.default_rng(SUBJECT)
     for image in read_record(folder / "capture.json", FolderCapture).images:
         assert image.variance_file is not None
-        mean, variance = (np.load(folder / file).astype(np.float64) for file in (image.file, image.variance_file))
-        noisy, spread = photograph(mean, variance, random)
-        np.save(folder / image.file, noisy)
-        np.save(folder / image.variance_file, spread)
+        write_photograph(folder, folder, (image.file, image.variance_file), random)
 
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:

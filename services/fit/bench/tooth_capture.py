@@ -45,6 +45,17 @@ def photograph(mean: NDArray[np.float64], variance: NDArray[np.float64], random:
     return (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32), (variance + added).astype(np.float32)
 
 
+def write_photograph(source: Path, target: Path, files: tuple[str, str], random: np.random.Generator, added: NDArray[np.float64] | float = 0.0) -> None:
+    """Store a rendered image, with something added, as a camera's photograph, and its variance beside it.
+
+    Args:
+        files: names of image and variance, equal in both folders.
+    """
+    mean, variance = (np.load(source / file).astype(np.float64) for file in files)
+    for file, values in zip(files, photograph(mean + added, variance, random), strict=True):
+        np.save(target / file, values)
+
+
 def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> None:
     """Copy one camera of a folder capture and add sensor noise."""
     shutil.copytree(source / "teeth", target / "teeth")
@@ -54,10 +65,7 @@ def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> 
     (target / "capture.json").write_text(json.dumps(description))
     random = np.random.default_rng(seed)
     for image in description["images"]:
-        mean, variance = (np.load(source / image[key]).astype(np.float64) for key in ("file", "variance_file"))
-        noisy, spread = photograph(mean, variance, random)
-        np.save(target / image["file"], noisy)
-        np.save(target / image["variance_file"], spread)
+        write_photograph(source, target, (image["file"], image["variance_file"]), random)
 
 
 @dataclass(frozen=True)

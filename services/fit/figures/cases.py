@@ -19,7 +19,7 @@ from services.core.errors import InputError
 from services.core.records import FolderCapture, JobSpec
 from services.core.settings import read_job
 from services.core.store import read_record, write_record
-from services.fit.bench.tooth_capture import photograph
+from services.fit.bench.tooth_capture import write_photograph
 
 Array = NDArray[np.float64]
 JOB = "job.toml"
@@ -116,12 +116,8 @@ def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str
             shutil.copyfile(source / name, target / name)
     for image in images:
         assert image.variance_file is not None
-        mean, variance = (np.load(source / file).astype(np.float64) for file in (image.file, image.variance_file))
-        if image.camera in added:
-            mean = mean + added[image.camera][..., None]
-        noisy, spread = photograph(mean, variance, random)
-        np.save(target / image.file, noisy)
-        np.save(target / image.variance_file, spread)
+        more = added[image.camera][..., None] if image.camera in added else 0.0
+        write_photograph(source, target, (image.file, image.variance_file), random, more)
     cameras = tuple(camera for camera in description.cameras if camera.name in case.cameras)
     write_record(target / "capture.json", description.model_copy(update={"cameras": cameras, "images": tuple(images)}))
 

@@ -16,12 +16,14 @@ from services.core.store import open_stage
 from services.fit.bench.tooth_capture import tissue_of
 from services.fit.driver import dentin_shape
 from services.fit.evaluate import ErrorSums, error_sums
+from services.fit.export.asset import mouth_of
 from services.fit.export.pictures import Picture
 from services.fit.export.stains import kept_stains
 from services.fit.figures.cases import job_of
-from services.fit.jaw_driver import fixed_dentin, known_dentins
+from services.fit.jaw_driver import known_dentins
 from services.fit.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
-from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Tissue
+from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.stage import fitted_teeth
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View
 
@@ -75,11 +77,7 @@ class Fitted:
     def observations(self) -> Observations:
         """What it saw, a jaw's teeth with the dentin that was assumed."""
         found = read_observations(job_of(self.folder)[0], self.spec)
-        if self.spec.kind == "tooth":
-            return found
-        teeth = (fixed_dentin(tooth, found.manifest.cameras, self.spec) for tooth in found.teeth)
-        layered = {fdi for fdi, tooth in self.report.teeth.items() if all("dentin.sigma" in table for table in tooth.parameters.values())}
-        return replace(found, teeth=tuple(tooth if str(tooth.fdi) in layered else replace(tooth, dentin=None) for tooth in teeth))
+        return found if self.spec.kind == "tooth" else replace(found, teeth=fitted_teeth(found.folder, found.manifest, self.spec, self.report))
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -88,13 +86,11 @@ class Fitted:
 
     def optics(self, channel: str) -> Tissue | Mouth:
         """As reported."""
-        values = {name: estimate.value for name, estimate in self.report.parameters[channel].items()}
-        if self.spec.kind == "tooth":
-            stains = kept_stains(self._stage[0])
-            return replace(tissue_of(values), shape=self.report.shape, stain=None if stains is None else stains.textures.get(channel))
-        teeth = [self.report.teeth[str(tooth.fdi)].parameters[channel] for tooth in self.observations.teeth]
-        gums = tissue_of({f"enamel.{leaf}": values[f"gums.{leaf}"] for leaf in MEDIUM_FIELDS}).enamel if "gums.sigma" in values else None
-        return Mouth(tuple(tissue_of({name: one.value for name, one in table.items()}) for table in teeth), gums, values.get("cavity.reflectance"))
+        if self.spec.kind == "jaw":
+            return mouth_of(self.report, channel)
+        stains = kept_stains(self._stage[0])
+        tissue = tissue_of({name: estimate.value for name, estimate in self.report.parameters[channel].items()})
+        return replace(tissue, shape=self.report.shape, stain=None if stains is None else stains.textures.get(channel))
 
     def stage_tissue(self, channel: str, stage: str) -> Tissue:
         """A tooth's media as a stage ended."""
