@@ -119,7 +119,7 @@ def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, s
     rows += [row(f"central differences, step {h:g}", d, paths) for h, d in differences.items()]
     summary = row(f"central differences, step {best:g}", differences[best], paths)
     ratio = float(costs[best] / our_cost)
-    return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient-summary {tissue}", "efficiency_ratio": ratio, "z": z})]
+    return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient {tissue}-summary", "efficiency_ratio": ratio, "z": z})]
 
 
 def _resolved(bias: float, variance: float) -> float:

@@ -74,7 +74,7 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
         common: dict[str, Any] = {"benchmark": "transport-gradient stains", "parameter": name, "samples": samples}
         rows.append(GradientRow(**common, peer="dentine", seconds=share, error=float(values.std(ddof=1)) / size_of, gradient=float(values.mean())))
         peer = GradientRow(**common, peer=PEER, seconds=theirs, error=float(differences.std(ddof=1)) / size_of, gradient=float(differences.mean()))
-        summary = {"benchmark": "transport-gradient-summary stains", "efficiency_ratio": ratio, "z": z}
+        summary = {"benchmark": "transport-gradient stains-summary", "efficiency_ratio": ratio, "z": z}
         rows += [peer, peer.model_copy(update=summary)]
     means = {"parameter": None, "gradient": None, "z": None, "efficiency_ratio": float(np.exp(np.mean(np.log(ratios))))}
     return [*rows, rows[-1].model_copy(update=means)]

@@ -11,7 +11,7 @@ import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View, single_tooth
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAIRS = 30
 LIGHTS, FEW_LIGHTS = 18, (2, 7, 11)
@@ -150,6 +153,27 @@ def _compare(case: Case, samples: int) -> list[SkipRow]:
     peer = SkipRow(benchmark=name, peer="without", seconds=theirs, error=errors[1], operations=without)
     summary = {"efficiency_ratio": float(errors[1] ** 2 / errors[0] ** 2 / ratio), "time_ratio": ratio, "operations_on": on, "seconds_on": seconds_on}
     return [SkipRow(benchmark=name, peer="dentine", seconds=ours, error=errors[0], operations=off), peer, peer.model_copy(update=summary)]
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Times relative to a kernel that never had the feature, and the kernels' operations, feature off and on."""
+    from services.fit.bench.plots import grid
+
+    compared = [row for row in rows if row["time_ratio"] is not None][::-1]
+    names = [row["benchmark"].removeprefix("transport-skip ") for row in compared]
+    figure, (times, operations) = grid(2)
+    measures = (("off", [row["time_ratio"] for row in compared], [row["operations"] for row in compared]),
+                ("on", [row["seconds_on"] / row["seconds"] for row in compared], [row["operations_on"] for row in compared]))  # fmt: skip
+    for label, ratios, counts in measures:
+        times.plot(ratios, names, "o", label=label)
+        operations.plot(counts, names, "o", label=label)
+    times.axvline(1.0, color="grey", linewidth=1)
+    times.set(xlabel="time over that without the feature", xlim=(0, None))
+    operations.set(xlabel="operations in the kernel", xlim=(0, None), yticklabels=[])
+    for axes in (times, operations):
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8)
+    return figure
 
 
 def _view(camera: Camera) -> View:
