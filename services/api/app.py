@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.api.events import EventAddress
-from services.api.jobs import Jobs, RunJob
+from services.api.jobs import Jobs
 from services.api.pipeline import run_job
+from services.api.runner import RunJob
+from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 
@@ -21,13 +23,12 @@ if TYPE_CHECKING:
 STATIC = Path(__file__).parent / "dashboard" / "static"
 
 
-def run_locally(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """Run a job on this machine's own workers."""
-    run_job(spec, folder, events=events)
+def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
+    """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
 
-
-def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
-    """Build the application over ``settings.data``; its lifespan frames the time in which jobs run."""
+    Args:
+        run: in place of the stages.
+    """
     from fastapi import FastAPI
     from starlette.middleware.trustedhost import TrustedHostMiddleware
     from starlette.staticfiles import StaticFiles
@@ -37,7 +38,12 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
     from services.api.routes import build_router
     from services.api.shield import Shield
 
-    jobs = Jobs(settings.data, run)
+    workers = Workers(settings.scheduler)
+
+    def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+        run_job(spec, folder, events=events, cluster=workers)
+
+    jobs = Jobs(settings, run or run_on_workers)
     feed = EventFeed(jobs.repository.newest_event)
 
     @asynccontextmanager
@@ -51,6 +57,7 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
             with suppress(asyncio.CancelledError):
                 await following
             await asyncio.to_thread(jobs.close)
+            await asyncio.to_thread(workers.close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
     problems.install(app)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from services.api.pipeline import CANCEL_FLAG
 from services.core.errors import UnknownJobError
 from services.core.geometry import Record
+from services.core.stage import CANCEL_FLAG
 
 if TYPE_CHECKING:
     from fastapi import Request, Response

@@ -1,7 +1,9 @@
 """The one event table: every process that works on a job appends to it, everybody who watches reads it.
 
-A server keeps it in its own database beside the jobs; ``dentine run`` keeps one in the job's folder. SQLite in WAL mode with
-``BEGIN IMMEDIATE`` and a busy timeout, so that read-then-write transactions of several processes never lose an update.
+A server keeps it in its own database beside the jobs; ``dentine run`` keeps one in the job's folder.
+
+Whoever runs a job of a server holds a lease with a number. Every start of a stage names it, so that a runner that stalled and was given up cannot start a
+stage behind its successor's back.
 """
 
 from __future__ import annotations
@@ -9,14 +11,15 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import sqlalchemy as sql
 from pydantic import Field
 
+from services.api.database import metadata, open_database, sqlite_url, writing
 from services.core.errors import FencedError
 from services.core.geometry import Record
 from services.core.stage import StageEvent, StageName
@@ -24,7 +27,6 @@ from services.core.stage import StageEvent, StageName
 EVENTS_FILE = "events.sqlite"
 """Name of a job folder's own event table."""
 
-metadata = sql.MetaData()
 event_table = sql.Table(
     "event",
     metadata,
@@ -39,6 +41,14 @@ event_table = sql.Table(
     sql.Column("data", sql.Text, nullable=False),
     sql.Index("event_of_job", "job", "id"),
     sqlite_autoincrement=True,
+)
+lease_table = sql.Table(
+    "lease",
+    metadata,
+    sql.Column("job", sql.Text, primary_key=True),
+    sql.Column("number", sql.Integer, nullable=False),
+    sql.Column("holder", sql.Text, nullable=False),
+    sql.Column("until_s", sql.Float, nullable=False),
 )
 
 
@@ -60,42 +70,28 @@ class JobEvent(Record):
 class EventAddress:
     """Where a job's events go, small enough to travel to a worker."""
 
-    database: Path
+    url: str = field(repr=False)
     job: str
+    lease: int = 0
+    """Number under which the job is run; 0 where there is only one runner."""
 
     @contextmanager
     def open(self) -> Iterator[EventLog]:
         """Open the table for this job and close it afterwards."""
-        engine = open_database(self.database)
+        engine = open_database(self.url)
         try:
-            yield EventLog(engine, self.job)
+            yield EventLog(engine, self.job, self.lease)
         finally:
             engine.dispose()
 
 
-def open_database(path: Path) -> sql.Engine:
-    """Open or create the database with every table that is known by now."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    engine = sql.create_engine(f"sqlite:///{path}")
-
-    @sql.event.listens_for(engine, "connect")
-    def _connect(connection: Any, _: Any) -> None:
-        connection.isolation_level = None  # SQLAlchemy then emits BEGIN itself, see below
-        connection.execute("PRAGMA busy_timeout=5000")
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("PRAGMA synchronous=NORMAL")
-
-    @sql.event.listens_for(engine, "begin")
-    def _begin(connection: sql.Connection) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if connection.get_execution_options().get("writes") else "BEGIN")
-
-    metadata.create_all(engine)
-    return engine
-
-
-def writing(engine: sql.Engine) -> AbstractContextManager[sql.Connection]:
-    """A transaction that holds the write lock from its first statement, so that what it reads stays true."""
-    return engine.execution_options(writes=True).begin()
+def folder_events(folder: Path, job: str = "local") -> EventAddress:
+    """The event table in a job's folder, made if it is not there."""
+    address = EventAddress(sqlite_url(folder / EVENTS_FILE), job)
+    engine = open_database(address.url)
+    metadata.create_all(engine, tables=[event_table, lease_table])
+    engine.dispose()
+    return address
 
 
 def insert_event(connection: sql.Connection, job: str, attempt: int, event: StageEvent | None = None, **columns: Any) -> None:
@@ -109,13 +105,20 @@ def insert_event(connection: sql.Connection, job: str, attempt: int, event: Stag
 class EventLog:
     """The events of one job."""
 
-    def __init__(self, engine: sql.Engine, job: str) -> None:
-        self._engine, self.job = engine, job
+    def __init__(self, engine: sql.Engine, job: str, lease: int = 0) -> None:
+        self._engine, self.job, self._lease = engine, job, lease
 
-    def begin_stage(self, stage: StageName, lease: int = 0) -> int:
-        """Record that the stage starts and return its attempt: one more than any before, in this table or in ``lease``."""
+    def begin_stage(self, stage: StageName, known: int = 0) -> int:
+        """Record that the stage starts and return its attempt: one more than any before, in this table or ``known`` otherwise.
+
+        Raises:
+            FencedError: somebody else runs the job by now.
+        """
         with writing(self._engine) as connection:
-            attempt = 1 + max(lease, self._newest_attempt(connection, stage))
+            newest = connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == self.job)) or 0
+            if newest > self._lease:
+                raise FencedError(f"The job was taken over under lease {newest}; lease {self._lease} may not start stage {stage}.")
+            attempt = 1 + max(known, self._newest_attempt(connection, stage))
             insert_event(connection, self.job, attempt, StageEvent(stage=stage, kind="started"))
         return attempt
 

@@ -1,28 +1,26 @@
-"""What can be done with jobs, and the thread that runs them one after the other."""
+"""What can be done with jobs."""
 
 from __future__ import annotations
 
-import logging
-import shutil
-import threading
-from collections.abc import Callable
+import time
 from pathlib import Path
 
 from pydantic import Field
 
-from services.api.events import EventAddress, JobEvent
-from services.api.lifecycle import Instruction, JobState, Trigger
-from services.api.pipeline import request_cancel, stages_of, withdraw_cancel
-from services.api.repository import Creation, Failure, Job, Repository
-from services.core.errors import DentineError, JobCancelledError, JobStateError, SettingsError
+from services.api.admission import Admission, Machine
+from services.api.erasure import erase, forget_listing
+from services.api.events import JobEvent
+from services.api.lifecycle import Instruction, Trigger
+from services.api.pipeline import request_cancel, stages_of
+from services.api.repository import Creation, Deletion, Job, Repository
+from services.api.runner import RunJob, Runner
+from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import JobSpec
+from services.core.settings import ServerSettings
 from services.core.stage import StageName
 
-RunJob = Callable[[JobSpec, Path, EventAddress], object]
-"""Runs a job in a folder to its end, events to the given table; raises what a stage raises."""
-
-DATABASE_FILE = "dentine.sqlite"
+DAY_S = 86400.0
 
 
 class StageProgress(Record):
@@ -38,27 +36,21 @@ class StageProgress(Record):
 class Jobs:
     """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run."""
 
-    def __init__(self, data: Path, run: RunJob) -> None:
-        self._data, self._run = data.resolve(), run
-        self.repository = Repository(self._data / DATABASE_FILE)
-        self._wake = threading.Event()
-        self._closing = False
-        self._thread = threading.Thread(target=self._run_queued, name="jobs")
+    def __init__(self, settings: ServerSettings, run: RunJob) -> None:
+        self._data, self._keep_days = settings.data.resolve(), settings.keep_days
+        self._data.mkdir(parents=True, exist_ok=True)
+        self.repository = Repository(settings.database_url)
+        self._admission = Admission(lambda: Machine.of(self._data))
+        self._runner = Runner(self.repository, self.folder, run, self._admission, self._tidy)
+        self._is_alone = settings.database is None
 
     def start(self) -> None:
         """Queue again what an earlier server left unfinished, then run jobs."""
-        self.repository.lose_unfinished()
-        self._wake.set()
-        self._thread.start()
+        self._runner.start(alone=self._is_alone)
 
     def close(self) -> None:
         """Stop the running job cooperatively; it stays queued and resumes when the server starts again."""
-        self._closing = True
-        self._wake.set()
-        for job in self.repository.page(1, state=JobState.RUNNING):
-            request_cancel(self.folder(job.id))
-        if self._thread.ident is not None:
-            self._thread.join()
+        self._runner.close()
         self.repository.close()
 
     def folder(self, job_id: str) -> Path:
@@ -69,19 +61,20 @@ class Jobs:
         """Queue a job.
 
         Raises:
-            SettingsError: a path is relative or absent. JobStateError: the key belongs to another job.
+            SettingsError: a path is relative or absent. TooLargeError: the machine could never run it. JobStateError: the key belongs to another job.
         """
         for option, path in (("capture", spec.capture), ("rig.mouth", spec.rig.mouth if spec.rig else None)):
             if path is not None and not path.is_absolute():
                 raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
             if path is not None and not path.exists():
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
+        self._admission.refuse_too_large(spec)
         creation = self.repository.create(spec, key)
-        self._wake.set()
+        self._runner.wake()
         return creation
 
     def cancel(self, job_id: str) -> Job:
-        """Cancel a job; a running one stops between two frames or steps.
+        """Cancel a job; a running one stops between two frames or steps, or in mid-kernel.
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: it has ended.
@@ -93,8 +86,24 @@ class Jobs:
     def retry(self, job_id: str) -> Job:
         """Queue a failed or cancelled job again; it resumes from what it had published."""
         self.repository.apply(job_id, Trigger.RETRY)
-        self._wake.set()
+        self._runner.wake()
         return self.repository.get(job_id)
+
+    def delete(self, job_id: str) -> Deletion:
+        """Remove everything that is stored of a job that has ended, and give a receipt.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be removed; delete it again.
+        """
+        self.repository.apply(job_id, Trigger.DELETE)
+        erased = erase(self.folder(job_id))
+        receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
+        forget_listing(self.folder(job_id))
+        return receipt
+
+    def waits_for(self, job: Job) -> str | None:
+        """Why a queued job does not start, None if nothing keeps it."""
+        return self._admission.reason(job.id)
 
     def progress(self, job: Job) -> list[StageProgress]:
         """How far each stage is, from the event table."""
@@ -103,45 +112,17 @@ class Jobs:
 
     def free_bytes(self) -> int:
         """Free space where jobs are stored."""
-        return shutil.disk_usage(self._data).free
+        return Machine.of(self._data).free_disk_bytes
 
     def is_running(self) -> bool:
         """Whether queued jobs will be run."""
-        return self._thread.is_alive() and not self._closing
+        return self._runner.is_running
 
-    def _run_queued(self) -> None:
-        while not self._closing:
-            self._wake.wait()
-            self._wake.clear()
-            while not self._closing and (job := self.repository.next_queued()) is not None:
-                self._run_one(job)
-
-    def _run_one(self, job: Job) -> None:
-        folder = self.folder(job.id)
-        folder.mkdir(parents=True, exist_ok=True)
-        withdraw_cancel(folder)
-        try:
-            self.repository.apply(job.id, Trigger.START)
-        except JobStateError:
-            return  # cancelled since it was read
-        trigger, failure = Trigger.SUCCEED, None
-        try:
-            if self._closing:
-                request_cancel(folder)
-            self._run(job.spec, folder, self.repository.address_of(job.id))
-        except JobCancelledError:
-            trigger = Trigger.STOPPED if self.repository.get(job.id).state is JobState.CANCELLING else Trigger.LOSE
-        except DentineError as problem:
-            trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
-        except Exception as problem:
-            logging.getLogger(__name__).exception("job %s", job.id)
-            message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
-            trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
-        self.repository.apply(job.id, trigger, failure)
-
-    def _stage(self, job: Job) -> StageName | None:
-        latest = self.repository.events_of(job.id).latest()
-        return latest[-1].stage if latest else None
+    def _tidy(self) -> None:
+        # Finish deletions that were cut short, and delete what has been kept long enough.
+        oldest_s = 0.0 if self._keep_days is None else time.time() - self._keep_days * DAY_S
+        for job_id in self.repository.ended_before(oldest_s):
+            self.delete(job_id)
 
 
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:

@@ -7,11 +7,15 @@ SUBMITTED   CANCELLED              -                   -                   FAILE
 QUEUED      CANCELLED              RUNNING             -                   FAILED                 QUEUED, launch
 RUNNING     CANCELLING, stop       -                   SUCCEEDED           FAILED                 QUEUED, launch
 CANCELLING  CANCELLING             -                   SUCCEEDED           FAILED                 CANCELLED
+DELETING    -                      -                   -                   -                      DELETING, erase
 ==========  =====================  ==================  ==================  =====================  =================
 
-Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch.
+Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch; RUNNING -pause-> QUEUED, launch.
+What has ended can be deleted: -delete-> DELETING, erase; so can what is DELETING, as the erasing itself may have been cut short.
+
 ``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from what it had
-published. A job that ends before it notices a cancel has succeeded: the state tells what happened, not what was wished.
+published. ``pause`` says that it cannot go on for now, for lack of disk. A job that ends before it notices a cancel has succeeded: the state tells what
+happened, not what was wished.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ class JobState(StrEnum):
     CANCELLED = "CANCELLED"
     SUCCEEDED = "SUCCEEDED"
     FAILED = "FAILED"
+    DELETING = "DELETING"
 
     @property
     def is_final(self) -> bool:
@@ -52,6 +57,8 @@ class Trigger(StrEnum):
     FAIL = "fail"
     LOSE = "lose"
     RETRY = "retry"
+    PAUSE = "pause"
+    DELETE = "delete"
 
 
 class Instruction(StrEnum):
@@ -60,6 +67,7 @@ class Instruction(StrEnum):
     NOTHING = "nothing"
     LAUNCH = "launch"
     STOP = "stop"
+    ERASE = "erase"
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,7 @@ class Transition:
 
 
 _QUEUED = Transition(JobState.QUEUED, Instruction.LAUNCH)
+_DELETING = Transition(JobState.DELETING, Instruction.ERASE)
 
 TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
     {
@@ -86,13 +95,20 @@ TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
         (JobState.RUNNING, Trigger.SUCCEED): Transition(JobState.SUCCEEDED),
         (JobState.RUNNING, Trigger.FAIL): Transition(JobState.FAILED),
         (JobState.RUNNING, Trigger.LOSE): _QUEUED,
+        (JobState.RUNNING, Trigger.PAUSE): _QUEUED,
         (JobState.CANCELLING, Trigger.CANCEL): Transition(JobState.CANCELLING),
         (JobState.CANCELLING, Trigger.STOPPED): Transition(JobState.CANCELLED),
         (JobState.CANCELLING, Trigger.SUCCEED): Transition(JobState.SUCCEEDED),
         (JobState.CANCELLING, Trigger.FAIL): Transition(JobState.FAILED),
         (JobState.CANCELLING, Trigger.LOSE): Transition(JobState.CANCELLED),
+        (JobState.CANCELLING, Trigger.PAUSE): Transition(JobState.CANCELLED),
         (JobState.FAILED, Trigger.RETRY): _QUEUED,
         (JobState.CANCELLED, Trigger.RETRY): _QUEUED,
+        (JobState.FAILED, Trigger.DELETE): _DELETING,
+        (JobState.CANCELLED, Trigger.DELETE): _DELETING,
+        (JobState.SUCCEEDED, Trigger.DELETE): _DELETING,
+        (JobState.DELETING, Trigger.DELETE): _DELETING,
+        (JobState.DELETING, Trigger.LOSE): _DELETING,
     }
 )
 

@@ -11,20 +11,24 @@ the old one may still write. The fit spreads its passes over the same workers an
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import importlib
+import secrets
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from services.api.events import EVENTS_FILE, EventAddress, EventLog, JobEvent
-from services.core.errors import InputError, JobCancelledError, WorkerLostError
+from services.api.events import EventAddress, EventLog, JobEvent, folder_events
+from services.api.workers import Workers
+from services.core.errors import DiskFullError, InputError, JobCancelledError, SchedulerLostError, WorkerLostError
 from services.core.records import AssetManifest, JobSpec
-from services.core.stage import LocalContext, StageEvent, StageName
+from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, write_record
 
 if TYPE_CHECKING:
@@ -33,7 +37,6 @@ if TYPE_CHECKING:
 Listener = Callable[[JobEvent], None]
 
 JOB_FILE = "job.json"
-CANCEL_FLAG = "cancel"
 POLL_S = 0.25
 GRACE_S = 5.0
 """How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
@@ -48,9 +51,6 @@ DOORS: Mapping[StageName, str] = MappingProxyType(
 )
 """``module:function`` of each stage; imported by the worker, never here."""
 _PUBLISHED_AS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
-_WORKER_CONFIG = {
-    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],  # Ctrl-C is the parent's to handle
-}
 
 
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
@@ -65,8 +65,9 @@ def run_job(
     workers: int | None = None,
     events: EventAddress | None = None,
     doors: Mapping[StageName, str] = DOORS,
+    cluster: Workers | None = None,
 ) -> AssetManifest:
-    """Run a job to its asset on a local cluster; needs no server.
+    """Run a job to its asset; needs no server.
 
     Args:
         root: the job's folder; its published stages are kept and skipped.
@@ -74,11 +75,12 @@ def run_job(
         workers: worker processes, default ``spec.workers``.
         events: event table to append to, default one in ``root``.
         doors: where each stage is entered.
+        cluster: where it runs, default workers of its own.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors)
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster)
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -90,6 +92,7 @@ def run_stages(
     workers: int | None = None,
     events: EventAddress | None = None,
     doors: Mapping[StageName, str] = DOORS,
+    cluster: Workers | None = None,
     *,
     again: bool = False,
 ) -> None:
@@ -97,12 +100,12 @@ def run_stages(
     root = root.resolve()
     with _sole_owner(root):
         _claim_folder(root, spec)
-        address = events or EventAddress(root / EVENTS_FILE, "local")
+        address = events or folder_events(root)
         todo = tuple(stage for stage in stages if again or not is_published(root, _PUBLISHED_AS[stage]))
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
-                with _local_cluster(workers or spec.workers) as client:
+                with nullcontext(cluster) if cluster is not None else Workers() as processes, processes.client(workers or spec.workers) as client:
                     _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again) for stage in todo], watch)
             watch.tell()
 
@@ -146,10 +149,23 @@ class StageTask:
             context = LocalContext(self.root, attempt, tell)
             context.raise_if_cancelled()
             module, function = self.door.split(":")
-            getattr(importlib.import_module(module), function)(self.spec, context)
+            try:
+                getattr(importlib.import_module(module), function)(self.spec, context)
+            except OSError as problem:
+                raise _disk_full(self.root, problem) from problem
             if "finished" not in told:
                 tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
+
+
+def _disk_full(root: Path, problem: OSError) -> Exception:
+    # What an error of the system means, itself if not a full disk.
+    if problem.errno not in {errno.ENOSPC, errno.EDQUOT}:
+        return problem
+    free = shutil.disk_usage(root).free
+    return DiskFullError(
+        f"The disk was full at {problem.filename or root}; free some space, the job goes on from what it had published.", {"free_disk_bytes": free}
+    )
 
 
 class _Watch:
@@ -174,38 +190,34 @@ def _await_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None
 
     last: Future | None = None
     for task in tasks:
-        last = client.submit(task, last, key=f"{task.stage}-{task.events.job}", resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
+        key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
+        last = client.submit(task, last, key=key, resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
     flag, give_up_at = tasks[0].root / CANCEL_FLAG, None
     while not last.done():  # type: ignore[union-attr]
         with suppress(TimeoutError):
             wait([last], timeout=POLL_S)
+        if client.status != "running" or last.cancelled():  # type: ignore[union-attr]
+            raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.")
         watch.tell()
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S
         if give_up_at is not None and time.monotonic() > give_up_at and watch.stage != "capture":
+            _stop_workers(client)
             raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
     try:
         last.result()  # type: ignore[union-attr]
     except KilledWorker as problem:
         raise WorkerLostError(
-            f"Every worker that took on stage {watch.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again."
+            f"Every worker that took on stage {watch.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
+            {"stage": watch.stage, "deaths": problem.allowed_failures + 1},
         ) from problem
 
 
-@contextmanager
-def _local_cluster(workers: int) -> Iterator[Client]:
-    """Spawned single-thread workers on loopback; every one may reach the dome, one stage at a time."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    with (
-        dask.config.set(_WORKER_CONFIG),
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
+def _stop_workers(client: Client) -> None:
+    # Those that are busy; each is started again.
+    busy = [worker for worker, keys in client.processing().items() if keys]
+    with suppress(TimeoutError):
+        client.restart_workers(busy, timeout=GRACE_S)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import Field
 
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, UnknownJobError
+from services.core.errors import DentineError, InputError, JobStateError, PlatformError, TooLargeError, UnknownJobError
 from services.core.geometry import Record
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ class Problem(Record):
 _STATUS = {
     UnknownJobError: HTTPStatus.NOT_FOUND,
     JobStateError: HTTPStatus.CONFLICT,
+    TooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,
     InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
     PlatformError: HTTPStatus.SERVICE_UNAVAILABLE,
     DentineError: HTTPStatus.INTERNAL_SERVER_ERROR,

@@ -1,19 +1,25 @@
-"""Jobs in SQLite beside the event table; a change of state and its event are one transaction."""
+"""Jobs beside the event table; a change of state and its event are one transaction.
+
+Whoever runs a job holds its lease: a number, one more than any before, and a time until which it is his. A lease that is not renewed is lost, and what its
+holder still says of the job is refused.
+"""
 
 from __future__ import annotations
 
 import secrets
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.events import EventAddress, EventLog, event_table, insert_event, metadata, open_database, writing
+from services.api.database import metadata, open_database, writing
+from services.api.events import EventAddress, EventLog, event_table, insert_event, lease_table
 from services.api.lifecycle import JobState, Transition, Trigger, apply
-from services.core.errors import DentineError, JobStateError, UnknownJobError
+from services.api.migrations import upgrade
+from services.core.errors import DentineError, FencedError, JobStateError, UnknownJobError
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
@@ -32,6 +38,17 @@ job_table = sql.Table(
     sqlite_autoincrement=True,
 )
 
+deletion_table = sql.Table(
+    "deletion",
+    metadata,
+    sql.Column("job", sql.Text, primary_key=True),
+    sql.Column("deleted_s", sql.Float, nullable=False),
+    sql.Column("submitted_s", sql.Float, nullable=False),
+    sql.Column("files", sql.Integer, nullable=False),
+    sql.Column("bytes", sql.BigInteger, nullable=False),
+    sql.Column("digest", sql.Text, nullable=False),
+)
+
 
 class Failure(Record):
     """Why a job failed."""
@@ -40,11 +57,12 @@ class Failure(Record):
     message: str = Field(description="one sentence that names the thing and the remedy")
     exit_status: int = Field(description="what `dentine run` would have exited with")
     stage: StageName | None = None
+    evidence: dict[str, str | int | float | None] = Field(default={}, description="what was measured when it failed, units in the names")
 
     @classmethod
     def of(cls, problem: DentineError, stage: StageName | None) -> Self:
         """The failure that an error means."""
-        return cls(code=problem.code, message=problem.message, exit_status=problem.exit_status, stage=stage)
+        return cls(code=problem.code, message=problem.message, exit_status=problem.exit_status, stage=stage, evidence=dict(problem.evidence))
 
 
 class Job(Record):
@@ -59,6 +77,17 @@ class Job(Record):
     failure: Failure | None
 
 
+class Deletion(Record):
+    """The receipt of a deleted job: all that is left of it."""
+
+    job: str
+    deleted_s: float = Field(description="Unix time")
+    submitted_s: float = Field(description="Unix time of the submission")
+    files: int = Field(description="files that were removed")
+    bytes: int
+    digest: str = Field(description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before")
+
+
 @dataclass(frozen=True)
 class Creation:
     """What a submission led to."""
@@ -67,16 +96,29 @@ class Creation:
     is_new: bool
 
 
-class Repository:
-    """The database of a server."""
+@dataclass(frozen=True)
+class Lease:
+    """The right to run a job for a while."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._engine = open_database(path)
+    job: Job
+    number: int
+
+
+class Repository:
+    """The database of a server, brought to this version's tables when it is opened.
+
+    Args:
+        clock: Unix time; servers that share a database must agree on it to within a lease's length.
+    """
+
+    def __init__(self, url: str, clock: Callable[[], float] = time.time) -> None:
+        self._url, self._clock = url, clock
+        self.engine = open_database(url)
+        upgrade(self.engine)
 
     def close(self) -> None:
         """Close every connection."""
-        self._engine.dispose()
+        self.engine.dispose()
 
     def create(self, spec: JobSpec, key: str | None) -> Creation:
         """Insert a job as QUEUED, or find the one that was submitted with this idempotency key.
@@ -85,12 +127,12 @@ class Repository:
             JobStateError: the key was used for other options.
         """
         options = spec.model_dump_json()
-        with writing(self._engine) as connection:
+        with writing(self.engine) as connection:
             if key is not None and (earlier := connection.execute(sql.select(job_table).where(job_table.c.key == key)).mappings().first()):
                 if earlier["spec"] != options:
                     raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
                 return Creation(_job(earlier), is_new=False)
-            job_id, now = secrets.token_hex(6), time.time()
+            job_id, now = secrets.token_hex(6), self._clock()
             row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options}
             connection.execute(job_table.insert().values(row))
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
@@ -103,7 +145,7 @@ class Repository:
         Raises:
             UnknownJobError: there is none with this id.
         """
-        with self._engine.connect() as connection:
+        with self.engine.connect() as connection:
             return self._find(connection, job_id)
 
     def page(self, limit: int, before: int | None = None, state: JobState | None = None) -> list[Job]:
@@ -113,15 +155,45 @@ class Repository:
             query = query.where(job_table.c.number < before)
         if state is not None:
             query = query.where(job_table.c.state == state)
-        with self._engine.connect() as connection:
+        with self.engine.connect() as connection:
             return [_job(row) for row in connection.execute(query).mappings()]
 
-    def next_queued(self) -> Job | None:
-        """The job that has waited longest."""
-        query = sql.select(job_table).where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number).limit(1)
-        with self._engine.connect() as connection:
-            row = connection.execute(query).mappings().first()
-            return _job(row) if row else None
+    def queued(self) -> list[Job]:
+        """Jobs that wait, those that have waited longest first."""
+        query = sql.select(job_table).where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number)
+        with self.engine.connect() as connection:
+            return [_job(row) for row in connection.execute(query).mappings()]
+
+    def lease(self, job_id: str, holder: str, seconds: float) -> Lease:
+        """Start a queued job.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it is not queued, any more perhaps.
+        """
+        with writing(self.engine) as connection:
+            self._apply(connection, job_id, Trigger.START)
+            number, until_s = 1 + self._lease_number(connection, job_id), self._clock() + seconds
+            connection.execute(lease_table.delete().where(lease_table.c.job == job_id))
+            connection.execute(lease_table.insert().values(job=job_id, number=number, holder=holder, until_s=until_s))
+            return Lease(self._find(connection, job_id), number)
+
+    def renew(self, lease: Lease, seconds: float) -> bool:
+        """Keep a lease; False if somebody else has the job by now."""
+        held = (lease_table.c.job == lease.job.id) & (lease_table.c.number == lease.number)
+        with writing(self.engine) as connection:
+            return bool(connection.execute(lease_table.update().where(held).values(until_s=self._clock() + seconds)).rowcount)
+
+    def settle(self, lease: Lease, trigger: Trigger, failure: Failure | None = None) -> Transition:
+        """Apply what the holder of a lease says of its job, and end the lease.
+
+        Raises:
+            FencedError: somebody else has the job by now. JobStateError: its state does not take the trigger.
+        """
+        with writing(self.engine) as connection:
+            if (newest := self._lease_number(connection, lease.job.id)) != lease.number:
+                raise FencedError(f"Job {lease.job.id} was taken over under lease {newest}; lease {lease.number} has no say in it.")
+            connection.execute(lease_table.update().where(lease_table.c.job == lease.job.id).values(until_s=0.0))
+            return self._apply(connection, lease.job.id, trigger, failure)
 
     def apply(self, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
         """Apply a trigger to a job's state.
@@ -129,30 +201,80 @@ class Repository:
         Raises:
             UnknownJobError: there is no such job. JobStateError: its state does not take the trigger.
         """
-        with writing(self._engine) as connection:
+        with writing(self.engine) as connection:
             return self._apply(connection, job_id, trigger, failure)
 
-    def lose_unfinished(self) -> list[str]:
-        """Tell every job that was queued or running that no process works on it; call when the server starts."""
-        lost = [JobState.SUBMITTED, JobState.QUEUED, JobState.RUNNING, JobState.CANCELLING]
-        with writing(self._engine) as connection:
-            ids = list(connection.scalars(sql.select(job_table.c.id).where(job_table.c.state.in_(lost)).order_by(job_table.c.number)))
+    def lose(self) -> list[str]:
+        """Tell every job under way that no process works on it any more."""
+        return self._lose(sql.true())
+
+    def lose_expired(self, keep: str) -> list[str]:
+        """Tell those that have no lease, or one that ran out.
+
+        Args:
+            keep: holder whose leases hold whatever the clock says: the caller, who knows what it runs.
+        """
+        current = sql.select(lease_table.c.job).where((lease_table.c.until_s >= self._clock()) | (lease_table.c.holder == keep))
+        return self._lose(job_table.c.id.not_in(current))
+
+    def _lose(self, which: sql.ColumnElement[bool]) -> list[str]:
+        running = job_table.c.state.in_([JobState.RUNNING, JobState.CANCELLING])
+        with writing(self.engine) as connection:
+            ids = list(connection.scalars(sql.select(job_table.c.id).where(running, which).order_by(job_table.c.number)))
             for job_id in ids:
                 self._apply(connection, job_id, Trigger.LOSE)
         return ids
 
+    def forget(self, job_id: str, files: int, size: int, digest: str) -> Deletion:
+        """Remove what is stored of a job whose files are gone, and keep a receipt.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it is not being deleted.
+        """
+        with writing(self.engine) as connection:
+            job = self._find(connection, job_id)
+            if job.state is not JobState.DELETING:
+                raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
+            receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
+            connection.execute(deletion_table.insert().values(receipt.model_dump()))
+            for table, column in ((event_table, event_table.c.job), (lease_table, lease_table.c.job), (job_table, job_table.c.id)):
+                connection.execute(table.delete().where(column == job_id))
+            return receipt
+
+    def deletion(self, job_id: str) -> Deletion:
+        """The receipt of a deleted job.
+
+        Raises:
+            UnknownJobError: no job of this id was deleted.
+        """
+        with self.engine.connect() as connection:
+            row = connection.execute(sql.select(deletion_table).where(deletion_table.c.job == job_id)).mappings().first()
+        if row is None:
+            raise UnknownJobError(f"No job {job_id} was deleted; check its id.")
+        return Deletion(**row)
+
+    def ended_before(self, time_s: float) -> list[str]:
+        """Jobs that ended before a time, oldest first, and those whose deletion was begun."""
+        ended = job_table.c.state.in_([state for state in JobState if state.is_final]) & (job_table.c.changed_s < time_s)
+        query = sql.select(job_table.c.id).where(ended | (job_table.c.state == JobState.DELETING)).order_by(job_table.c.number)
+        with self.engine.connect() as connection:
+            return list(connection.scalars(query))
+
     def events_of(self, job_id: str) -> EventLog:
         """The job's events."""
-        return EventLog(self._engine, job_id)
+        return EventLog(self.engine, job_id)
 
-    def address_of(self, job_id: str) -> EventAddress:
+    def address_of(self, lease: Lease) -> EventAddress:
         """Where another process appends the job's events."""
-        return EventAddress(self._path, job_id)
+        return EventAddress(self._url, lease.job.id, lease.number)
 
     def newest_event(self) -> int:
         """Id of the last event of any job."""
-        with self._engine.connect() as connection:
+        with self.engine.connect() as connection:
             return connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
+
+    def _lease_number(self, connection: sql.Connection, job_id: str) -> int:
+        return connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == job_id)) or 0
 
     def _find(self, connection: sql.Connection, job_id: str) -> Job:
         row = connection.execute(sql.select(job_table).where(job_table.c.id == job_id)).mappings().first()
@@ -165,7 +287,7 @@ class Repository:
         transition = apply(before, trigger)
         if transition.state is before and trigger is not Trigger.LOSE:
             return transition
-        changes = {"state": transition.state, "changed_s": time.time(), "failure": failure.model_dump_json() if failure else None}
+        changes = {"state": transition.state, "changed_s": self._clock(), "failure": failure.model_dump_json() if failure else None}
         connection.execute(job_table.update().where(job_table.c.id == job_id).values(changes))
         data: dict[str, Any] = {"state": transition.state, "trigger": trigger} | ({"failure": failure.model_dump()} if failure else {})
         message = failure.message if failure else f"{transition.state.capitalize()}."

@@ -12,7 +12,7 @@ from services.api.feed import EventFeed, follow
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import MEDIA_TYPE, Problem
-from services.api.repository import Job
+from services.api.repository import Deletion, Job
 from services.core.errors import PlatformError
 from services.core.geometry import Record
 from services.core.records import JobSpec
@@ -32,6 +32,7 @@ class JobDetail(Job):
     """A job and how far each of its stages is."""
 
     stages: list[StageProgress]
+    waits_for: str | None = Field(description="why a queued job does not start; null if nothing keeps it")
 
 
 class Health(Record):
@@ -43,14 +44,14 @@ class Health(Record):
 
 def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     """Routes over the given jobs."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 422)}
+    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 422, 507)}
     router = APIRouter(prefix="/v1", responses=failures)
 
     def find_job(job_id: str) -> Job:
         return jobs.repository.get(job_id)
 
     def detail(job: Job) -> JobDetail:
-        return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job))
+        return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job), waits_for=jobs.waits_for(job))
 
     Found = Annotated[Job, Depends(find_job)]
 
@@ -82,6 +83,16 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     def retry(job: Found) -> Job:
         """Queue a failed or cancelled job again; it resumes from what it had published."""
         return jobs.retry(job.id)
+
+    @router.delete("/jobs/{job_id}", tags=["jobs"])
+    def delete(job: Found) -> Deletion:
+        """Remove everything that is stored of a job that has ended; the answer is the receipt."""
+        return jobs.delete(job.id)
+
+    @router.get("/deletions/{job_id}", tags=["jobs"])
+    def deletion(job_id: str) -> Deletion:
+        """The receipt of a deleted job."""
+        return jobs.repository.deletion(job_id)
 
     @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, tags=["jobs"])
     async def events(job: Found, last_event_id: Annotated[int | None, Header()] = None) -> AsyncIterator[ServerSentEvent]:

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from services.api.app import STATIC, create_app, run_locally
-from services.api.jobs import RunJob
+from services.api.app import STATIC, create_app
+from services.api.runner import RunJob
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
 
 
-def serve(settings: ServerSettings, run: RunJob = run_locally) -> None:
+def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
     """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens.
 
     Raises:

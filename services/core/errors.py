@@ -8,17 +8,23 @@
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
     │   ├── CaptureInputError a frame or file is missing or malformed
     │   ├── UnknownJobError   no such job or artifact
+    │   ├── TooLargeError     more disk or memory than the machine has
     │   └── JobStateError     the job's state does not allow what was asked
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
     │   ├── CorruptStoreError a shard is missing, truncated or altered
     │   └── FencedError       a newer attempt owns this stage
     ├── PlatformError         the machine lacks something: a library, a device
+    │   └── SchedulerLostError the workers' scheduler does not answer; the job waits for it
     ├── RigError              the dome or a camera misbehaves; lights are dark when it is raised
     │   ├── InterlockError    e-stop or interlock open
     │   ├── ExposureLimitError photobiological limit, refused before anything is sent
     │   └── ReadbackError     the controller does not hold what was written
-    ├── WorkerLostError       worker processes kept dying on a stage
+    ├── ResourceError         the machine ran out of something, or a process broke; evidence in ``evidence``
+    │   ├── MemoryKillError   a process grew beyond its share of the memory
+    │   ├── DiskFullError     a write found no space; nothing half-written is visible
+    │   ├── CrashError        a process was ended by a signal or by itself
+    │   └── WorkerLostError   worker processes kept dying on a stage
     ├── NonFiniteError        a kernel produced NaN or Inf; count and place in the message
     └── JobCancelledError          cooperative cancel
 
@@ -27,6 +33,11 @@ Every message is one sentence that names the thing and the remedy. Every error s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+Evidence = Mapping[str, str | int | float | None]
+"""What was measured when something failed, quantities with their units in the name."""
+
 
 class DentineError(Exception):
     """Root of the tree; ``code`` is stable and machine-readable."""
@@ -34,13 +45,21 @@ class DentineError(Exception):
     code = "dentine-error"
     exit_status = 1
 
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, evidence: Evidence | None = None) -> None:
+        super().__init__(message, *(() if evidence is None else (dict(evidence),)))
+
+    def __str__(self) -> str:
+        return self.message
 
     @property
     def message(self) -> str:
         """The sentence for the user."""
         return str(self.args[0])
+
+    @property
+    def evidence(self) -> Evidence:
+        """What was measured when it happened."""
+        return self.args[1] if len(self.args) > 1 else {}
 
 
 class InputError(DentineError):
@@ -72,6 +91,12 @@ class UnknownJobError(InputError):
     """There is no such job, or it has no such artifact."""
 
     code = "job-unknown"
+
+
+class TooLargeError(InputError):
+    """A job needs more disk or memory than the machine has in all."""
+
+    code = "job-too-large"
 
 
 class JobStateError(InputError):
@@ -112,6 +137,12 @@ class PlatformError(DentineError):
     exit_status = 4
 
 
+class SchedulerLostError(PlatformError):
+    """The scheduler of the workers does not answer, or went away; nothing was lost by it."""
+
+    code = "scheduler-lost"
+
+
 class RigError(DentineError):
     """The dome or a camera misbehaves. Whoever raises it has already switched the lights off."""
 
@@ -137,11 +168,35 @@ class ReadbackError(RigError):
     code = "rig-readback"
 
 
-class WorkerLostError(DentineError):
+class ResourceError(DentineError):
+    """The machine ran out of something, or one of its processes broke."""
+
+    code = "resource-exhausted"
+    exit_status = 7
+
+
+class MemoryKillError(ResourceError):
+    """A process grew beyond its share of the memory and was ended."""
+
+    code = "memory-killed"
+
+
+class DiskFullError(ResourceError):
+    """A write found no space on the disk."""
+
+    code = "disk-full"
+
+
+class CrashError(ResourceError):
+    """A process was ended by a signal, or ended by itself."""
+
+    code = "process-crashed"
+
+
+class WorkerLostError(ResourceError):
     """Worker processes kept dying on the same stage."""
 
     code = "worker-lost"
-    exit_status = 7
 
 
 class NonFiniteError(DentineError):

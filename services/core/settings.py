@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, SecretStr, ValidationError
 
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import JobSpec
+
+DATABASE_FILE = "dentine.sqlite"
+"""Name of the database in the data folder."""
 
 
 class ServerSettings(Record):
@@ -19,7 +22,15 @@ class ServerSettings(Record):
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
-    data: Path = Field(default=Path("dentine-data"), description="folder of the database and the jobs")
+    data: Path = Field(default=Path("dentine-data"), description="folder of the jobs and, by default, the database")
+    database: SecretStr | None = Field(default=None, description="postgresql://USER:PASSWORD@HOST/NAME; default is SQLite in the data folder")
+    scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
+    keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
+
+    @property
+    def database_url(self) -> str:
+        """URL of the database, with its password."""
+        return self.database.get_secret_value() if self.database is not None else f"sqlite:///{self.data.resolve() / DATABASE_FILE}"
 
 
 class Settings(Record):

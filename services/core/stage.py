@@ -10,6 +10,8 @@ from pydantic import Field
 from services.core.errors import JobCancelledError
 from services.core.geometry import Record
 
+CANCEL_FLAG = "cancel"
+"""File in a job's folder that asks whoever works on it to stop."""
 StageName = Literal["capture", "prepare", "fit", "export"]
 
 
@@ -55,6 +57,6 @@ class LocalContext:
             self._listener(event)
 
     def raise_if_cancelled(self) -> None:
-        """Raise once ``cancel`` exists in the job's folder."""
-        if (self.root / "cancel").exists():
+        """Raise once the flag exists in the job's folder."""
+        if (self.root / CANCEL_FLAG).exists():
             raise JobCancelledError("The job was cancelled on request; what it had published is kept.")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from services.core.records import JobSpec
-from services.core.stage import StageContext, StageEvent
+from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
@@ -69,7 +69,7 @@ class Attempt:
         """Where tasks run, under keys of this attempt's own."""
         place = self.context.root / CHECKPOINT
         prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[:12]
-        with executor(self.engine, prefix) as run_on:
+        with executor(self.context.root / CANCEL_FLAG, self.engine, prefix) as run_on:
             yield run_on
 
     def passes(self, run_on: Executor, files: ChannelFiles, scope: str) -> Passes:

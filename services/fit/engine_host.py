@@ -2,7 +2,8 @@
 
 A kernel can hold the interpreter lock for seconds, and a worker that cannot answer its scheduler is taken for dead. So each worker keeps one child, a
 fresh interpreter that owns Mitsuba, the built scenes and the kernels. The worker's task only waits on a pipe. A child that dies (out of memory, kill) is
-started again and asked once more; a child whose worker dies sees its pipe close and ends itself, also in mid-kernel.
+started again and asked once more; a child whose worker dies sees its pipe close and ends itself, also in mid-kernel. While it waits, the task looks at the
+child's memory and at the job's cancel flag, and ends the child where it must; the worker stays.
 """
 
 from __future__ import annotations
@@ -15,15 +16,21 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
 from typing import Any, Protocol
 
-from services.core.errors import PlatformError
+from services.core.errors import JobCancelledError, ResourceError
 from services.fit.blocks import StoredFile, read_recipe
+from services.fit.engine_process import EngineProcess
 
 ENGINE = "services.fit.transport.engine:Engine"
 """Default engine, as ``module:class``; imported only where it runs."""
 SCENES_KEPT = 4
+WATCH_S = 0.25
+"""How often a waiting task looks at the child's memory and at the cancel flag."""
 
 
 class EngineHost(Protocol):
@@ -61,13 +68,17 @@ class InProcessHost:
 
 
 class ChildHost:
-    """The engine in one child process, started at the first call and again after it died."""
+    """The engine in one child process, started at the first call and again after it died.
 
-    def __init__(self, factory: str = ENGINE, threads: int | None = None) -> None:
-        self._factory, self._threads = factory, threads
+    Args:
+        memory_bytes: how far the child may grow; None for as far as the system lets it.
+    """
+
+    def __init__(self, factory: str = ENGINE, threads: int | None = None, memory_bytes: int | None = None) -> None:
+        self._command = [sys.executable, "-m", "services.fit.engine_host"], [factory, str(threads or 0)]
+        self._memory_bytes = memory_bytes
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pipe: Connection[Any, Any] | None = None
+        self._process: EngineProcess | None = None
 
     @property
     def pid(self) -> int | None:
@@ -78,45 +89,73 @@ class ChildHost:
         """See EngineHost. One call at a time.
 
         Raises:
-            PlatformError: the child died twice in this call.
+            MemoryKillError: the child grew beyond its share, or the system killed it for memory. CrashError: it died twice in this call.
         """
+        return self.call_until(lambda: False, method, recipe, *args, **options)
+
+    def call_until(self, is_cancelled: Callable[[], bool], method: str, recipe: StoredFile, *args: Any, **options: Any) -> Any:
+        """The same, but the child is ended in mid-kernel, and JobCancelledError raised, once ``is_cancelled()``."""
         request = pickle.dumps((method, recipe, args, options))
         with self._lock:
-            for _ in range(2):
+            for is_last in (False, True):
+                if is_cancelled():
+                    raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+                self._process = process = self._process or self._start()
                 try:
-                    pipe = self._connect()
-                    pipe.send_bytes(request)
-                    succeeded, value = pickle.loads(pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe
+                    process.pipe.send_bytes(request)
+                    while not process.pipe.poll(WATCH_S):
+                        if is_cancelled():
+                            self._end()
+                            raise JobCancelledError("The job was cancelled on request while it rendered; what it had published is kept.")
+                        process.check_memory()
+                    succeeded, value = pickle.loads(process.pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe
                 except (EOFError, ConnectionError):
                     self._end()
+                    if is_last or process.was_out_of_memory:
+                        raise process.death() from None
                     continue
+                except ResourceError:
+                    self._end()
+                    raise
                 if succeeded:
                     return value
                 raise value
-        raise PlatformError("The rendering process ended twice in one task, most likely for lack of memory; lower samples_per_pixel or raise pixel_step.")
+        raise AssertionError
 
     def close(self) -> None:
         """End the child."""
         with self._lock:
             self._end()
 
-    def _connect(self) -> Connection[Any, Any]:
-        if self._pipe is None:
-            self._pipe, theirs = Pipe()
-            environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-            command = [sys.executable, "-m", "services.fit.engine_host", str(theirs.fileno()), self._factory, str(self._threads or 0)]
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL)  # noqa: S603
-            theirs.close()
-        return self._pipe
+    def _start(self) -> EngineProcess:
+        ours, theirs = Pipe()
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        module, arguments = self._command
+        command = [*module, str(theirs.fileno()), *arguments]
+        process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL)  # noqa: S603
+        theirs.close()
+        return EngineProcess(process, ours, self._memory_bytes)
 
     def _end(self) -> None:
-        if self._pipe is not None:
-            self._pipe.close()
-            self._pipe = None
         if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+            self._process.end()
             self._process = None
+
+
+@dataclass(frozen=True)
+class CancellableHost:
+    """A worker's child as the tasks of one job see it."""
+
+    child: ChildHost
+    flag: Path
+    """Exists once the job's cancel was asked for."""
+
+    def call(self, method: str, recipe: StoredFile, *args: Any, **options: Any) -> Any:
+        """See ChildHost."""
+        return self.child.call_until(self.flag.exists, method, recipe, *args, **options)
+
+    def close(self) -> None:
+        """The child belongs to its worker."""
 
 
 def serve(descriptor: int, factory: str, threads: int | None) -> None:

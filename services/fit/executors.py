@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Protocol
 
 from distributed import WorkerPlugin
 
-from services.fit.engine_host import ENGINE, ChildHost, EngineHost, InProcessHost
+from services.fit.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
 
 Task = Callable[..., Any]
 ALLOWED_RETRIES = 3
@@ -43,14 +44,15 @@ class LocalExecutor:
 class DaskExecutor:
     """Runs tasks on any worker; a worker's tasks share its one child process."""
 
-    def __init__(self, client: Any, factory: str, prefix: str) -> None:
+    def __init__(self, client: Any, factory: str, prefix: str, flag: Path) -> None:
         self._client, self._prefix, self._plugin, self._submitted = client, prefix, plugin_name(factory), itertools.count()
+        self._flag = flag
         client.register_plugin(_EnginePlugin(factory), name=self._plugin)
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
         """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own."""
         own = f"{self._prefix}-{next(self._submitted)}-{key}"
-        return self._client.submit(run_on_worker, self._plugin, task, *args, key=own, pure=False, retries=ALLOWED_RETRIES)
+        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False, retries=ALLOWED_RETRIES)
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """See Executor."""
@@ -65,11 +67,11 @@ class _EnginePlugin(WorkerPlugin):
 
     def __init__(self, factory: str) -> None:
         self._factory = factory
-        self.host: EngineHost | None = None
+        self.host: ChildHost | None = None
 
     def setup(self, worker: Any) -> None:
         """Called by Dask on every worker, late-comers included."""
-        self.host = ChildHost(self._factory, worker.state.nthreads)
+        self.host = ChildHost(self._factory, worker.state.nthreads, worker.memory_manager.memory_limit)
 
     def teardown(self, worker: Any) -> None:  # noqa: ARG002 - Dask's signature
         """Called by Dask when the worker closes."""
@@ -82,11 +84,11 @@ def plugin_name(factory: str) -> str:
     return f"dentine-{factory}"
 
 
-def run_on_worker(plugin: str, task: Task, *args: Any) -> Any:
-    """Run a task with its worker's child."""
+def run_on_worker(plugin: str, flag: Path, task: Task, *args: Any) -> Any:
+    """Run a task with its worker's child, until ``flag`` exists."""
     from distributed import get_worker
 
-    return task(get_worker().plugins[plugin].host, *args)
+    return task(CancellableHost(get_worker().plugins[plugin].host, flag), *args)
 
 
 def _inside_task() -> bool:
@@ -100,8 +102,12 @@ def _inside_task() -> bool:
 
 
 @contextmanager
-def executor(factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
-    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process."""
+def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
+    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process.
+
+    Args:
+        flag: once it exists, what a worker renders is cut off.
+    """
     if not _inside_task():
         host = InProcessHost(factory)
         try:
@@ -112,4 +118,4 @@ def executor(factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
     from distributed import worker_client
 
     with worker_client() as client:
-        yield DaskExecutor(client, factory, prefix)
+        yield DaskExecutor(client, factory, prefix, flag)

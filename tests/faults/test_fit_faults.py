@@ -104,7 +104,7 @@ def echo(_host: object, number: int) -> int:
 
 
 def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
-    run_on = DaskExecutor(client, FAKE, "names")
+    run_on = DaskExecutor(client, FAKE, "names", Path("never"))
     assert run_on.gather([run_on.submit("same", echo, number) for number in range(5)]) == list(range(5))
 
 
@@ -169,13 +169,9 @@ def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path
 def test_renderers_end_with_their_worker(tmp_path: Path) -> None:
     from services.fit.engine_host import ChildHost
 
-    host = ChildHost(FAKE)
-    host._connect()
-    pid = host.pid
-    assert pid is not None
-    host._pipe.close()  # type: ignore[union-attr]
-    assert host._process is not None
-    assert host._process.wait(timeout=20) == 0
+    process = ChildHost(FAKE)._start()
+    process.pipe.close()
+    assert process._process.wait(timeout=PATIENCE_S) == 0
 
 
 def read_entries(root: Path) -> dict[str, Any]:

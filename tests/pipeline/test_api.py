@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,10 +13,11 @@ import pytest
 from httpx import Client
 
 from services.api.app import create_app
+from services.api.database import open_database, sqlite_url
 from services.api.events import EventAddress
-from services.core.errors import CaptureInputError, DentineError
+from services.core.errors import CaptureInputError, DentineError, DiskFullError, MemoryKillError
 from services.core.records import JobSpec
-from services.core.settings import ServerSettings
+from services.core.settings import DATABASE_FILE, ServerSettings
 from tests.support.live_server import serving
 
 
@@ -200,3 +203,68 @@ def test_every_error_has_a_status() -> None:
             yield from below(child)
 
     assert {status_of(kind("x")) // 100 for kind in below(DentineError)} == {4, 5}
+
+
+def test_a_deleted_job_is_gone_and_its_receipt_stays(serve: Any, capture_folder: str, tmp_path: Path) -> None:
+    client = serve()
+    job_id = submit(client, capture_folder).json()["id"]
+    finish(client, job_id)
+    files = [path for path in (tmp_path / "data" / "jobs" / job_id).rglob("*") if path.is_file()]
+    receipt = client.delete(f"/v1/jobs/{job_id}")
+    assert receipt.status_code == 200
+    assert receipt.json()["files"] == len(files)
+    assert client.get(f"/v1/deletions/{job_id}").json() == receipt.json()
+    assert client.get(f"/v1/jobs/{job_id}").status_code == 404
+    assert client.delete(f"/v1/jobs/{job_id}").status_code == 404
+    assert client.get("/v1/jobs").json()["jobs"] == []
+    assert list((tmp_path / "data" / "jobs").iterdir()) == []
+    # Nor do its options lie in the database's files any more.
+    with open_database(sqlite_url(tmp_path / "data" / DATABASE_FILE)).connect() as connection:
+        connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+    assert not [path for path in (tmp_path / "data").glob("dentine.sqlite*") if capture_folder.encode() in path.read_bytes()]
+
+
+def test_a_job_under_way_is_not_deleted(serve: Any, capture_folder: str) -> None:
+    hold = threading.Event()
+    client = serve(lambda *_: hold.wait(60))
+    job_id = submit(client, capture_folder).json()["id"]
+    try:
+        answer = client.delete(f"/v1/jobs/{job_id}")
+        assert (answer.status_code, answer.json()["code"]) == (409, "job-state")
+    finally:
+        hold.set()
+        finish(client, job_id)
+
+
+def test_what_the_machine_could_never_run_is_refused_with_507(serve: Any, capture_folder: str) -> None:
+    answer = submit(serve(), capture_folder, workers=64)
+    assert (answer.status_code, answer.json()["code"]) == (507, "job-too-large")
+    assert "fewer workers" in answer.json()["detail"]
+
+
+def test_a_full_disk_pauses_a_job_and_it_goes_on(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.admission.RETRY_S", 0.5)
+    monkeypatch.setattr("services.api.runner.ROUND_S", 0.1)
+    tries: list[int] = []
+
+    def run(*_: object) -> None:
+        tries.append(1)
+        if len(tries) == 1:
+            raise DiskFullError("The disk was full; free some space.", {"free_disk_bytes": 7})
+
+    client = serve(run)
+    job_id = submit(client, capture_folder).json()["id"]
+    states = [line for line in finish(client, job_id).splitlines() if '"kind":"state"' in line]
+    told = [json.loads(line.removeprefix("data: "))["data"]["state"] for line in states]
+    assert told == ["SUBMITTED", "QUEUED", "RUNNING", "QUEUED", "RUNNING", "SUCCEEDED"]
+
+
+def test_failures_say_what_was_measured(serve: Any, capture_folder: str) -> None:
+    def run(*_: object) -> None:
+        raise MemoryKillError("It grew too large; give it more.", {"peak_memory_bytes": 5, "memory_limit_bytes": 4})
+
+    client = serve(run)
+    job_id = submit(client, capture_folder).json()["id"]
+    finish(client, job_id)
+    failure = client.get(f"/v1/jobs/{job_id}").json()["failure"]
+    assert (failure["code"], failure["evidence"]) == ("memory-killed", {"peak_memory_bytes": 5, "memory_limit_bytes": 4})

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.api.events import EVENTS_FILE, EventAddress, JobEvent
+from services.api.events import JobEvent, folder_events
 from services.api.pipeline import request_cancel, run_job, stages_of, withdraw_cancel
 from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, WorkerLostError
 from services.core.records import JobSpec, RigSpec
@@ -105,16 +105,16 @@ def test_a_folder_belongs_to_one_run_and_one_set_of_options(tmp_path: Path) -> N
 
 
 def test_an_overtaken_attempt_cannot_report(tmp_path: Path) -> None:
-    with EventAddress(tmp_path / EVENTS_FILE, "job").open() as log:
+    with folder_events(tmp_path, "job").open() as log:
         old = log.begin_stage("fit")
         assert log.begin_stage("fit") == old + 1
         with pytest.raises(FencedError):
             log.append(old, StageEvent(stage="fit", kind="log"))
-        assert log.begin_stage("fit", lease=7) == 8
+        assert log.begin_stage("fit", known=7) == 8
 
 
 def test_writers_at_once_lose_no_event(tmp_path: Path) -> None:
-    address = EventAddress(tmp_path / EVENTS_FILE, "job")
+    address = folder_events(tmp_path, "job")
 
     def write() -> None:
         with address.open() as log:

@@ -35,11 +35,17 @@ def test_a_launch_always_leads_to_queued_and_only_queued_jobs_start(sequence: li
 
 
 @given(triggers)
-def test_an_end_is_left_only_by_retry_and_success_never(sequence: list[Trigger]) -> None:
+def test_an_end_is_left_only_by_deletion_or_retry_and_success_never_by_retry(sequence: list[Trigger]) -> None:
     for state, trigger, _ in walk(sequence):
         if state.is_final:
-            assert trigger is Trigger.RETRY
-            assert state is not JobState.SUCCEEDED
+            assert trigger is Trigger.DELETE or (trigger is Trigger.RETRY and state is not JobState.SUCCEEDED)
+
+
+@given(triggers)
+def test_what_is_being_deleted_never_comes_back(sequence: list[Trigger]) -> None:
+    for state, _, transition in walk(sequence):
+        if state is JobState.DELETING:
+            assert transition == lifecycle.Transition(JobState.DELETING, Instruction.ERASE)
 
 
 @given(triggers)
@@ -63,7 +69,7 @@ def test_every_unfinished_state_survives_a_crash_and_every_state_is_reachable() 
 
 
 def test_the_refusal_names_what_the_state_takes() -> None:
-    with pytest.raises(JobStateError, match=r"SUCCEEDED does not take 'cancel'; it takes nothing"):
+    with pytest.raises(JobStateError, match=r"SUCCEEDED does not take 'cancel'; it takes delete"):
         apply(JobState.SUCCEEDED, Trigger.CANCEL)
 
 

@@ -1,0 +1,134 @@
+"""Which jobs may start: those whose predicted disk and memory are there. What can never be there is refused when the job is submitted."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import stat
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from services.core.errors import DentineError, DiskFullError, TooLargeError
+from services.core.records import JobSpec
+
+DISK_PER_CAPTURE = 4.0
+"""Bytes that a job stores per byte of its capture, its own copy of a capture included; 2 to 3 were measured."""
+LEAST_DISK_BYTES = 64 * 2**20
+"""What a job stores of a small capture: pictures, checkpoint and asset."""
+RIG_CAPTURE_BYTES = 2 * 2**30
+"""A capture that a rig is about to take."""
+WORKER_BYTES = 3 * 2**29
+"""Memory of one worker and its rendering process in a jaw's fit; 1.2 GiB were measured."""
+MOST_FILES = 20_000
+"""Of a capture that are looked at."""
+KEPT_FREE_BYTES = 256 * 2**20
+"""Disk that no job may count on."""
+RETRY_S = 10.0
+"""How long a job waits after it was paused."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a job is predicted to take."""
+
+    disk_bytes: int
+    memory_bytes: int
+
+
+def predict(spec: JobSpec) -> Needs:
+    """Prediction from the size of the capture and the number of workers."""
+    size = RIG_CAPTURE_BYTES if spec.capture is None else _stored_bytes(spec.capture)
+    return Needs(LEAST_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
+
+
+def _stored_bytes(folder: Path) -> int:
+    # What lies on the disk, of as many files as a capture may have.
+    total = 0
+    for path in itertools.islice(folder.rglob("*"), MOST_FILES):
+        with suppress(OSError):
+            status = path.lstat()
+            total += 512 * status.st_blocks if stat.S_ISREG(status.st_mode) else 0
+    return total
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What there is."""
+
+    free_disk_bytes: int
+    disk_bytes: int
+    memory_bytes: int
+
+    @classmethod
+    def of(cls, folder: Path) -> Machine:
+        """This machine, and the disk of a folder."""
+        disk = shutil.disk_usage(folder)
+        return cls(disk.free, disk.total, psutil.virtual_memory().total)
+
+
+class Admission:
+    """Holds jobs back; remembers why.
+
+    Args:
+        look: what the machine has now.
+    """
+
+    def __init__(self, look: Callable[[], Machine], clock: Callable[[], float] = time.monotonic) -> None:
+        self._look, self._clock = look, clock
+        self._lock = threading.Lock()
+        self._paused: dict[str, tuple[float, str]] = {}
+        self._reasons: dict[str, str] = {}
+
+    def refuse_too_large(self, spec: JobSpec) -> None:
+        """Refuse what this machine could never run.
+
+        Raises:
+            TooLargeError: it needs more disk or memory than there is in all.
+        """
+        needs, machine = predict(spec), self._look()
+        if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
+            raise TooLargeError(
+                f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all; put the server's data on a larger one.",
+                {"needed_disk_bytes": needs.disk_bytes, "disk_bytes": machine.disk_bytes},
+            )
+        if needs.memory_bytes > machine.memory_bytes:
+            raise TooLargeError(
+                f"{spec.workers} workers need about {_gib(needs.memory_bytes)} of memory and there are {_gib(machine.memory_bytes)}; ask for fewer workers.",
+                {"needed_memory_bytes": needs.memory_bytes, "memory_bytes": machine.memory_bytes},
+            )
+
+    def holds(self, job_id: str, spec: JobSpec) -> bool:
+        """Whether a queued job must wait; ``reason`` then says why."""
+        machine = self._look()
+        with self._lock:
+            until, reason = self._paused.get(job_id, (0.0, ""))
+            if self._clock() >= until:
+                needed, reason = predict(spec).disk_bytes + KEPT_FREE_BYTES, ""
+                if machine.free_disk_bytes < needed:
+                    reason = f"Waits for disk: about {_gib(needed)} are needed and {_gib(machine.free_disk_bytes)} are free."
+                self._paused.pop(job_id, None)
+            self._reasons.pop(job_id, None)
+            if reason:
+                self._reasons[job_id] = reason
+            return bool(reason)
+
+    def pause(self, job_id: str, problem: DentineError) -> None:
+        """Let a job wait that could not go on."""
+        what = "disk" if isinstance(problem, DiskFullError) else "workers"
+        with self._lock:
+            self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
+
+    def reason(self, job_id: str) -> str | None:
+        """Why a queued job does not start, None if nothing keeps it."""
+        with self._lock:
+            return self._reasons.get(job_id)
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"

@@ -1,0 +1,78 @@
+"""The database behind a URL: SQLite for one machine, Postgres for several; what is read inside ``writing`` stays true in both.
+
+SQLite runs in WAL mode with ``BEGIN IMMEDIATE`` and a busy timeout, because its defaults lose updates in read-then-write. On Postgres the same
+transactions take one advisory lock. So there is one writer at a time, events become visible in the order of their ids, and a reader that remembers the last
+id it saw misses none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sql
+
+from services.core.errors import PlatformError, SettingsError
+
+BUSY_MS = 5000
+"""How long a writer waits for another one before it gives up."""
+WRITER_LOCK = 0x64656E74
+"""Number of the advisory lock, "dent"."""
+
+metadata = sql.MetaData()
+
+
+def sqlite_url(path: Path) -> str:
+    """URL of a database file."""
+    return f"sqlite:///{path}"
+
+
+def open_database(url: str) -> sql.Engine:
+    """Open a database; nothing is created in it.
+
+    Raises:
+        SettingsError: not a URL of SQLite or Postgres. PlatformError: Postgres' driver is not installed.
+    """
+    try:
+        parsed = sql.make_url(url)
+    except sql.exc.ArgumentError:
+        raise SettingsError("The database's URL is malformed; give sqlite:///FILE or postgresql://USER:PASSWORD@HOST/NAME.") from None
+    if parsed.get_backend_name() == "sqlite":
+        if parsed.database:
+            Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+        return _sqlite(parsed)
+    if parsed.get_backend_name() != "postgresql":
+        raise SettingsError(f"The database {parsed.get_backend_name()!r} is not supported; use sqlite or postgresql.")
+    try:
+        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
+    except ModuleNotFoundError as problem:
+        raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
+
+
+@contextmanager
+def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
+    """A transaction that keeps other writers out from its first statement."""
+    with engine.execution_options(writes=True).begin() as connection:
+        if engine.dialect.name == "postgresql":
+            connection.execute(sql.select(sql.func.pg_advisory_xact_lock(WRITER_LOCK)))
+        yield connection
+
+
+def _sqlite(url: sql.URL) -> sql.Engine:
+    engine = sql.create_engine(url)
+
+    @sql.event.listens_for(engine, "connect")
+    def _connect(connection: Any, _: Any) -> None:
+        connection.isolation_level = None  # SQLAlchemy then emits BEGIN itself, see below
+        connection.execute(f"PRAGMA busy_timeout={BUSY_MS}")
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=NORMAL")
+        connection.execute("PRAGMA secure_delete=ON")  # what is deleted is overwritten
+
+    @sql.event.listens_for(engine, "begin")
+    def _begin(connection: sql.Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if connection.get_execution_options().get("writes") else "BEGIN")
+
+    return engine

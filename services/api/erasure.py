@@ -1,0 +1,61 @@
+"""Removes a job's folder so that it can be shown that nothing is left."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from services.core.errors import StoreError
+from services.core.store import write_atomic
+
+
+@dataclass(frozen=True)
+class Erased:
+    """What was removed."""
+
+    files: int
+    bytes: int
+    digest: str
+    """SHA-256 over lines of path, size and SHA-256 of every file, sorted by path."""
+
+
+def erase(folder: Path) -> Erased:
+    """Remove a folder and everything below it; an absent one counts as empty. A removal that was cut short is gone on with, and counts from its beginning.
+
+    Raises:
+        StoreError: something could not be removed.
+    """
+    listing = _listing(folder)
+    if not listing.exists():
+        write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
+    try:
+        if folder.exists():
+            shutil.rmtree(folder)
+    except OSError as problem:
+        raise StoreError(
+            f"{problem.filename or folder} could not be removed ({problem.strerror}); correct its permissions and delete the job again."
+        ) from problem
+    return Erased(**json.loads(listing.read_text()))
+
+
+def forget_listing(folder: Path) -> None:
+    """Remove what ``erase`` noted of the folder, once a receipt is kept."""
+    _listing(folder).unlink(missing_ok=True)
+
+
+def _listing(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.erasing")
+
+
+def _measure(folder: Path) -> Erased:
+    lines, size = [], 0
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()):
+        with path.open("rb") as stream:
+            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        length = path.stat().st_size
+        lines.append(f"{path.relative_to(folder).as_posix()} {length} {content}\n")
+        size += length
+    return Erased(len(lines), size, hashlib.sha256("".join(lines).encode()).hexdigest())

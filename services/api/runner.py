@@ -1,0 +1,134 @@
+"""The threads of a server that run queued jobs, one after the other, and look after those that nobody runs any more."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from services.api.admission import Admission
+from services.api.events import EventAddress
+from services.api.lifecycle import JobState, Trigger
+from services.api.pipeline import request_cancel, withdraw_cancel
+from services.api.repository import Failure, Job, Lease, Repository
+from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, SchedulerLostError
+from services.core.records import JobSpec
+from services.core.stage import StageName
+
+RunJob = Callable[[JobSpec, Path, EventAddress], object]
+"""Runs a job in a folder to its end, events to the given table; raises what a stage raises."""
+
+LEASE_S = 60.0
+"""How long a job stays with a server that no longer answers."""
+ROUND_S = 10.0
+"""How often leases are renewed, lost ones found and waiting jobs looked at again."""
+
+
+class Runner:
+    """Runs jobs between ``start`` and ``close``.
+
+    Args:
+        folder: of a job by its id.
+    """
+
+    def __init__(self, repository: Repository, folder: Callable[[str], Path], run: RunJob, admission: Admission, on_round: Callable[[], None]) -> None:
+        self._repository, self._folder, self._run, self._admission, self._on_round = repository, folder, run, admission, on_round
+        self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
+        self._wake, self._closing = threading.Event(), threading.Event()
+        self._current: Lease | None = None
+        self._threads = [threading.Thread(target=self._work, name="jobs"), threading.Thread(target=self._look_after, name="leases")]
+
+    def start(self, *, alone: bool) -> None:
+        """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left by one that died."""
+        if alone:
+            self._repository.lose()
+        self._wake.set()
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Stop the running job cooperatively; it stays queued and resumes when a server starts again."""
+        self._closing.set()
+        self._wake.set()
+        if (lease := self._current) is not None:
+            request_cancel(self._folder(lease.job.id))
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+
+    def wake(self) -> None:
+        """There is something to run."""
+        self._wake.set()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether queued jobs will be run."""
+        return all(thread.is_alive() for thread in self._threads) and not self._closing.is_set()
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            while not self._closing.is_set() and (lease := self._next()) is not None:
+                self._current = lease
+                self._run_one(lease)
+                self._current = None
+
+    def _next(self) -> Lease | None:
+        # The oldest job that may start; those that wait for disk or memory let others pass.
+        for job in self._repository.queued():
+            if self._admission.holds(job.id, job.spec):
+                continue
+            try:
+                return self._repository.lease(job.id, self._holder, LEASE_S)
+            except JobStateError:
+                continue  # cancelled, or another server's by now
+        return None
+
+    def _look_after(self) -> None:
+        log = logging.getLogger(__name__)
+        while not self._closing.wait(ROUND_S):
+            try:
+                if (lease := self._current) is not None and not self._repository.renew(lease, LEASE_S):
+                    log.warning("job %s was taken over by another server", lease.job.id)
+                for job_id in self._repository.lose_expired(self._holder):
+                    log.warning("job %s was lost by its server and is queued again", job_id)
+                self._on_round()
+            except Exception:
+                log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
+            self._wake.set()
+
+    def _run_one(self, lease: Lease) -> None:
+        job, folder = lease.job, self._folder(lease.job.id)
+        folder.mkdir(parents=True, exist_ok=True)
+        withdraw_cancel(folder)
+        if self._closing.is_set() or self._repository.get(job.id).state is JobState.CANCELLING:
+            request_cancel(folder)
+        trigger, failure = Trigger.SUCCEED, None
+        try:
+            self._run(job.spec, folder, self._repository.address_of(lease))
+        except JobCancelledError:
+            trigger = Trigger.STOPPED if self._repository.get(job.id).state is JobState.CANCELLING else Trigger.LOSE
+        except FencedError as problem:
+            logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
+            return
+        except (DiskFullError, SchedulerLostError) as problem:
+            self._admission.pause(job.id, problem)
+            trigger = Trigger.PAUSE
+        except DentineError as problem:
+            trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
+        except Exception as problem:
+            logging.getLogger(__name__).exception("job %s", job.id)
+            message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
+            trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
+        try:
+            self._repository.settle(lease, trigger, failure)
+        except FencedError as problem:
+            logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
+
+    def _stage(self, job: Job) -> StageName | None:
+        latest = self._repository.events_of(job.id).latest()
+        return latest[-1].stage if latest else None

@@ -1,0 +1,72 @@
+"""Which jobs wait for what, and which are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.api.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
+from services.core.errors import DiskFullError, SchedulerLostError, TooLargeError
+from services.core.records import JobSpec
+
+GIB = 2**30
+
+
+class World:
+    """A machine and a clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.machine, self.now_s = Machine(free_disk_bytes=50 * GIB, disk_bytes=100 * GIB, memory_bytes=16 * GIB), 0.0
+        self.admission = Admission(lambda: self.machine, lambda: self.now_s)
+
+    def free(self, size: int) -> None:
+        self.machine = Machine(size, self.machine.disk_bytes, self.machine.memory_bytes)
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> JobSpec:
+    (tmp_path / "teeth").mkdir()
+    (tmp_path / "teeth" / "a.npy").write_bytes(bytes(1 << 20))
+    (tmp_path / "link").symlink_to("/proc/kcore")
+    return JobSpec(capture=tmp_path, workers=2)
+
+
+def test_the_prediction_counts_what_lies_on_the_disk(spec: JobSpec) -> None:
+    needs = predict(spec)
+    # Blocks of the file system round a file up by less than 64 KiB.
+    assert 0 <= needs.disk_bytes - LEAST_DISK_BYTES - DISK_PER_CAPTURE * 2**20 <= DISK_PER_CAPTURE * 2**16
+    assert needs.memory_bytes == 2 * WORKER_BYTES
+
+
+def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> None:
+    world, enough = World(), predict(spec).disk_bytes + KEPT_FREE_BYTES
+    world.free(enough - 1)
+    assert world.admission.holds("a", spec)
+    assert "Waits for disk" in (world.admission.reason("a") or "")
+    world.free(enough)
+    assert not world.admission.holds("a", spec)
+    assert world.admission.reason("a") is None
+
+
+@pytest.mark.parametrize(("problem", "what"), [(DiskFullError("Full; free some."), "disk"), (SchedulerLostError("Gone; start it."), "workers")])
+def test_what_was_paused_is_tried_again_after_a_while(spec: JobSpec, problem: DiskFullError | SchedulerLostError, what: str) -> None:
+    world = World()
+    world.admission.pause("a", problem)
+    assert world.admission.holds("a", spec)
+    assert world.admission.reason("a") == f"Waits for {what}: {problem.message}"
+    assert not world.admission.holds("b", spec)
+    world.now_s = RETRY_S
+    assert not world.admission.holds("a", spec)
+
+
+def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> None:
+    world = World()
+    world.free(0)
+    world.admission.refuse_too_large(spec)  # it may wait
+    with pytest.raises(TooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB") as refusal:
+        world.admission.refuse_too_large(spec.model_copy(update={"workers": 64}))
+    assert refusal.value.evidence == {"needed_memory_bytes": 64 * WORKER_BYTES, "memory_bytes": 16 * GIB}
+    world.machine = Machine(0, LEAST_DISK_BYTES, 16 * GIB)
+    with pytest.raises(TooLargeError, match=r"of disk and there are 0\.1 GiB in all"):
+        world.admission.refuse_too_large(spec)

@@ -1,0 +1,52 @@
+"""Removing a job's folder, also when the removal is cut short."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import pytest
+
+from services.api.erasure import erase, forget_listing
+from services.core.errors import StoreError
+
+
+def write_job(folder: Path) -> str:
+    """Two files; returns the digest that the receipt must hold."""
+    (folder / "fit").mkdir(parents=True)
+    lines = []
+    for name, content in (("fit/shard", b"abc"), ("job.json", b"{}")):
+        (folder / name).write_bytes(content)
+        lines.append(f"{name} {len(content)} {hashlib.sha256(content).hexdigest()}\n")
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def test_nothing_is_left_and_the_receipt_tells_what_was_there(tmp_path: Path) -> None:
+    folder = tmp_path / "job"
+    digest = write_job(folder)
+    erased = erase(folder)
+    assert (erased.files, erased.bytes, erased.digest) == (2, 5, digest)
+    forget_listing(folder)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_removal_that_was_cut_short_counts_from_its_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "job"
+    digest = write_job(folder)
+
+    def stop(path: Path) -> None:
+        (Path(path) / "job.json").unlink()
+        raise PermissionError(13, "Permission denied", str(path / "fit"))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", stop)
+        with pytest.raises(StoreError, match=r"fit could not be removed \(Permission denied\)"):
+            erase(folder)
+    assert erase(folder).digest == digest
+    assert not folder.exists()
+    assert erase(folder).files == 2  # and again, until the receipt is kept
+
+
+def test_an_absent_folder_is_empty(tmp_path: Path) -> None:
+    assert erase(tmp_path / "none").files == 0
