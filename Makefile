@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo gallery figures test test-all lint bench dashboard setup
+.PHONY: demo gallery figures test test-all faults lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -20,6 +20,10 @@ test: ## all but the tests that take many minutes; what the machine cannot run i
 test-all: ## the slow ones too: fits of the real incisor, long slab tables
 	@deploy/setup.sh dashboard browser
 	@$(BIN)/python -m pytest
+
+faults: ## kill -9 of every part of the service at every point of a job, a quarter of an hour; needs Postgres
+	@deploy/setup.sh
+	@$(BIN)/python -m tests.faults.kill_matrix --out faults.json
 
 lint: setup
 	@$(BIN)/ruff check .

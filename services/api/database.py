@@ -7,10 +7,10 @@ id it saw misses none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import sqlalchemy as sql
 
@@ -21,6 +21,10 @@ BUSY_MS = 5000
 WRITER_LOCK = 0x64656E74
 """Number of the advisory lock, "dent"."""
 
+PATIENCE_S = 600.0
+"""How long whoever works on a job waits for a database that went away."""
+
+T = TypeVar("T")
 metadata = sql.MetaData()
 
 
@@ -49,6 +53,17 @@ def open_database(url: str) -> sql.Engine:
         return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
+
+
+def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
+    """Make a call again while the database does not answer, for so long."""
+    import stamina
+
+    away = (sql.exc.OperationalError, sql.exc.InterfaceError)
+    for attempt in stamina.retry_context(on=away, attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0):
+        with attempt:
+            return call()
+    raise AssertionError
 
 
 @contextmanager

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+
+import sqlalchemy as sql
 
 from services.api.events import JobEvent
 from services.api.lifecycle import JobState
@@ -23,11 +26,12 @@ class EventFeed:
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
         while True:
-            newest = await asyncio.to_thread(self._newest_event)
-            if newest > self.newest:
-                async with self._grown:
-                    self.newest = newest
-                    self._grown.notify_all()
+            with suppress(sql.exc.DBAPIError):  # a database that does not answer has nothing new to tell
+                newest = await asyncio.to_thread(self._newest_event)
+                if newest > self.newest:
+                    async with self._grown:
+                        self.newest = newest
+                        self._grown.notify_all()
             await asyncio.sleep(PERIOD_S)
 
     async def beyond(self, event_id: int) -> None:

@@ -18,12 +18,14 @@ import secrets
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.workers import Workers
 from services.core.errors import DiskFullError, InputError, JobCancelledError, SchedulerLostError, WorkerLostError
@@ -138,12 +140,13 @@ class StageTask:
             return self.stage
         with self.events.open() as log:
             lease = self.root / f"{folder}.lease"
-            attempt = log.begin_stage(self.stage, int(lease.read_text()) if lease.exists() else 0)
+            known = int(lease.read_text()) if lease.exists() else 0
+            attempt = patiently(lambda: log.begin_stage(self.stage, known))
             told: set[str] = set()
 
             def tell(event: StageEvent) -> None:
                 if event.kind != "started":  # begin_stage has recorded it
-                    log.append(attempt, event)
+                    patiently(lambda: log.append(attempt, event))
                 told.add(event.kind)
 
             context = LocalContext(self.root, attempt, tell)
@@ -176,7 +179,7 @@ class _Watch:
         self.stage: StageName | None = None
 
     def tell(self) -> None:
-        while new := self._log.read(self._after):
+        while new := patiently(lambda: self._log.read(self._after)):
             for event in new:
                 self.stage = event.stage or self.stage
                 if self._listener is not None:
@@ -186,6 +189,15 @@ class _Watch:
 
 def _await_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None:
     """Submit the chain, follow its events, and raise what it raises."""
+    from distributed.comm import CommClosedError
+
+    try:
+        _follow_stages(client, tasks, watch)
+    except (CancelledError, CommClosedError) as problem:
+        raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.") from problem
+
+
+def _follow_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None:
     from distributed import KilledWorker, wait
 
     last: Future | None = None
@@ -196,8 +208,6 @@ def _await_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None
     while not last.done():  # type: ignore[union-attr]
         with suppress(TimeoutError):
             wait([last], timeout=POLL_S)
-        if client.status != "running" or last.cancelled():  # type: ignore[union-attr]
-            raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.")
         watch.tell()
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S

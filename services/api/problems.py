@@ -54,6 +54,7 @@ def install(app: FastAPI) -> None:
     """Answer every error of the application with a problem document."""
     from fastapi.exceptions import RequestValidationError
     from fastapi.responses import Response
+    from sqlalchemy.exc import DBAPIError
     from starlette.exceptions import HTTPException
 
     def answer(request: Request, status: HTTPStatus, code: str, detail: str, headers: Any = None) -> Response:
@@ -62,6 +63,10 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(DentineError)
     def _dentine(request: Request, problem: DentineError) -> Response:
         return answer(request, status_of(problem), problem.code, problem.message)
+
+    @app.exception_handler(DBAPIError)
+    def _database(request: Request, _problem: DBAPIError) -> Response:
+        return answer(request, HTTPStatus.SERVICE_UNAVAILABLE, "database-lost", "The database does not answer; what is stored is kept, try again later.")
 
     @app.exception_handler(RequestValidationError)
     def _request(request: Request, problem: RequestValidationError) -> Response:

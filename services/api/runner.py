@@ -9,7 +9,10 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import sqlalchemy as sql
+
 from services.api.admission import Admission
+from services.api.database import patiently
 from services.api.events import EventAddress
 from services.api.lifecycle import JobState, Trigger
 from services.api.pipeline import request_cancel, withdraw_cancel
@@ -72,9 +75,14 @@ class Runner:
         while not self._closing.is_set():
             self._wake.wait()
             self._wake.clear()
-            while not self._closing.is_set() and (lease := self._next()) is not None:
-                self._current = lease
-                self._run_one(lease)
+            try:
+                while not self._closing.is_set() and (lease := self._next()) is not None:
+                    self._current = lease
+                    self._run_one(lease)
+                    self._current = None
+            except sql.exc.DBAPIError:
+                logging.getLogger(__name__).exception("the database does not answer; trying again in %g s", ROUND_S)
+            finally:
                 self._current = None
 
     def _next(self) -> Lease | None:
@@ -111,7 +119,8 @@ class Runner:
         try:
             self._run(job.spec, folder, self._repository.address_of(lease))
         except JobCancelledError:
-            trigger = Trigger.STOPPED if self._repository.get(job.id).state is JobState.CANCELLING else Trigger.LOSE
+            state = patiently(lambda: self._repository.get(job.id).state)
+            trigger = Trigger.STOPPED if state is JobState.CANCELLING else Trigger.LOSE
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
@@ -125,7 +134,7 @@ class Runner:
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
         try:
-            self._repository.settle(lease, trigger, failure)
+            patiently(lambda: self._repository.settle(lease, trigger, failure))
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -46,7 +47,7 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
 @contextmanager
 def toy_server(data: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
     """The server with toy stages as a process of its own, ended by SIGTERM unless the block ended it."""
-    command = [sys.executable, "-m", "tests.support.toy_server", str(data)]
+    command = [sys.executable, "-m", "tests.support.toy_server", json.dumps({"data": str(data), "port": 0})]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as process:
         try:
             assert process.stdout is not None

@@ -8,9 +8,11 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 import sqlalchemy as sql
 
@@ -20,40 +22,67 @@ USER = "postgres"
 """Who runs the server where the tests run as root, which Postgres refuses."""
 
 
+class PostgresServer:
+    """A server in a temporary folder that can be killed and started again. Skips where Postgres is not installed."""
+
+    def __init__(self) -> None:
+        found = next(iter(sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)), None)
+        if found is None:
+            pytest.skip("Postgres is not installed.")
+        self._as_user: dict[str, Any] = {}
+        if os.geteuid() == 0:
+            if USER not in {entry.pw_name for entry in pwd.getpwall()}:
+                pytest.skip(f"Postgres does not run as root, and there is no user {USER}.")
+            self._as_user = {"user": USER, "group": USER, "extra_groups": []}
+        self._programs, self._folder = found, Path(tempfile.mkdtemp(prefix="pg-"))
+        if self._as_user:
+            shutil.chown(self._folder, USER, USER)
+        self._data = self._folder / "data"
+        self._run("initdb", "--username", USER, "--auth", "trust", "--no-sync")
+
+    def url(self, name: str) -> str:
+        """Of one of its databases."""
+        return f"postgresql://{USER}@/{name}?host={self._folder}"
+
+    def start(self) -> None:
+        """Start, after a kill too."""
+        options = f"-c listen_addresses= -c unix_socket_directories={self._folder} -c fsync=off"
+        self._run("pg_ctl", "--wait", "--log", str(self._folder / "log"), "--options", options, "start")
+
+    def kill(self) -> None:
+        """Kill -9 the server and everything that it started."""
+        main = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
+        for process in [main, *main.children(recursive=True)]:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+        psutil.wait_procs([main], timeout=30)
+
+    def remove(self) -> None:
+        """Stop it and remove its folder."""
+        with suppress(subprocess.CalledProcessError):
+            self._run("pg_ctl", "--wait", "--mode", "immediate", "stop")
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _run(self, program: str, *arguments: str) -> None:
+        command = [str(self._programs / program), "--pgdata", str(self._data), *arguments]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=self._folder, **self._as_user)
+
+
 @contextmanager
-def postgres_server() -> Iterator[str]:
-    """URL of a fresh server without its database's name; skips where Postgres is not installed."""
-    found = next(iter(sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)), None)
-    if found is None:
-        pytest.skip("Postgres is not installed.")
-    folder = Path(tempfile.mkdtemp(prefix="pg-"))
-    as_user = {}
-    if os.geteuid() == 0:
-        if USER not in {entry.pw_name for entry in pwd.getpwall()}:
-            pytest.skip(f"Postgres does not run as root, and there is no user {USER}.")
-        shutil.chown(folder, USER, USER)
-        as_user = {"user": USER, "group": USER, "extra_groups": []}
-
-    def run(*command: str) -> None:
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder, **as_user)
-
-    data = folder / "data"
+def postgres_server() -> Iterator[PostgresServer]:
+    """A running server, removed in the end."""
+    server = PostgresServer()
     try:
-        run(str(found / "initdb"), "--pgdata", str(data), "--username", USER, "--auth", "trust", "--no-sync")
-        options = f"-c listen_addresses= -c unix_socket_directories={folder} -c fsync=off"
-        run(str(found / "pg_ctl"), "--pgdata", str(data), "--wait", "--log", str(folder / "log"), "--options", options, "start")
-        try:
-            yield f"postgresql://{USER}@/{{name}}?host={folder}"
-        finally:
-            run(str(found / "pg_ctl"), "--pgdata", str(data), "--wait", "--mode", "immediate", "stop")
+        server.start()
+        yield server
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        server.remove()
 
 
-def new_database(server: str, name: str) -> str:
+def new_database(server: PostgresServer, name: str) -> str:
     """URL of an empty database on a server."""
-    engine = open_database(server.format(name="postgres"))
+    engine = open_database(server.url("postgres"))
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         connection.execute(sql.text(f'CREATE DATABASE "{name}"'))
     engine.dispose()
-    return server.format(name=name)
+    return server.url(name)

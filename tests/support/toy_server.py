@@ -1,22 +1,36 @@
-"""``python -m tests.support.toy_server DATA``: the real server with toy stages, so that a test can kill it."""
+"""``python -m tests.support.toy_server SETTINGS``: the real server with toy stages, so that a test can kill it. Leases are short, as tests wait for them."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 from services.api.events import EventAddress
 from services.api.pipeline import run_job
 from services.api.server import serve
+from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from tests.support.toy_stages import DOORS
 
+LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 
-def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """Run a job with toy stages on real workers."""
-    run_job(spec, folder, events=events, doors=DOORS)
+
+def main(settings: ServerSettings) -> None:
+    """Serve with toy stages on real workers."""
+    with (
+        patch("services.api.runner.LEASE_S", LEASE_S),
+        patch("services.api.runner.ROUND_S", ROUND_S),
+        patch("services.api.admission.RETRY_S", RETRY_S),
+        Workers(settings.scheduler) as workers,
+    ):
+
+        def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+            run_job(spec, folder, events=events, doors=DOORS, cluster=workers)
+
+        serve(settings, run_toys)
 
 
 if __name__ == "__main__":
-    serve(ServerSettings(port=0, data=Path(sys.argv[1])), run_toys)
+    main(ServerSettings.model_validate_json(sys.argv[1]))

@@ -14,39 +14,56 @@ from services.core.store import StageWriter
 DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("capture", "prepare", "fit", "export")}
 
 
-def _publish(folder: str, context: StageContext) -> AssetManifest:
+def _publish(stage: StageName, folder: str, context: StageContext) -> AssetManifest:
     writer = StageWriter(context.root, folder, context.attempt)
     (writer.folder / "by.txt").write_text(f"{context.attempt}\n")
     record = AssetManifest(files=("by.txt",), held_out_error=0.04)
+    if stage != "capture":
+        _reach(context, stage, "middle")
     writer.publish(record)
+    with (context.root / "publications.txt").open("a") as stream:
+        stream.write(f"{stage}\n")
+    _reach(context, stage, "end")
     return record
+
+
+def _reach(context: StageContext, stage: StageName, point: str) -> None:
+    # Says where it is and in which process, and waits there as long as it is told to.
+    (context.root / f"at-{stage}-{point}").write_text(str(os.getpid()))
+    while (context.root / f"hold-{stage}-{point}").exists():
+        context.raise_if_cancelled()
+        time.sleep(0.02)
 
 
 def capture(_spec: JobSpec, context: StageContext) -> AssetManifest:
     """Lights a dome (a file) and darkens it on every exit; waits for ``hold-capture`` to go away."""
+    _reach(context, "capture", "start")
     lit = context.root / "lit"
     lit.touch()
     try:
         while (context.root / "hold-capture").exists():
             context.raise_if_cancelled()
             time.sleep(0.02)
+        _reach(context, "capture", "middle")
     except JobCancelledError:
         time.sleep(0.2)
         raise
     finally:
-        lit.unlink()
-    return _publish("capture", context)
+        lit.unlink(missing_ok=True)
+    return _publish("capture", "capture", context)
 
 
 def prepare(_spec: JobSpec, context: StageContext) -> AssetManifest:
     """Fails with a sentence while ``bad-input`` exists."""
+    _reach(context, "prepare", "start")
     if (context.root / "bad-input").exists():
         raise CaptureInputError("Frame c0_l3.npy is missing from the capture; copy it there.")
-    return _publish("prepared", context)
+    return _publish("prepare", "prepared", context)
 
 
 def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
     """Reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
+    _reach(context, "fit", "start")
     for step in range(10):
         data = {"channel": "green", "step": step, "loss": 0.5**step, "held_out_error": 0.6**step, "parameters": {"enamel.sigma": 4.0}}
         context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=(step + 1) / 10, data=data))
@@ -58,10 +75,11 @@ def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
             context.raise_if_cancelled()
             time.sleep(0.02)
         context.raise_if_cancelled()
-    return _publish("fit", context)
+    return _publish("fit", "fit", context)
 
 
 def export(_spec: JobSpec, context: StageContext) -> AssetManifest:
     """Publishes an asset."""
+    _reach(context, "export", "start")
     (context.root / "report.html").write_text("<!doctype html><title>report</title>")
-    return _publish("asset", context)
+    return _publish("export", "asset", context)

@@ -18,7 +18,7 @@ from services.api.lifecycle import JobState, Trigger
 from services.api.repository import Failure, Repository, job_table
 from services.core.errors import FencedError, JobStateError, SettingsError, UnknownJobError
 from services.core.records import JobSpec
-from tests.support.postgres import new_database, postgres_server
+from tests.support.postgres import PostgresServer, new_database, postgres_server
 
 SPEC = JobSpec(capture=Path("/mouth"))
 names = (f"test_{number}" for number in itertools.count())
@@ -35,9 +35,9 @@ class Clock:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with postgres_server() as url:
-        yield url
+def server() -> Iterator[PostgresServer]:
+    with postgres_server() as running:
+        yield running
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
