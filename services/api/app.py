@@ -23,7 +23,7 @@ STATIC = Path(__file__).parent / "dashboard" / "static"
 
 def run_locally(spec: JobSpec, folder: Path, events: EventAddress) -> None:
     """Run a job on this machine's own workers."""
-    run_job(spec, folder, events=events)
+    run_job(spec, folder, events=events, is_logged=True)
 
 
 def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
@@ -34,28 +34,33 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
 
     from services.api import problems
     from services.api.feed import EventFeed
+    from services.api.observation import Observation
     from services.api.routes import build_router
     from services.api.shield import Shield
 
     jobs = Jobs(settings.data, run)
     feed = EventFeed(jobs.repository.newest_event)
+    observation = Observation(jobs, settings)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         jobs.start()
-        following = asyncio.create_task(feed.run())
+        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
         try:
             yield
         finally:
-            following.cancel()
-            with suppress(asyncio.CancelledError):
-                await following
+            for task in tasks:
+                task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await task
             await asyncio.to_thread(jobs.close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
     problems.install(app)
     app.include_router(build_router(jobs, feed))
+    observation.include_routes(app)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host}))
     app.add_middleware(Shield)
+    observation.watch_requests(app)
     return app

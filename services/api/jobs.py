@@ -12,6 +12,7 @@ from pydantic import Field
 
 from services.api.events import EventAddress, JobEvent
 from services.api.lifecycle import Instruction, JobState, Trigger
+from services.api.logs import log_context
 from services.api.pipeline import request_cancel, stages_of, withdraw_cancel
 from services.api.repository import Creation, Failure, Job, Repository
 from services.core.errors import DentineError, JobCancelledError, JobStateError, SettingsError
@@ -65,7 +66,7 @@ class Jobs:
         """Where a job's stages and results lie."""
         return self._data / "jobs" / job_id
 
-    def submit(self, spec: JobSpec, key: str | None = None) -> Creation:
+    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None) -> Creation:
         """Queue a job.
 
         Raises:
@@ -76,7 +77,8 @@ class Jobs:
                 raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
             if path is not None and not path.exists():
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
-        creation = self.repository.create(spec, key)
+        creation = self.repository.create(spec, key, request_id)
+        logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._wake.set()
         return creation
 
@@ -114,7 +116,8 @@ class Jobs:
             self._wake.wait()
             self._wake.clear()
             while not self._closing and (job := self.repository.next_queued()) is not None:
-                self._run_one(job)
+                with log_context(job=job.id, request_id=job.request_id):
+                    self._run_one(job)
 
     def _run_one(self, job: Job) -> None:
         folder = self.folder(job.id)
@@ -134,10 +137,11 @@ class Jobs:
         except DentineError as problem:
             trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
         except Exception as problem:
-            logging.getLogger(__name__).exception("job %s", job.id)
+            logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
-        self.repository.apply(job.id, trigger, failure)
+        transition = self.repository.apply(job.id, trigger, failure)
+        logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
 
     def _stage(self, job: Job) -> StageName | None:
         latest = self.repository.events_of(job.id).latest()

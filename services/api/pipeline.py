@@ -15,7 +15,7 @@ import fcntl
 import importlib
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -65,6 +65,8 @@ def run_job(
     workers: int | None = None,
     events: EventAddress | None = None,
     doors: Mapping[StageName, str] = DOORS,
+    *,
+    is_logged: bool = False,
 ) -> AssetManifest:
     """Run a job to its asset on a local cluster; needs no server.
 
@@ -74,11 +76,12 @@ def run_job(
         workers: worker processes, default ``spec.workers``.
         events: event table to append to, default one in ``root``.
         doors: where each stage is entered.
+        is_logged: workers write log lines on standard error.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors)
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, is_logged=is_logged)
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -92,6 +95,7 @@ def run_stages(
     doors: Mapping[StageName, str] = DOORS,
     *,
     again: bool = False,
+    is_logged: bool = False,
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
     root = root.resolve()
@@ -103,7 +107,7 @@ def run_stages(
             watch = _Watch(log, listener, log.newest_id())
             if todo:
                 with _local_cluster(workers or spec.workers) as client:
-                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again) for stage in todo], watch)
+                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo], watch)
             watch.tell()
 
 
@@ -127,6 +131,7 @@ class StageTask:
     root: Path
     events: EventAddress
     again: bool = False
+    is_logged: bool = False
 
     def __call__(self, _previous: str | None = None) -> str:
         """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
@@ -142,14 +147,24 @@ class StageTask:
                 if event.kind != "started":  # begin_stage has recorded it
                     log.append(attempt, event)
                 told.add(event.kind)
+                write_line(event)
 
-            context = LocalContext(self.root, attempt, tell)
-            context.raise_if_cancelled()
-            module, function = self.door.split(":")
-            getattr(importlib.import_module(module), function)(self.spec, context)
-            if "finished" not in told:
-                tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
+            with self._logs(attempt) as write_line:
+                context = LocalContext(self.root, attempt, tell)
+                context.raise_if_cancelled()
+                module, function = self.door.split(":")
+                getattr(importlib.import_module(module), function)(self.spec, context)
+                if "finished" not in told:
+                    tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
+
+    def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
+        """The worker's log lines, or silence."""
+        if not self.is_logged:
+            return nullcontext(lambda _event: None)
+        from services.api.logs import stage_logs
+
+        return stage_logs(self.stage, attempt, self.events)
 
 
 class _Watch:

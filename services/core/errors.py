@@ -8,6 +8,9 @@
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
     │   ├── CaptureInputError a frame or file is missing or malformed
     │   ├── UnknownJobError   no such job or artifact
+    │   ├── UnknownPresetError no such set of options
+    │   ├── UnknownWebhookError no such webhook or delivery
+    │   ├── WebhookAddressError a webhook may not go there
     │   └── JobStateError     the job's state does not allow what was asked
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
@@ -72,6 +75,24 @@ class UnknownJobError(InputError):
     """There is no such job, or it has no such artifact."""
 
     code = "job-unknown"
+
+
+class UnknownPresetError(InputError):
+    """There is no such set of options."""
+
+    code = "preset-unknown"
+
+
+class UnknownWebhookError(InputError):
+    """There is no such webhook, or it has no such delivery."""
+
+    code = "webhook-unknown"
+
+
+class WebhookAddressError(InputError):
+    """A webhook's address is malformed, or leads where the server may not go."""
+
+    code = "webhook-address"
 
 
 class JobStateError(InputError):

@@ -20,6 +20,7 @@ class ServerSettings(Record):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
     data: Path = Field(default=Path("dentine-data"), description="folder of the database and the jobs")
+    private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
 
 
 class Settings(Record):

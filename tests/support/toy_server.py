@@ -15,7 +15,7 @@ from tests.support.toy_stages import DOORS
 
 def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
     """Run a job with toy stages on real workers."""
-    run_job(spec, folder, events=events, doors=DOORS)
+    run_job(spec, folder, events=events, doors=DOORS, is_logged=True)
 
 
 if __name__ == "__main__":
