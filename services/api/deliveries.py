@@ -10,7 +10,7 @@ import json
 import logging
 import secrets
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
@@ -63,7 +63,7 @@ class Claim:
     message: str
     payload: str
     url: str
-    secret: str
+    secret: str = field(repr=False)
     tries: int
     deadline_s: float
 
@@ -201,7 +201,7 @@ def _move_cursor(connection: sql.Connection, events: Any) -> None:
 def _insert(connection: sql.Connection, webhook_id: str, message: str, payload: str, now_s: float) -> int:
     row = {"webhook": webhook_id, "message": message, "payload": payload, "created_s": now_s, "state": DeliveryState.PENDING, "tries": 0}
     row |= {"next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
-    return int(connection.execute(delivery_table.insert().values(row)).inserted_primary_key[0])
+    return connection.execute(delivery_table.insert().values(row).returning(delivery_table.c.id)).scalar_one()
 
 
 def _payload(job: str, data: dict[str, Any], time_s: float) -> str:

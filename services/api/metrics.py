@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import sqlalchemy as sql
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector
@@ -68,11 +69,11 @@ class ServiceCollector(Collector):
 
     def _of_database(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         with self._engine.connect() as connection:
-            by_state = dict(connection.execute(sql.select(job_table.c.state, sql.func.count()).group_by(job_table.c.state)).all())
+            by_state = _counts(connection, sql.select(job_table.c.state, sql.func.count()).group_by(job_table.c.state))
             queued_s = connection.scalar(sql.select(sql.func.min(job_table.c.changed_s)).where(job_table.c.state == JobState.QUEUED))
-            running = dict(connection.execute(_running_stages()).all())
+            running = _counts(connection, _running_stages())
             rows = connection.scalar(sql.select(sql.func.count()).select_from(event_table)) or 0
-            deliveries = dict(connection.execute(sql.select(delivery_table.c.state, sql.func.count()).group_by(delivery_table.c.state)).all())
+            deliveries = _counts(connection, sql.select(delivery_table.c.state, sql.func.count()).group_by(delivery_table.c.state))
         yield _gauge("dentine_jobs", "Jobs by state", "state", ((state, by_state.get(state, 0)) for state in JobState))
         age_s = 0.0 if queued_s is None else max(time.time() - queued_s, 0.0)
         yield GaugeMetricFamily("dentine_oldest_queued_job_seconds", "How long the oldest queued job has waited; 0 without one", age_s)
@@ -96,7 +97,11 @@ class ServiceCollector(Collector):
             return connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
 
 
-def _running_stages() -> sql.Select[tuple[str, int]]:
+def _counts(connection: sql.Connection, query: sql.Select[Any]) -> dict[str, int]:
+    return {row[0]: row[1] for row in connection.execute(query)}
+
+
+def _running_stages() -> sql.Select[Any]:
     """How many jobs are in each stage, from the last staged event of each job that runs."""
     of_job = event_table.alias()
     last = (

@@ -51,7 +51,9 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         return read_previews(jobs.repository.events_of(job.id), job.id, after, limit)
 
     @router.get("/jobs/{job_id}/previews/{preview_id}/{picture}", response_class=Response, tags=["artifacts"])
-    def preview(job: Found, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request) -> Response:
+    def preview(
+        job: Found, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request
+    ) -> Response:
         """One picture; takes Range and If-None-Match."""
         events = jobs.repository.events_of(job.id).read(preview_id - 1, 1, kind="preview")
         path = events[0].data.get(picture) if events and events[0].id == preview_id else None

@@ -17,7 +17,7 @@ import sqlalchemy as sql
 
 from services.api.deliveries import Attempt, Claim, Deliveries
 from services.api.webhook_address import AddressPolicy
-from services.api.webhooks import SECRET_PREFIX
+from services.api.webhooks import KEY_PREFIX
 from services.core.errors import WebhookAddressError
 
 PERIOD_S = 0.5
@@ -30,7 +30,7 @@ FIRST_RETRY_S = 10.0
 
 def sign(secret: str, message: str, timestamp: int, payload: str) -> str:
     """The header ``webhook-signature``."""
-    key = base64.b64decode(secret.removeprefix(SECRET_PREFIX))
+    key = base64.b64decode(secret.removeprefix(KEY_PREFIX))
     digest = hmac.digest(key, f"{message}.{timestamp}.{payload}".encode(), hashlib.sha256)
     return f"v1,{base64.b64encode(digest).decode()}"
 

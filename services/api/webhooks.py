@@ -19,7 +19,7 @@ from services.core.errors import JobStateError, UnknownWebhookError
 from services.core.geometry import Record
 
 MOST_WEBHOOKS = 100
-SECRET_PREFIX = "whsec_"
+KEY_PREFIX = "whsec_"
 _SECRET_BYTES = 32
 
 States = Annotated[tuple[JobState, ...], Field(min_length=1, max_length=len(JobState), description="states of a job to tell of when it enters them")]
@@ -74,7 +74,7 @@ class Webhooks:
             WebhookAddressError: the address is refused. JobStateError: there are too many.
         """
         self._policy.check_url(request.url)
-        secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
+        secret = KEY_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
         with writing(self._engine) as connection:
             if (connection.scalar(sql.select(sql.func.count()).select_from(webhook_table)) or 0) >= MOST_WEBHOOKS:
                 raise JobStateError(f"There are {MOST_WEBHOOKS} webhooks already; delete one first.")
