@@ -1,7 +1,6 @@
-"""What is to be delivered to webhooks, from the event table, and the log of what was tried.
+"""Deliveries to webhooks: what is due, what was tried, and what comes of it.
 
-A cursor in the database says how far the event table was read; it moves in the same transaction that adds the deliveries, so that a
-restart neither loses nor repeats one. A delivery that is tried is claimed for a while: if the process dies meanwhile it falls due again.
+A delivery that is tried is claimed for a while: if the process dies meanwhile it falls due again.
 """
 
 from __future__ import annotations
@@ -11,26 +10,22 @@ import logging
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any
 
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.events import event_table, writing
-from services.api.webhook_tables import DeliveryState, attempt_table, cursor_table, delivery_table, webhook_table
-from services.api.webhooks import find_webhook, states_of, switch_off
+from services.api.events import writing
+from services.api.webhook_outbox import DAY_S, TRY_FOR_S, collect_changes, has_news, insert_delivery, message_body
+from services.api.webhook_tables import DeliveryState, attempt_table, delivery_table, webhook_table
+from services.api.webhooks import find_webhook, switch_off
 from services.core.errors import UnknownWebhookError
 from services.core.geometry import Record
 
-DAY_S = 86_400.0
-TRY_FOR_S = DAY_S
 DISABLE_AFTER_S = 5 * DAY_S
 KEEP_S = 30 * DAY_S
 """How long the log keeps what is settled."""
 CLAIM_S = 60.0
-_BATCH = 500
-_READER = "webhooks"
 
 
 class Attempt(Record):
@@ -75,25 +70,13 @@ class Deliveries:
         self._engine = engine
 
     def collect(self, now_s: float) -> int:
-        """Add a delivery for each new change of state and each active webhook that asked for it; returns how many."""
+        """Add deliveries for what changed since the last time; returns how many."""
         with self._engine.connect() as connection:
-            events, end = _unread(connection)
-        if not events and end < _BATCH:
-            return 0  # nothing to tell; the cursor follows now and then, so that watching costs no writes
-        added = 0
+            if not has_news(connection):
+                return 0  # watching costs no writes
         with writing(self._engine) as connection:
-            events, _ = _unread(connection)
-            webhooks = connection.execute(sql.select(webhook_table).where(webhook_table.c.active)).mappings().all()
-            for event in events:
-                data = json.loads(event["data"])
-                for webhook in webhooks:
-                    if data["state"] in states_of(webhook) and event["id"] > webhook["after_event"]:
-                        message = f"evt_{event['id']}_{webhook['id']}"
-                        _insert(connection, webhook["id"], message, _payload(event["job"], data, event["time_s"]), now_s)
-                        added += 1
-            _move_cursor(connection, events)
             _forget(connection, now_s - KEEP_S)
-        return added
+            return collect_changes(connection, now_s)
 
     def claim(self, now_s: float, busy: Collection[str], most: int) -> list[Claim]:
         """Take the oldest due delivery of each webhook that is not busy."""
@@ -169,8 +152,8 @@ class Deliveries:
         """Queue a message that says that it is a test, also to an inactive webhook."""
         with writing(self._engine) as connection:
             find_webhook(connection, webhook_id)
-            payload = _message("webhook.test", now_s, {"webhook": webhook_id})
-            delivery_id = _insert(connection, webhook_id, f"test_{secrets.token_hex(8)}", payload, now_s)
+            payload = message_body("webhook.test", now_s, {"webhook": webhook_id})
+            delivery_id = insert_delivery(connection, webhook_id, f"test_{secrets.token_hex(8)}", payload, now_s)
             return _delivery(connection, _find(connection, webhook_id, delivery_id))
 
     def redeliver(self, webhook_id: str, delivery_id: int, now_s: float) -> Delivery:
@@ -180,37 +163,6 @@ class Deliveries:
             values = {"state": DeliveryState.PENDING, "tries": 0, "next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
             connection.execute(delivery_table.update().where(delivery_table.c.id == row["id"]).values(values))
             return _delivery(connection, _find(connection, webhook_id, delivery_id))
-
-
-def _unread(connection: sql.Connection) -> tuple[Any, int]:
-    """The next changes of state beyond the cursor, and how far the event table has grown beyond it."""
-    cursor = connection.scalar(sql.select(cursor_table.c.event).where(cursor_table.c.reader == _READER)) or 0
-    newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
-    fresh = sql.select(event_table).where(event_table.c.id > cursor, event_table.c.kind == "state").order_by(event_table.c.id).limit(_BATCH)
-    return connection.execute(fresh).mappings().all(), newest - cursor
-
-
-def _move_cursor(connection: sql.Connection, events: Any) -> None:
-    """To the last event that was looked at."""
-    newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
-    reached = events[-1]["id"] if len(events) == _BATCH else newest
-    if not connection.execute(cursor_table.update().where(cursor_table.c.reader == _READER).values(event=reached)).rowcount:
-        connection.execute(cursor_table.insert().values(reader=_READER, event=reached))
-
-
-def _insert(connection: sql.Connection, webhook_id: str, message: str, payload: str, now_s: float) -> int:
-    row = {"webhook": webhook_id, "message": message, "payload": payload, "created_s": now_s, "state": DeliveryState.PENDING, "tries": 0}
-    row |= {"next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
-    return connection.execute(delivery_table.insert().values(row).returning(delivery_table.c.id)).scalar_one()
-
-
-def _payload(job: str, data: dict[str, Any], time_s: float) -> str:
-    failure = data.get("failure") or {}
-    return _message("job.state", time_s, {"job": job, "state": data["state"], "failure_code": failure.get("code")})
-
-
-def _message(kind: str, time_s: float, data: dict[str, Any]) -> str:
-    return json.dumps({"type": kind, "timestamp": datetime.fromtimestamp(time_s, UTC).isoformat(), "data": data})
 
 
 def _update(connection: sql.Connection, claim: Claim, **values: Any) -> None:

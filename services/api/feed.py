@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+
+import sqlalchemy as sql
 
 from services.api.events import JobEvent
 from services.api.lifecycle import JobState
@@ -23,7 +26,9 @@ class EventFeed:
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
         while True:
-            newest = await asyncio.to_thread(self._newest_event)
+            newest = self.newest
+            with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
+                newest = await asyncio.to_thread(self._newest_event)
             if newest > self.newest:
                 async with self._grown:
                     self.newest = newest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import re
 import socket
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from services.core.errors import WebhookAddressError
 
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
+_HOST = re.compile(r"[A-Za-z0-9_.:-]+")
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
 
@@ -33,7 +35,7 @@ class AddressPolicy:
             host = parts.raw_host.decode()
         except (httpx.InvalidURL, ValueError) as problem:
             raise WebhookAddressError(f"The webhook's address is malformed ({problem}); give one such as https://example.org/hook.") from problem
-        if parts.scheme not in {"https", "http"} or not host:
+        if parts.scheme not in {"https", "http"} or not _HOST.fullmatch(host) or not 0 < (parts.port or 443) < 2**16:
             raise WebhookAddressError("The webhook's address must be an absolute https address, such as https://example.org/hook.")
         if parts.userinfo or parts.fragment:
             raise WebhookAddressError("The webhook's address must not hold a login or a fragment; the signature tells the receiver who sends.")

@@ -14,6 +14,7 @@ from pydantic import Field
 from services.api.events import event_table, writing
 from services.api.lifecycle import JobState
 from services.api.webhook_address import AddressPolicy
+from services.api.webhook_outbox import collect_changes, states_of
 from services.api.webhook_tables import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.core.errors import JobStateError, UnknownWebhookError
 from services.core.geometry import Record
@@ -112,6 +113,7 @@ class Webhooks:
             values["states"] = _states(change.states)
         with writing(self._engine) as connection:
             find_webhook(connection, webhook_id)
+            collect_changes(connection, time.time())  # what happened before is told as it was asked for then
             if change.active is True:
                 values |= {"active": True, "failing_since_s": None, "note": ""}
             if values:
@@ -151,11 +153,6 @@ def switch_off(connection: sql.Connection, webhook_id: str, note: str) -> None:
     connection.execute(webhook_table.update().where(webhook_table.c.id == webhook_id).values(active=False, note=note))
     pending = delivery_table.update().where(delivery_table.c.webhook == webhook_id, delivery_table.c.state == DeliveryState.PENDING)
     connection.execute(pending.values(state=DeliveryState.GIVEN_UP, next_try_s=None))
-
-
-def states_of(row: Any) -> tuple[JobState, ...]:
-    """The states that a subscription's row names."""
-    return tuple(JobState(state) for state in json.loads(row["states"]))
 
 
 def _states(states: tuple[JobState, ...]) -> str:

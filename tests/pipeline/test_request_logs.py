@@ -32,6 +32,10 @@ def lines() -> Iterator[Any]:
         services.setLevel(other)
 
 
+def broken() -> None:
+    raise ZeroDivisionError("on purpose")
+
+
 def test_one_id_leads_from_the_answer_to_the_worker(tmp_path: Path) -> None:
     log = tmp_path / "stderr"
     with log.open("w") as stream, toy_server(tmp_path / "data", stream) as (client, process):
@@ -74,10 +78,6 @@ def test_a_line_holds_the_route_and_never_path_or_query(tmp_path: Path, lines: A
 
 def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, lines: Any) -> None:
     app = create_app(ServerSettings(data=tmp_path))
-
-    def broken() -> None:
-        raise ZeroDivisionError("on purpose")
-
     app.add_api_route("/v1/broken", broken)
     app.router.routes.insert(0, app.router.routes.pop())  # before the page, which takes every path
     with serving(app) as client:
@@ -91,7 +91,7 @@ def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, 
 def test_what_is_logged_inside_a_block_carries_its_values(lines: Any) -> None:
     with log_context(job="j1", request_id=None):
         try:
-            raise ZeroDivisionError("on purpose")
+            broken()
         except ZeroDivisionError:
             logging.getLogger("services.api.any").exception("Broke %s.", "here", extra={"stage": "fit"})
     logging.getLogger("services.api.any").info("After.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -57,5 +58,5 @@ def test_thinned_columns_are_even_and_keep_both_ends(log: EventLog, first: int, 
     assert (steps[0], steps[-1]) == (first, first + count - 1)
     assert len(steps) <= points
     assert len(steps) >= min(count, points // 2)
-    inner = [after - before for before, after in zip(steps[1:-2], steps[2:-1], strict=True)]
+    inner = [after - before for before, after in pairwise(steps[1:-1])]
     assert len(set(inner)) <= 1
