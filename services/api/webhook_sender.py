@@ -8,6 +8,7 @@ import hashlib
 import hmac
 import logging
 import random
+import ssl
 import time
 from collections.abc import Callable
 from importlib.metadata import version
@@ -46,6 +47,7 @@ class WebhookSender:
     Args:
         clock: Unix time; what is due depends on it.
         draw: jitter, uniform in [0, 1).
+        tls: whom to trust; default: the usual authorities.
     """
 
     def __init__(
@@ -56,15 +58,18 @@ class WebhookSender:
         total_s: float = TOTAL_S,
         clock: Callable[[], float] = time.time,
         draw: Callable[[], float] = random.random,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self._deliveries, self._policy = deliveries, policy
         self._period_s, self._total_s, self._clock, self._draw = period_s, total_s, clock, draw
+        self._tls = tls
 
     async def run(self) -> None:
         """Send until cancelled. What is on its way then falls due again when its claim ends."""
         sending: dict[str, asyncio.Task[None]] = {}
         limits = httpx.Limits(max_keepalive_connections=0)  # a kept connection to one host would serve another at the same address
-        async with httpx.AsyncClient(trust_env=False, follow_redirects=False, timeout=httpx.Timeout(self._total_s, connect=CONNECT_S), limits=limits) as http:
+        timeout, verify = httpx.Timeout(self._total_s, connect=CONNECT_S), self._tls or httpx.create_ssl_context(trust_env=False)
+        async with httpx.AsyncClient(verify=verify, trust_env=False, follow_redirects=False, timeout=timeout, limits=limits) as http:
             try:
                 while True:
                     sending = {webhook: task for webhook, task in sending.items() if not task.done()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import ssl
 import threading
 import time
 from collections.abc import Iterator
@@ -30,6 +31,8 @@ from tests.support.live_server import serving
 from tests.support.receiver import Receiver, receiving, wait_until
 
 OPEN = AddressPolicy(allow_private=True)
+CERTIFICATE = Path(__file__).parents[1] / "support" / "localhost.pem"
+"""For the name localhost, signed by itself, with its key."""
 ENTERED = ["QUEUED", "RUNNING", "SUCCEEDED"]
 
 
@@ -43,8 +46,8 @@ class Service:
         self.now_s = time.time()
 
     @contextmanager
-    def sending(self, policy: AddressPolicy = OPEN, total_s: float = 30.0) -> Iterator[None]:
-        sender = WebhookSender(self.deliveries, policy, 0.02, total_s, lambda: self.now_s, lambda: 0.5)
+    def sending(self, policy: AddressPolicy = OPEN, total_s: float = 30.0, tls: ssl.SSLContext | None = None) -> Iterator[None]:
+        sender = WebhookSender(self.deliveries, policy, 0.02, total_s, lambda: self.now_s, lambda: 0.5, tls)
         loop = asyncio.new_event_loop()
         task = loop.create_task(sender.run())
 
@@ -194,6 +197,27 @@ def test_a_name_that_leads_inside_is_not_connected_to(service: Service) -> None:
     assert error is not None
     assert "no public address" in error
     assert receiver.received == []
+
+
+def test_a_certificate_must_prove_the_name_though_the_address_is_connected_to(service: Service) -> None:
+    """Trusted and named rightly; then signed by nobody known; then for another name."""
+    certified = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    certified.load_cert_chain(CERTIFICATE)
+    trusting = ssl.create_default_context(cafile=CERTIFICATE)
+    with receiving(tls=certified) as receiver:
+        named = service.subscribe(receiver.url)
+        with service.sending(tls=trusting):
+            service.run_job()
+            service.wait_for(named, "delivered")
+        assert [headers["host"] for headers, _ in receiver.received] == [receiver.url.removeprefix("https://")]
+        service.webhooks.delete(named.id)
+        for tls, url in ((None, receiver.url), (trusting, receiver.url.replace("localhost", "127.0.0.1"))):
+            webhook = service.subscribe(url)
+            with service.sending(tls=tls):
+                service.run_job()
+                assert service.wait_for_tries(webhook, 1).attempts[0].error == "The receiver could not be reached (ConnectError)."
+            service.webhooks.delete(webhook.id)
+        assert len(receiver.received) == 1
 
 
 def test_a_server_killed_between_event_and_delivery_tells_it_after_its_restart(service: Service) -> None:

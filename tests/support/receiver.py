@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -34,13 +35,16 @@ def wait_until(is_true: Callable[[], bool], limit_s: float = 60.0) -> None:
 
 
 @contextmanager
-def receiving(*answers: int) -> Iterator[Receiver]:
-    """Receive on a free loopback port for the time of the block."""
+def receiving(*answers: int, tls: ssl.SSLContext | None = None) -> Iterator[Receiver]:
+    """Receive on a free loopback port for the time of the block; with ``tls`` under the name localhost."""
     receiver = Receiver(answers=list(answers))
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"])).decode()
+            length = int(self.headers["Content-Length"])
+            body = self.rfile.read(length).decode()
+            if len(body) < length:
+                return  # the sender was stopped in the middle
             answer = receiver.answers.pop(0) if receiver.answers else 204
             receiver.received.append(({name.lower(): value for name, value in self.headers.items()} | {":path": self.path}, body))
             if answer == 0:
@@ -57,6 +61,9 @@ def receiving(*answers: int) -> Iterator[Receiver]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     receiver.url = f"http://127.0.0.1:{server.server_address[1]}"
+    if tls is not None:
+        server.socket = tls.wrap_socket(server.socket, server_side=True)
+        receiver.url = f"https://localhost:{server.server_address[1]}"
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     try:
