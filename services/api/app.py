@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,34 +35,38 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
 
     from services.api import problems
     from services.api.feed import EventFeed
+    from services.api.observation import Observation
     from services.api.routes import build_router
     from services.api.shield import Shield
 
     workers = Workers(settings.scheduler)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        run_job(spec, folder, events=events, cluster=workers)
+        run_job(spec, folder, events=events, cluster=workers, is_logged=True)
 
     jobs = Jobs(settings, run or run_on_workers)
     feed = EventFeed(jobs.repository.newest_event)
+    observation = Observation(jobs, settings)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         jobs.start()
-        following = asyncio.create_task(feed.run())
+        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
         try:
             yield
         finally:
-            following.cancel()
-            with suppress(asyncio.CancelledError):
-                await following
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             await asyncio.to_thread(jobs.close)
             await asyncio.to_thread(workers.close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
     problems.install(app)
     app.include_router(build_router(jobs, feed))
+    observation.include_routes(app)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host}))
     app.add_middleware(Shield)
+    observation.watch_requests(app)
     return app

@@ -74,13 +74,15 @@ class EventAddress:
     job: str
     lease: int = 0
     """Number under which the job is run; 0 where there is only one runner."""
+    request_id: str | None = None
+    """The request that submitted the job; None where there was none."""
 
     @contextmanager
     def open(self) -> Iterator[EventLog]:
         """Open the table for this job and close it afterwards."""
         engine = open_database(self.url)
         try:
-            yield EventLog(engine, self.job, self.lease)
+            yield EventLog(engine, self.job, self.lease, self.request_id)
         finally:
             engine.dispose()
 
@@ -105,8 +107,8 @@ def insert_event(connection: sql.Connection, job: str, attempt: int, event: Stag
 class EventLog:
     """The events of one job."""
 
-    def __init__(self, engine: sql.Engine, job: str, lease: int = 0) -> None:
-        self._engine, self.job, self._lease = engine, job, lease
+    def __init__(self, engine: sql.Engine, job: str, lease: int = 0, request_id: str | None = None) -> None:
+        self._engine, self.job, self._lease, self._request_id = engine, job, lease, request_id
 
     def begin_stage(self, stage: StageName, known: int = 0) -> int:
         """Record that the stage starts and return its attempt: one more than any before, in this table or ``known`` otherwise.
@@ -119,7 +121,8 @@ class EventLog:
             if newest > self._lease:
                 raise FencedError(f"The job was taken over under lease {newest}; lease {self._lease} may not start stage {stage}.")
             attempt = 1 + max(known, self._newest_attempt(connection, stage))
-            insert_event(connection, self.job, attempt, StageEvent(stage=stage, kind="started"))
+            origin = {} if self._request_id is None else {"job": self.job, "request_id": self._request_id}
+            insert_event(connection, self.job, attempt, StageEvent(stage=stage, kind="started", data=origin))
         return attempt
 
     def append(self, attempt: int, event: StageEvent) -> None:
@@ -134,9 +137,10 @@ class EventLog:
                 raise FencedError(f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are refused.")
             insert_event(connection, self.job, attempt, event)
 
-    def read(self, after: int = 0, limit: int = 1000) -> list[JobEvent]:
-        """The job's events with an id above ``after``, oldest first."""
+    def read(self, after: int = 0, limit: int = 1000, **only: str | int | None) -> list[JobEvent]:
+        """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None for anything."""
         query = sql.select(event_table).where(event_table.c.job == self.job, event_table.c.id > after).order_by(event_table.c.id).limit(limit)
+        query = query.where(*(event_table.c[column] == value for column, value in only.items() if value is not None))
         with self._engine.connect() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 

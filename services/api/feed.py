@@ -26,12 +26,13 @@ class EventFeed:
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
         while True:
-            with suppress(sql.exc.DBAPIError):  # a database that does not answer has nothing new to tell
+            newest = self.newest
+            with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
                 newest = await asyncio.to_thread(self._newest_event)
-                if newest > self.newest:
-                    async with self._grown:
-                        self.newest = newest
-                        self._grown.notify_all()
+            if newest > self.newest:
+                async with self._grown:
+                    self.newest = newest
+                    self._grown.notify_all()
             await asyncio.sleep(PERIOD_S)
 
     async def beyond(self, event_id: int) -> None:

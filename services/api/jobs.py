@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from pathlib import Path
 
@@ -57,7 +58,7 @@ class Jobs:
         """Where a job's stages and results lie."""
         return self._data / "jobs" / job_id
 
-    def submit(self, spec: JobSpec, key: str | None = None) -> Creation:
+    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None) -> Creation:
         """Queue a job.
 
         Raises:
@@ -69,7 +70,8 @@ class Jobs:
             if path is not None and not path.exists():
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
         self._admission.refuse_too_large(spec)
-        creation = self.repository.create(spec, key)
+        creation = self.repository.create(spec, key, request_id)
+        logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
         return creation
 

@@ -19,7 +19,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -68,6 +68,8 @@ def run_job(
     events: EventAddress | None = None,
     doors: Mapping[StageName, str] = DOORS,
     cluster: Workers | None = None,
+    *,
+    is_logged: bool = False,
 ) -> AssetManifest:
     """Run a job to its asset; needs no server.
 
@@ -78,11 +80,12 @@ def run_job(
         events: event table to append to, default one in ``root``.
         doors: where each stage is entered.
         cluster: where it runs, default workers of its own.
+        is_logged: workers write log lines on standard error.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster)
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged)
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -97,6 +100,7 @@ def run_stages(
     cluster: Workers | None = None,
     *,
     again: bool = False,
+    is_logged: bool = False,
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
     root = root.resolve()
@@ -108,7 +112,7 @@ def run_stages(
             watch = _Watch(log, listener, log.newest_id())
             if todo:
                 with nullcontext(cluster) if cluster is not None else Workers() as processes, processes.client(workers or spec.workers) as client:
-                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again) for stage in todo], watch)
+                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo], watch)
             watch.tell()
 
 
@@ -132,6 +136,7 @@ class StageTask:
     root: Path
     events: EventAddress
     again: bool = False
+    is_logged: bool = False
 
     def __call__(self, _previous: str | None = None) -> str:
         """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
@@ -148,17 +153,27 @@ class StageTask:
                 if event.kind != "started":  # begin_stage has recorded it
                     patiently(lambda: log.append(attempt, event))
                 told.add(event.kind)
+                write_line(event)
 
-            context = LocalContext(self.root, attempt, tell)
-            context.raise_if_cancelled()
-            module, function = self.door.split(":")
-            try:
-                getattr(importlib.import_module(module), function)(self.spec, context)
-            except OSError as problem:
-                raise _disk_full(self.root, problem) from problem
-            if "finished" not in told:
-                tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
+            with self._logs(attempt) as write_line:
+                context = LocalContext(self.root, attempt, tell)
+                context.raise_if_cancelled()
+                module, function = self.door.split(":")
+                try:
+                    getattr(importlib.import_module(module), function)(self.spec, context)
+                except OSError as problem:
+                    raise _disk_full(self.root, problem) from problem
+                if "finished" not in told:
+                    tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
+
+    def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
+        """The worker's log lines, or silence."""
+        if not self.is_logged:
+            return nullcontext(lambda _event: None)
+        from services.api.logs import stage_logs
+
+        return stage_logs(self.stage, attempt, self.events)
 
 
 def _disk_full(root: Path, problem: OSError) -> Exception:

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import Field
 
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, TooLargeError, UnknownJobError
+from services.core.errors import (
+    DentineError,
+    InputError,
+    JobStateError,
+    PlatformError,
+    TooLargeError,
+    UnknownJobError,
+    UnknownPresetError,
+    UnknownWebhookError,
+)
 from services.core.geometry import Record
 
 if TYPE_CHECKING:
@@ -37,6 +46,8 @@ class Problem(Record):
 
 _STATUS = {
     UnknownJobError: HTTPStatus.NOT_FOUND,
+    UnknownPresetError: HTTPStatus.NOT_FOUND,
+    UnknownWebhookError: HTTPStatus.NOT_FOUND,
     JobStateError: HTTPStatus.CONFLICT,
     TooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,
     InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
@@ -79,7 +90,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     def _unexpected(request: Request, _problem: Exception) -> Response:
-        return answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, "internal-error", "The server failed on this request; its log says why.")
+        request_id = getattr(request.state, "request_id", "")
+        detail = f"The server failed on this request; its log says why, under request {request_id}."
+        return answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, "internal-error", detail, {"X-Request-ID": request_id})
 
 
 def _sentence(errors: Sequence[Any]) -> str:

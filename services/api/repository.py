@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import sqlalchemy as sql
 from pydantic import Field
@@ -35,6 +35,9 @@ job_table = sql.Table(
     sql.Column("changed_s", sql.Float, nullable=False),
     sql.Column("spec", sql.Text, nullable=False),
     sql.Column("failure", sql.Text),
+    sql.Column("request_id", sql.Text),
+    sql.Column("kind", sql.Text),
+    sql.Column("source", sql.Text),
     sqlite_autoincrement=True,
 )
 
@@ -75,6 +78,30 @@ class Job(Record):
     changed_s: float = Field(description="Unix time of the last change of state")
     spec: JobSpec
     failure: Failure | None
+    request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
+
+
+class JobFilter(Record):
+    """Which jobs to list; what is left out allows any."""
+
+    states: tuple[JobState, ...] = ()
+    kind: Literal["tooth", "jaw"] | None = None
+    created_after_s: float | None = Field(default=None, description="Unix time")
+    created_before_s: float | None = Field(default=None, description="Unix time")
+    source: str | None = Field(default=None, description="text in the path of the capture or of the rig's mouth, in any case")
+
+    def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
+        """What a row of the job table must fulfil."""
+        if self.states:
+            yield job_table.c.state.in_(self.states)
+        if self.kind is not None:
+            yield job_table.c.kind == self.kind
+        if self.created_after_s is not None:
+            yield job_table.c.created_s > self.created_after_s
+        if self.created_before_s is not None:
+            yield job_table.c.created_s < self.created_before_s
+        if self.source is not None:
+            yield job_table.c.source.icontains(self.source, autoescape=True)
 
 
 class Deletion(Record):
@@ -120,7 +147,7 @@ class Repository:
         """Close every connection."""
         self.engine.dispose()
 
-    def create(self, spec: JobSpec, key: str | None) -> Creation:
+    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None) -> Creation:
         """Insert a job as QUEUED, or find the one that was submitted with this idempotency key.
 
         Raises:
@@ -133,7 +160,8 @@ class Repository:
                     raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
                 return Creation(_job(earlier), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
-            row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options}
+            row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
+            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture)}
             connection.execute(job_table.insert().values(row))
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
@@ -148,9 +176,11 @@ class Repository:
         with self.engine.connect() as connection:
             return self._find(connection, job_id)
 
-    def page(self, limit: int, before: int | None = None, state: JobState | None = None) -> list[Job]:
+    def page(self, limit: int, before: int | None = None, state: JobState | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
         query = sql.select(job_table).order_by(job_table.c.number.desc()).limit(limit)
+        if only is not None:
+            query = query.where(*only.conditions())
         if before is not None:
             query = query.where(job_table.c.number < before)
         if state is not None:
@@ -266,7 +296,7 @@ class Repository:
 
     def address_of(self, lease: Lease) -> EventAddress:
         """Where another process appends the job's events."""
-        return EventAddress(self._url, lease.job.id, lease.number)
+        return EventAddress(self._url, lease.job.id, lease.number, lease.job.request_id)
 
     def newest_event(self) -> int:
         """Id of the last event of any job."""
@@ -296,6 +326,6 @@ class Repository:
 
 
 def _job(row: Any) -> Job:
-    fields = {name: row[name] for name in ("id", "number", "state", "created_s", "changed_s")}
+    fields = {name: row[name] for name in ("id", "number", "state", "created_s", "changed_s", "request_id")}
     failure = Failure.model_validate_json(row["failure"]) if row["failure"] else None
     return Job(**fields, spec=JobSpec.model_validate_json(row["spec"]), failure=failure)

@@ -1,7 +1,7 @@
 """The REST routes below ``/v1``. Annotations are evaluated here, because FastAPI reads them and they name local dependencies."""
 
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -12,13 +12,9 @@ from services.api.feed import EventFeed, follow
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import MEDIA_TYPE, Problem
-from services.api.repository import Deletion, Job
-from services.core.errors import PlatformError
+from services.api.repository import Deletion, Job, JobFilter
 from services.core.geometry import Record
 from services.core.records import JobSpec
-
-FREE_BYTES_NEEDED = 256 * 2**20
-"""Below this the server is not ready: a stage could not publish."""
 
 
 class JobPage(Record):
@@ -39,7 +35,6 @@ class Health(Record):
     """What the server has checked."""
 
     status: str
-    free_bytes: int | None = None
 
 
 def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
@@ -56,17 +51,26 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     Found = Annotated[Job, Depends(find_job)]
 
     @router.post("/jobs", status_code=201, tags=["jobs"])
-    def submit(spec: JobSpec, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
+    def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200."""
-        creation = jobs.submit(spec, idempotency_key)
+        creation = jobs.submit(spec, idempotency_key, request.state.request_id)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
         return creation.job
 
     @router.get("/jobs", tags=["jobs"])
-    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: int | None = None, state: JobState | None = None) -> JobPage:
+    def page(
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+        before: int | None = None,
+        state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
+        kind: Literal["tooth", "jaw"] | None = None,
+        created_after_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
+        created_before_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
+        capture: Annotated[str | None, Query(max_length=500, description="text in the path of the capture or of the rig's mouth, in any case")] = None,
+    ) -> JobPage:
         """List jobs, newest first."""
-        found = jobs.repository.page(limit + 1, before, state)
+        only = JobFilter(states=state, kind=kind, created_after_s=created_after_s, created_before_s=created_before_s, source=capture)
+        found = jobs.repository.page(limit + 1, before, only=only)
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", tags=["jobs"])
@@ -122,15 +126,5 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     def live() -> Health:
         """Whether the process answers."""
         return Health(status="live")
-
-    @router.get("/health/ready", tags=["health"], responses={503: failures[404]})
-    def ready() -> Health:
-        """Whether a submitted job would run: database, runner and disk."""
-        jobs.repository.newest_event()
-        if not jobs.is_running():
-            raise PlatformError("Jobs are not being run; restart the server and read its log.")
-        if (free := jobs.free_bytes()) < FREE_BYTES_NEEDED:
-            raise PlatformError(f"Only {free // 2**20} MiB of disk are free; free at least {FREE_BYTES_NEEDED // 2**20} MiB.")
-        return Health(status="ready", free_bytes=free)
 
     return router

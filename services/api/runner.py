@@ -15,6 +15,7 @@ from services.api.admission import Admission
 from services.api.database import patiently
 from services.api.events import EventAddress
 from services.api.lifecycle import JobState, Trigger
+from services.api.logs import log_context
 from services.api.pipeline import request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, SchedulerLostError
@@ -78,7 +79,8 @@ class Runner:
             try:
                 while not self._closing.is_set() and (lease := self._next()) is not None:
                     self._current = lease
-                    self._run_one(lease)
+                    with log_context(job=lease.job.id, request_id=lease.job.request_id):
+                        self._run_one(lease)
                     self._current = None
             except sql.exc.DBAPIError:
                 logging.getLogger(__name__).exception("the database does not answer; trying again in %g s", ROUND_S)
@@ -130,13 +132,15 @@ class Runner:
         except DentineError as problem:
             trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
         except Exception as problem:
-            logging.getLogger(__name__).exception("job %s", job.id)
+            logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
         try:
-            patiently(lambda: self._repository.settle(lease, trigger, failure))
+            transition = patiently(lambda: self._repository.settle(lease, trigger, failure))
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
+            return
+        logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
 
     def _stage(self, job: Job) -> StageName | None:
         latest = self._repository.events_of(job.id).latest()

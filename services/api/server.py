@@ -11,6 +11,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from services.api.app import STATIC, create_app
+from services.api.logs import configure_logs
 from services.api.runner import RunJob
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
@@ -32,7 +33,9 @@ def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
             print("The dashboard is not built; run make dashboard. The API works without it.", file=sys.stderr)
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
-        server = uvicorn.Server(uvicorn.Config(create_app(settings, run), log_level="warning", access_log=False, timeout_graceful_shutdown=1))
+        configure_logs(sys.stderr)
+        config = uvicorn.Config(create_app(settings, run), log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
         server.run(sockets=[listener])

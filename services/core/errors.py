@@ -9,6 +9,9 @@
     │   ├── CaptureInputError a frame or file is missing or malformed
     │   ├── UnknownJobError   no such job or artifact
     │   ├── TooLargeError     more disk or memory than the machine has
+    │   ├── UnknownPresetError no such set of options
+    │   ├── UnknownWebhookError no such webhook or delivery
+    │   ├── WebhookAddressError a webhook may not go there
     │   └── JobStateError     the job's state does not allow what was asked
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
@@ -97,6 +100,24 @@ class TooLargeError(InputError):
     """A job needs more disk or memory than the machine has in all."""
 
     code = "job-too-large"
+
+
+class UnknownPresetError(InputError):
+    """There is no such set of options."""
+
+    code = "preset-unknown"
+
+
+class UnknownWebhookError(InputError):
+    """There is no such webhook, or it has no such delivery."""
+
+    code = "webhook-unknown"
+
+
+class WebhookAddressError(InputError):
+    """A webhook's address is malformed, or leads where the server may not go."""
+
+    code = "webhook-address"
 
 
 class JobStateError(InputError):

@@ -26,6 +26,7 @@ class ServerSettings(Record):
     database: SecretStr | None = Field(default=None, description="postgresql://USER:PASSWORD@HOST/NAME; default is SQLite in the data folder")
     scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
     keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
+    private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
 
     @property
     def database_url(self) -> str:

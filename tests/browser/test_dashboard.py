@@ -14,7 +14,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.events import EventAddress
+from services.api.database import sqlite_url
+from services.api.events import EventAddress, EventLog
 from services.api.repository import Repository
 from services.core.errors import CaptureInputError
 from services.core.records import Estimate, JobSpec
@@ -179,11 +180,11 @@ def test_jobs_are_reached_by_keyboard_alone(page: Page, job: ScriptedJob) -> Non
 
 
 def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
-    repository = Repository(tmp_path / "data" / "dentine.sqlite")
+    repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
     job.steps.release(STEPS)
     long = submit(page)
     expect_state(page, long, "SUCCEEDED")
-    log = repository.events_of(long)
+    log = EventLog(repository.engine, long, lease=1)
     attempt = log.begin_stage("fit")
     for step in range(500):
         data = {"channel": "green", "step": step, "loss": 1 / (1 + step), "parameters": {}}

@@ -27,7 +27,7 @@ def main(settings: ServerSettings) -> None:
     ):
 
         def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-            run_job(spec, folder, events=events, doors=DOORS, cluster=workers)
+            run_job(spec, folder, events=events, doors=DOORS, cluster=workers, is_logged=True)
 
         serve(settings, run_toys)
 

@@ -12,10 +12,12 @@ import sqlalchemy as sql
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
+from services.api import webhook_tables
 from services.api.database import metadata, open_database, sqlite_url
 from services.api.events import event_table
 from services.api.lifecycle import JobState, Trigger
-from services.api.repository import Failure, Repository, job_table
+from services.api.migrations import FIRST, upgrade
+from services.api.repository import Failure, JobFilter, Repository, job_table
 from services.core.errors import FencedError, JobStateError, SettingsError, UnknownJobError
 from services.core.records import JobSpec
 from tests.support.postgres import PostgresServer, new_database, postgres_server
@@ -197,18 +199,21 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
+    assert webhook_tables.webhook_table.metadata is metadata
     with repository.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []
 
 
 def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock) -> None:
     engine = open_database(url)
-    metadata.create_all(engine, tables=[job_table, event_table])
+    upgrade(engine, FIRST)
     row = {"id": "old", "key": None, "state": "RUNNING", "created_s": 1.0, "changed_s": 2.0, "spec": SPEC.model_dump_json()}
     with engine.begin() as connection:
         connection.execute(job_table.insert().values(row))
+        connection.execute(sql.text("DROP TABLE alembic_version"))
     engine.dispose()
     repository = Repository(url, clock)
+    assert [job.id for job in repository.page(9, only=JobFilter(kind="tooth", source="MOUTH"))] == ["old"]
     assert repository.lose_expired("me") == ["old"]
     assert repository.lease("old", "me", 60).number == 1
     repository.close()

@@ -12,8 +12,8 @@ FIRST = "0001"
 """The tables that databases had before they were numbered."""
 
 
-def upgrade(engine: sql.Engine) -> None:
-    """Take all steps that are missing. Servers that start together wait for each other."""
+def upgrade(engine: sql.Engine, to: str = "head") -> None:
+    """Take all steps that are missing, up to one. Servers that start together wait for each other."""
     from alembic import command
     from alembic.config import Config
 
@@ -25,4 +25,4 @@ def upgrade(engine: sql.Engine) -> None:
         tables = sql.inspect(connection).get_table_names()
         if "job" in tables and "alembic_version" not in tables:
             command.stamp(config, FIRST)
-        command.upgrade(config, "head")
+        command.upgrade(config, to)

@@ -1,0 +1,57 @@
+"""A zip file made while it is sent: stored, not deflated, in pieces that need neither memory nor disk."""
+
+from __future__ import annotations
+
+import io
+import time
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+PIECE_BYTES = 2**18
+_EARLIEST = (1980, 1, 1, 0, 0, 0)
+"""The first moment that a zip file can name."""
+
+
+def stream_zip(root: Path, names: Iterable[str]) -> Iterator[bytes]:
+    """The bytes of a zip of files below ``root``. A file that vanishes before its turn is left out; one that grows is cut at the size it had."""
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
+        for name in names:
+            with suppress(FileNotFoundError):
+                yield from _entry(archive, sink, root / name, name)
+    yield sink.take()
+
+
+def _entry(archive: zipfile.ZipFile, sink: _Sink, path: Path, name: str) -> Iterator[bytes]:
+    with path.open("rb") as source:
+        stat = path.stat()
+        info = zipfile.ZipInfo(name, max(time.gmtime(stat.st_mtime)[:6], _EARLIEST))
+        info.external_attr = 0o644 << 16
+        left = info.file_size = stat.st_size
+        with archive.open(info, "w") as target:
+            while piece := source.read(min(PIECE_BYTES, left)):
+                target.write(piece)
+                left -= len(piece)
+                yield sink.take()
+
+
+class _Sink(io.RawIOBase):
+    """Collects what is written until it is taken; cannot seek, so sizes and checksums follow each file's bytes."""
+
+    def __init__(self) -> None:
+        self._pieces = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: bytes) -> int:  # type: ignore[override]
+        self._pieces += piece
+        return len(piece)
+
+    def take(self) -> bytes:
+        """What was written since the last time."""
+        taken = bytes(self._pieces)
+        self._pieces.clear()
+        return taken

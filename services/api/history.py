@@ -1,0 +1,166 @@
+"""What a job's events add up to: the curve of its fit, its pictures, its log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import Field
+
+from services.api.events import EventLog, JobEvent
+from services.core.geometry import Record
+from services.core.stage import StageName
+
+PICTURES = ("render", "photo", "residual")
+_PAGE = 1000
+
+
+class LogLine(Record):
+    """Something that a stage said."""
+
+    id: int = Field(description="grows with time")
+    time_s: float = Field(description="Unix time")
+    stage: StageName | None
+    attempt: int
+    message: str
+
+
+class LogPage(Record):
+    """Some lines, oldest first."""
+
+    lines: list[LogLine]
+    next_after: int = Field(description="give as 'after' to get what follows, also later on")
+    is_last: bool = Field(description="whether nothing follows by now")
+
+
+class Series(Record):
+    """Steps of one channel as columns of equal length; null where a step does not tell a number."""
+
+    channel: str
+    step: list[int] = Field(description="number of the step; gaps where the columns are thinned")
+    time_s: list[float] = Field(description="Unix time")
+    stage: list[str | None] = Field(description="stage of the fit")
+    tooth: list[int | None] = Field(description="FDI number, where the step looks at one tooth of a jaw alone")
+    samples: list[int | None] = Field(description="paths per pixel and pass")
+    loss: list[float | None]
+    fit_error: list[float | None] = Field(description="relative image error on fitted images")
+    held_out_error: list[float | None] = Field(description="relative image error on held-out images")
+    held_out_se: list[float | None] = Field(description="Monte Carlo standard error of held_out_error")
+    parameters: dict[str, list[float | None]] = Field(description="by name; units as in parameters.json")
+
+
+class History(Record):
+    """The curve of a fit."""
+
+    series: list[Series] = Field(description="one per channel, in the order in which they began")
+
+
+class Preview(Record):
+    """One picture in three versions, as a step left it."""
+
+    id: int = Field(description="of the event that told of it")
+    time_s: float = Field(description="Unix time")
+    attempt: int
+    camera: str
+    light: str
+    channel: str
+    step: int
+    held_out: bool
+    pictures: dict[str, str] = Field(description="render, photo, residual: paths to get them from")
+
+
+class PreviewPage(Record):
+    """Some pictures, oldest first."""
+
+    previews: list[Preview]
+    next_after: int = Field(description="give as 'after' to get what follows, also later on")
+    is_last: bool = Field(description="whether nothing follows by now")
+
+
+def read_log(log: EventLog, after: int, limit: int, stage: StageName | None, attempt: int | None) -> LogPage:
+    """One page of what the stages said."""
+    events = log.read(after, limit + 1, kind="log", stage=stage, attempt=attempt)
+    lines = [LogLine(**{name: getattr(event, name) for name in LogLine.model_fields}) for event in events[:limit]]
+    return LogPage(lines=lines, next_after=lines[-1].id if lines else after, is_last=len(events) <= limit)
+
+
+def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> PreviewPage:
+    """One page of the pictures that the fit wrote."""
+    events = log.read(after, limit + 1, kind="preview")
+    previews = [_preview(event, job_id) for event in events[:limit]]
+    return PreviewPage(previews=previews, next_after=previews[-1].id if previews else after, is_last=len(events) <= limit)
+
+
+def read_history(log: EventLog, points: int, channel: str | None = None) -> History:
+    """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later attempt repeats replaces the earlier one."""
+    thinned: dict[str, _Thinned] = {}
+    for event in _events(log, "step"):
+        name = str(event.data.get("channel", ""))
+        if isinstance(event.data.get("step"), int) and channel in {None, name}:
+            thinned.setdefault(name, _Thinned(points)).add(event)
+    return History(series=[_series(name, one) for name, one in thinned.items()])
+
+
+class _Thinned:
+    """Every n-th step of a channel, n doubling as steps come, so that a long fit needs no more memory than a short one."""
+
+    def __init__(self, points: int) -> None:
+        self._points, self._stride = points, 1
+        self._kept: dict[int, JobEvent] = {}
+        self._first: JobEvent | None = None
+        self._last: JobEvent | None = None
+
+    def add(self, event: JobEvent) -> None:
+        """Take in a step."""
+        if self._first is None or event.data["step"] <= self._first.data["step"]:
+            self._first = event
+        if self._last is None or event.data["step"] >= self._last.data["step"]:
+            self._last = event
+        if event.data["step"] % self._stride == 0:
+            self._kept[event.data["step"]] = event
+        while len(self._kept) > max(self._points - 2, 1):
+            self._stride *= 2
+            self._kept = {step: kept for step, kept in self._kept.items() if step % self._stride == 0}
+
+    def events(self) -> list[JobEvent]:
+        """What is left, in the order of steps."""
+        ends = {event.data["step"]: event for event in (self._first, self._last) if event is not None}
+        return [event for _, event in sorted((self._kept | ends).items())]
+
+
+def _events(log: EventLog, kind: str) -> Iterator[JobEvent]:
+    after = 0
+    while events := log.read(after, _PAGE, kind=kind):
+        yield from events
+        after = events[-1].id
+
+
+def _series(channel: str, thinned: _Thinned) -> Series:
+    events = thinned.events()
+    rows = [event.data for event in events]
+    parameters: list[dict[str, float]] = [row.get("parameters") or {} for row in rows]
+    names = list(dict.fromkeys(name for one in parameters for name in one))
+
+    def column(name: str) -> list[Any]:
+        return [row.get(name) for row in rows]
+
+    return Series(
+        channel=channel,
+        step=column("step"),
+        time_s=[event.time_s for event in events],
+        stage=column("stage"),
+        tooth=column("tooth"),
+        samples=column("samples"),
+        loss=column("loss"),
+        fit_error=column("fit_error"),
+        held_out_error=column("held_out_error"),
+        held_out_se=column("held_out_se"),
+        parameters={name: [one.get(name) for one in parameters] for name in names},
+    )
+
+
+def _preview(event: JobEvent, job_id: str) -> Preview:
+    absent = {"camera": "", "light": "", "channel": "", "step": 0, "held_out": False}
+    known = {name: event.data.get(name, default) for name, default in absent.items()}
+    pictures = {kind: f"/v1/jobs/{job_id}/previews/{event.id}/{kind}" for kind in PICTURES if kind in event.data}
+    return Preview(id=event.id, time_s=event.time_s, attempt=event.attempt, pictures=pictures, **known)

@@ -1,0 +1,43 @@
+"""What lets others see what happens: composes routes, metrics, readiness and webhooks over one server's jobs."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI
+
+from services.api.deliveries import Deliveries
+from services.api.health_routes import build_health_router
+from services.api.jobs import Jobs
+from services.api.metrics import RequestMetrics, build_registry
+from services.api.observe_routes import build_observe_router
+from services.api.readiness import Readiness
+from services.api.requests import RequestLog
+from services.api.webhook_address import AddressPolicy
+from services.api.webhook_routes import build_webhook_router
+from services.api.webhook_sender import WebhookSender
+from services.api.webhooks import Webhooks
+from services.core.settings import ServerSettings
+
+
+class Observation:
+    """Belongs to one application; ``webhook_sender`` is to be run while the application lives."""
+
+    def __init__(self, jobs: Jobs, settings: ServerSettings) -> None:
+        engine, policy = jobs.repository.engine, AddressPolicy(settings.private_webhooks)
+        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes)
+        deliveries = Deliveries(engine)
+        self._registry = build_registry(engine, readiness, jobs.free_bytes)
+        self._routers = (
+            build_observe_router(jobs),
+            build_health_router(readiness, self._registry),
+            build_webhook_router(Webhooks(engine, policy), deliveries),
+        )
+        self.webhook_sender = WebhookSender(deliveries, policy)
+
+    def include_routes(self, app: FastAPI) -> None:
+        """Add every route of this room."""
+        for router in self._routers:
+            app.include_router(router)
+
+    def watch_requests(self, app: FastAPI) -> None:
+        """Log and count requests; add this last, so that it sees also what others refuse."""
+        app.add_middleware(RequestLog, metrics=RequestMetrics(self._registry))

@@ -1,0 +1,92 @@
+"""Where webhooks may go: names are resolved first, what they resolve to is checked, and only that is connected to."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import re
+import socket
+from dataclasses import dataclass
+
+import httpx
+
+from services.core.errors import WebhookAddressError
+
+IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+_HOST = re.compile(r"[A-Za-z0-9_.:-]+")
+_NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
+
+
+@dataclass(frozen=True)
+class AddressPolicy:
+    """``allow_private`` opens private, link-local and loopback addresses, and to those also plain http."""
+
+    allow_private: bool = False
+
+    def check_url(self, url: str) -> None:
+        """Check what can be known without asking a name server.
+
+        Raises:
+            WebhookAddressError: not a web address, not https, a login in it, or a forbidden address.
+        """
+        try:
+            parts = httpx.URL(url)
+            host = parts.raw_host.decode()
+        except (httpx.InvalidURL, ValueError) as problem:
+            raise WebhookAddressError(f"The webhook's address is malformed ({problem}); give one such as https://example.org/hook.") from problem
+        if parts.scheme not in {"https", "http"} or not _HOST.fullmatch(host) or not 0 < (parts.port or 443) < 2**16:
+            raise WebhookAddressError("The webhook's address must be an absolute https address, such as https://example.org/hook.")
+        if parts.userinfo or parts.fragment:
+            raise WebhookAddressError("The webhook's address must not hold a login or a fragment; the signature tells the receiver who sends.")
+        if parts.scheme == "http" and not self.allow_private:
+            raise WebhookAddressError("The webhook's address must be https.")
+        if (literal := _literal(host)) is not None:
+            self.check_address(literal, parts.scheme)
+
+    def check_address(self, address: IpAddress, scheme: str) -> None:
+        """Check an address before it is connected to.
+
+        Raises:
+            WebhookAddressError: it is not public and the settings do not allow that, or plain http would leave for a public one.
+        """
+        if not is_public(address):
+            if not self.allow_private or address.is_multicast or address.is_unspecified:
+                raise WebhookAddressError(f"Webhooks may not go to {address}, which is no public address; set private_webhooks to allow private ones.")
+        elif scheme == "http":
+            raise WebhookAddressError(f"A webhook to the public address {address} must be https.")
+
+    async def resolve(self, host: str, port: int, scheme: str) -> list[str]:
+        """Addresses of a host, all of them checked.
+
+        Raises:
+            WebhookAddressError: one of them is refused, or the name has none.
+        """
+        try:
+            found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError) as problem:
+            raise WebhookAddressError(f"The webhook's host {host} cannot be resolved; correct the address.") from problem
+        addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
+        for address in addresses:
+            self.check_address(ipaddress.ip_address(address), scheme)
+        return addresses
+
+
+def is_public(address: IpAddress) -> bool:
+    """Whether an address, or the IPv4 address that an IPv6 one leads to, is on the public internet."""
+    if isinstance(address, ipaddress.IPv6Address):
+        within = address.ipv4_mapped or address.sixtofour or (address.teredo or (None, None))[1]
+        if within is None and address in _NAT64:
+            within = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        if within is not None:
+            return is_public(within)
+        if address.is_site_local:
+            return False
+    return address.is_global and not address.is_multicast and not address.is_reserved
+
+
+def _literal(host: str) -> IpAddress | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None

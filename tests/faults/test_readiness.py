@@ -1,0 +1,173 @@
+"""Readiness and metrics tell the truth while database, scheduler, store or disk are broken, and again once they are mended."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import httpx
+import pytest
+
+from services.api import readiness as readiness_module
+from services.api.app import create_app
+from services.api.database import open_database, sqlite_url
+from services.api.jobs import Jobs
+from services.api.migrations import upgrade
+from services.api.readiness import FREE_BYTES_NEEDED, Readiness
+from services.core.settings import DATABASE_FILE, ServerSettings
+from tests.support.live_server import serving
+
+NOBODY = 65534
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[httpx.Client]:
+    with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
+        yield client
+
+
+def bad_checks(client: httpx.Client) -> dict[str, str]:
+    """Name and sentence of each check that fails; status, problem document and metrics must say the same."""
+    answer = client.get("/v1/health/ready")
+    told = answer.json()
+    assert [check["name"] for check in told["checks"]] == ["database", "scheduler", "store", "disk"]
+    bad = {check["name"]: check["sentence"] for check in told["checks"] if not check["ok"]}
+    if bad:
+        assert (answer.status_code, told["status"], told["code"]) == (503, 503, "not-ready")
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert told["detail"] == " ".join(bad.values())
+    else:
+        assert (answer.status_code, told["status"]) == (200, "ready")
+    assert client.get("/v1/health/live").json() == {"status": "live"}
+    scraped = client.get("/v1/metrics")
+    assert scraped.status_code == 200
+    for check in told["checks"]:
+        assert f'dentine_up{{part="{check["name"]}"}} {float(check["ok"])}' in scraped.text
+    assert ("dentine_jobs{" in scraped.text) is ("database" not in bad)
+    return bad
+
+
+@contextmanager
+def locked(data: Path) -> Iterator[None]:
+    with closing(sqlite3.connect(data / DATABASE_FILE, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.execute("ROLLBACK")
+
+
+@contextmanager
+def moved(data: Path) -> Iterator[None]:
+    hidden = data / "hidden"
+    (data / DATABASE_FILE).rename(hidden)
+    yield
+    hidden.rename(data / DATABASE_FILE)
+
+
+@contextmanager
+def without_folder(data: Path) -> Iterator[None]:
+    shutil.rmtree(data / "jobs", ignore_errors=True)
+    (data / "jobs").touch()
+    yield
+    (data / "jobs").unlink()
+
+
+@pytest.mark.parametrize(
+    ("fault", "part", "sentence"),
+    [
+        (locked, "database", "grants no write"),
+        (moved, "database", "was removed or replaced"),
+        (without_folder, "store", "cannot be written"),
+    ],
+)
+def test_a_fault_is_named_while_it_lasts(client: httpx.Client, tmp_path: Path, fault: Callable[[Path], Any], part: str, sentence: str) -> None:
+    assert bad_checks(client) == {}
+    with fault(tmp_path):
+        bad = bad_checks(client)
+    assert set(bad) == {part}
+    assert sentence in bad[part]
+    assert bad_checks(client) == {}
+
+
+def test_a_database_replaced_under_the_server_is_told(tmp_path: Path) -> None:
+    jobs = Jobs(ServerSettings(data=tmp_path), lambda *_: None)
+    readiness = Readiness(jobs.repository.engine, tmp_path / "jobs", lambda: True, jobs.free_bytes)
+    assert all(check.ok for check in readiness.checks())
+    with moved(tmp_path):
+        upgrade(open_database(sqlite_url(tmp_path / DATABASE_FILE)))
+        assert [check.name for check in readiness.checks() if not check.ok] == ["database"]
+    jobs.repository.close()
+
+
+def test_a_disk_that_is_almost_full_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=FREE_BYTES_NEEDED - 1, total=2 * FREE_BYTES_NEEDED))
+        assert bad_checks(client) == {"disk": "Only 255 MiB of disk are free; free at least 256 MiB."}
+    assert bad_checks(client) == {}
+
+
+def test_a_disk_that_takes_no_byte_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as failing:
+        failing.setattr(readiness_module.os, "fsync", full)
+        assert bad_checks(client) == {"store": "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the disk."}
+    assert bad_checks(client) == {}
+    assert list((tmp_path / "jobs").iterdir()) == []
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_runner_that_died_is_told(tmp_path: Path) -> None:
+    def die(*_: object) -> None:
+        raise SystemExit  # ends the thread that runs jobs
+
+    with serving(create_app(ServerSettings(data=tmp_path), die)) as client:
+        assert bad_checks(client) == {}
+        client.post("/v1/jobs", json={"capture": "/"})
+        while client.get("/v1/health/ready").status_code == 200:
+            pass
+        assert set(bad_checks(client)) == {"scheduler"}
+
+
+def test_a_read_only_data_folder_is_told() -> None:
+    """Asked as a user without rights, since the superuser may write anywhere."""
+    data = Path(tempfile.mkdtemp())
+    try:
+        data.chmod(0o755)
+        jobs = Jobs(ServerSettings(data=data), lambda *_: None)
+        (data / "jobs").mkdir(mode=0o755)
+        readiness = Readiness(jobs.repository.engine, data / "jobs", lambda: True, jobs.free_bytes)
+        assert all(check.ok for check in readiness.checks())
+        jobs.repository.close()
+        for path in (data, *data.rglob("*")):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        with unprivileged():
+            bad = {check.name: check.sentence for check in readiness.checks() if not check.ok}
+        assert set(bad) == {"database", "store"}
+        assert "readonly database" in bad["database"] or "unable to open" in bad["database"]
+        assert "Permission denied" in bad["store"]
+    finally:
+        for path in (data, *data.rglob("*")):
+            path.chmod(0o755)
+        shutil.rmtree(data)
+
+
+@contextmanager
+def unprivileged() -> Iterator[None]:
+    """Without the superuser's rights, where the process has them."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
