@@ -32,11 +32,12 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
     from starlette.middleware.trustedhost import TrustedHostMiddleware
     from starlette.staticfiles import StaticFiles
 
-    from services.api import problems
+    from services.api import access, problems
     from services.api.feed import EventFeed
     from services.api.routes import build_router
     from services.api.shield import Shield
 
+    access.refuse_open_network(settings)
     jobs = Jobs(settings.data, run)
     feed = EventFeed(jobs.repository.newest_event)
 
@@ -52,10 +53,12 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
                 await following
             await asyncio.to_thread(jobs.close)
 
-    app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
+    app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)
     app.include_router(build_router(jobs, feed))
+    access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host}))
-    app.add_middleware(Shield)
+    names = {name.strip() for name in settings.names.split(",") if name.strip()}
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host} | names))
+    app.add_middleware(Shield, secure=not settings.is_loopback)
     return app

@@ -76,7 +76,7 @@ class EventAddress:
 def open_database(path: Path) -> sql.Engine:
     """Open or create the database with every table that is known by now."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    engine = sql.create_engine(f"sqlite:///{path}")
+    engine = sql.create_engine(f"sqlite:///{path}", hide_parameters=True)  # errors end in logs
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:

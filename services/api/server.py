@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app, run_locally
 from services.api.jobs import RunJob
 from services.core.errors import PlatformError
@@ -21,7 +22,9 @@ def serve(settings: ServerSettings, run: RunJob = run_locally) -> None:
 
     Raises:
         PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
+        SettingsError: other machines reach the server and access is open.
     """
+    refuse_open_network(settings)
     try:
         import uvicorn
     except ModuleNotFoundError as problem:
@@ -32,7 +35,9 @@ def serve(settings: ServerSettings, run: RunJob = run_locally) -> None:
             print("The dashboard is not built; run make dashboard. The API works without it.", file=sys.stderr)
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
-        server = uvicorn.Server(uvicorn.Config(create_app(settings, run), log_level="warning", access_log=False, timeout_graceful_shutdown=1))
+        proxies = {"proxy_headers": bool(settings.trusted_proxies), "forwarded_allow_ips": settings.trusted_proxies}
+        config = uvicorn.Config(create_app(settings, run), log_level="warning", access_log=False, timeout_graceful_shutdown=1, **proxies)
+        server = uvicorn.Server(config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
         server.run(sockets=[listener])

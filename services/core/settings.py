@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import ipaddress
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, SecretStr, ValidationError
 
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import JobSpec
+
+
+class RateSettings(Record):
+    """How often one token, or one address without a token, may ask."""
+
+    reads_per_10_s: int = Field(default=10_000, gt=0, description="requests that change nothing; an event stream counts once")
+    writes_per_10_s: int = Field(default=2_000, gt=0, description="requests that change something")
+    refusals_per_minute: int = Field(default=60, gt=0, description="requests of one address without a valid token that are answered and audited one by one")
 
 
 class ServerSettings(Record):
@@ -20,12 +29,33 @@ class ServerSettings(Record):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
     data: Path = Field(default=Path("dentine-data"), description="folder of the database and the jobs")
+    access: Literal["tokens", "open"] = Field(default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only")
+    names: str = Field(default="", description="further host names that clients use for this server, separated by commas")
+    trusted_proxies: str = Field(default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas")
+    session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
+    body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
+    rates: RateSettings = RateSettings()
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches the server."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+class ClientSettings(Record):
+    """The command line as a client of a server."""
+
+    token: SecretStr | None = Field(default=None, description="what `dentine token create` printed")
 
 
 class Settings(Record):
     """Everything a deployment may set."""
 
     server: ServerSettings = ServerSettings()
+    client: ClientSettings = ClientSettings()
 
 
 def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> Settings:

@@ -1,6 +1,6 @@
 /** One job, live: fed by its event stream, completed from its artifacts when it ends. */
 
-import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob } from "./api";
+import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, when } from "./format";
@@ -104,7 +104,14 @@ export class JobView {
 
   private async act(): Promise<void> {
     const retry = FINAL.includes(this.current);
-    this.showState(await (retry ? retryJob : cancelJob)(this.id));
+    try {
+      this.showState(await (retry ? retryJob : cancelJob)(this.id));
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.failure.hidden = false;
+      this.failure.textContent = problem instanceof Error ? problem.message : String(problem);
+      return;
+    }
     if (retry) this.follow();
     this.onChange();
   }
