@@ -14,6 +14,9 @@ from services.api.events import metadata, writing
 from services.core.geometry import Record
 from services.core.redaction import redacted
 
+ID_LENGTH = 500
+"""More of an artifact's path is not kept: whoever asks for it could make it long."""
+
 audit_table = sql.Table(
     "audit",
     metadata,
@@ -57,7 +60,7 @@ class Deed:
     def write(self, connection: sql.Connection, outcome: int) -> None:
         """Append the row inside the caller's transaction, unless that was done."""
         if not self.is_written:
-            ids = {name: redacted(value) for name, value in self.ids.items()}
+            ids = {name: redacted(value)[:ID_LENGTH] for name, value in self.ids.items()}
             row = {"time_s": time.time(), "who": self.who, "token": self.token, "address": self.address, "action": self.action}
             connection.execute(audit_table.insert().values(row | {"ids": json.dumps(ids), "outcome": outcome}))
             self.is_written = True

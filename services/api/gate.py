@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 from services.api.access import Access
 from services.api.audit import AuditLog, Deed
-from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes, require
+from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
 from services.api.problems import MEDIA_TYPE, Problem, response_of
 from services.api.rates import Rates, network_of
 from services.api.shield import SAFE_METHODS
-from services.api.tokens import Caller, public_id
-from services.core.errors import DentineError, PlatformError, RateError, ScopeError, UnauthenticatedError
+from services.api.tokens import public_id
+from services.core.errors import PlatformError, RateError, ScopeError, UnauthenticatedError
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -46,7 +46,7 @@ class Gate:
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        deed = Deed(f"{scope['method']} {found.route.template if found.route else scope['path']}", _address(scope), ids=found.ids)
+        deed = Deed(f"{scope['method']} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
         refusal = await self._refusal(request, found, deed)
         if refusal is not None:
             await refusal(scope, receive, send)
@@ -70,9 +70,7 @@ class Gate:
         if found.route is None:
             return _nothing_there(found, path, request.scope["method"])
         try:
-            if found.route.needs is None:
-                raise ScopeError(f"Route {deed.action} does not declare exactly one scope and is closed; declare it with needs() beside the route.")
-            require(caller, found.route.needs.scope)
+            found.route.admit(caller)
         except ScopeError as problem:
             await asyncio.to_thread(self._audit.append, deed, HTTPStatus.FORBIDDEN)
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
@@ -149,7 +147,8 @@ def _address(scope: Scope) -> str:
 
 
 def _made(message: Message) -> dict[str, str]:
-    return {"made": value.decode("latin-1") for name, value in message["headers"] if name.lower() == b"location"}
+    location = next((value for name, value in message["headers"] if name.lower() == b"location"), None)
+    return {} if location is None else {"made": location.decode("latin-1")}
 
 
 def _too_many(who: str, wait_s: int, path: str) -> Response:

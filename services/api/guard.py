@@ -67,6 +67,16 @@ class GuardedRoute:
         """The declaration, if there is exactly one."""
         return self.declared[0] if len(self.declared) == 1 else None
 
+    def admit(self, caller: Caller) -> None:
+        """Let a caller with the route's scope pass.
+
+        Raises:
+            ScopeError: the caller lacks the scope, or the route declares none or several.
+        """
+        if self.needs is None:
+            raise ScopeError(f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route.")
+        require(caller, self.needs.scope)
+
 
 @dataclass(frozen=True)
 class Found:
@@ -84,7 +94,7 @@ def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
         if isinstance(context.original_route, Mount) and context.name == PAGE:
             continue
         declared = tuple(one.dependency for one in getattr(context, "dependencies", ()) if isinstance(one.dependency, Needs))
-        found.append(GuardedRoute(context.path or "", frozenset(getattr(context, "methods", None) or ()), context.path_regex, declared))
+        found.append(GuardedRoute(context.path_format or "", frozenset(getattr(context, "methods", None) or ()), context.path_regex, declared))
     return found
 
 

@@ -35,8 +35,15 @@ def serve(settings: ServerSettings, run: RunJob = run_locally) -> None:
             print("The dashboard is not built; run make dashboard. The API works without it.", file=sys.stderr)
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
-        proxies = {"proxy_headers": bool(settings.trusted_proxies), "forwarded_allow_ips": settings.trusted_proxies}
-        config = uvicorn.Config(create_app(settings, run), log_level="warning", access_log=False, timeout_graceful_shutdown=1, **proxies)
+        proxies = settings.trusted_proxies
+        config = uvicorn.Config(
+            create_app(settings, run),
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=1,
+            proxy_headers=bool(proxies),
+            forwarded_allow_ips=proxies,
+        )
         server = uvicorn.Server(config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order

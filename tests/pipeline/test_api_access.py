@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from fastapi import APIRouter, FastAPI
-from fastapi.routing import APIRoute
 
 from services.api import gate
 from services.api.app import create_app
@@ -54,10 +53,9 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
     """Method, template and declared scope of every route."""
     found = []
     for route in guarded_routes(app.routes):
-        template = re.sub(r":\w+}", "}", route.template)
-        if template != LIVENESS:
-            assert route.needs is not None, f"{template} declares {len(route.declared)} scopes"
-            found += [(method, template, route.needs.scope) for method in route.methods]
+        if route.template != LIVENESS:
+            assert route.needs is not None, f"{route.template} declares {len(route.declared)} scopes"
+            found += [(method, route.template, route.needs.scope) for method in route.methods]
     return found
 
 
@@ -99,30 +97,44 @@ def test_liveness_and_the_page_need_no_token(server: Guarded) -> None:
     assert server.ask("GET", "/").status_code == 200
 
 
-@pytest.mark.parametrize(("method", "path"), [("GET", "/v1/nothing"), ("PUT", "/v1/jobs"), ("OPTIONS", "/v1/jobs"), ("GET", "/v1/../v1/jobs"), ("GET", "/v1/jobs/")])
-def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str, path: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("GET", "/v1/jobs/", 404), ("PUT", "/v1/jobs", 405), ("OPTIONS", "/v1/jobs", 405)]
+)
+def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str, path: str, status: int) -> None:
     assert server.ask(method, path).status_code == 401
     answer = server.ask(method, path, Scope.READ)
-    assert (answer.status_code, answer.json()["code"]) in {(404, "not-found"), (405, "method-not-allowed"), (200, None)} or path == "/v1/../v1/jobs"
-    if answer.status_code == 405:
-        assert answer.headers["allow"] == "GET, POST"
+    assert (answer.status_code, answer.json()["code"]) == (status, {404: "not-found", 405: "method-not-allowed"}[status])
+    assert answer.headers.get("allow") == {404: None, 405: "GET, POST"}[status]
 
 
 @pytest.mark.parametrize("declared", [0, 2])
-def test_a_route_without_exactly_one_scope_is_closed(tmp_path: Path, declared: int) -> None:
+@pytest.mark.parametrize("path", ["/v1/thing", "/thing"])
+def test_a_route_without_exactly_one_scope_is_closed(tmp_path: Path, declared: int, path: str) -> None:
     called = []
+    router = APIRouter()
+    router.add_api_route(path, lambda: called.append(1), dependencies=[needs("read") for _ in range(declared)])
     app = create_app(ServerSettings(data=tmp_path))
-    router = APIRouter(prefix="/v1/extra")
-    router.add_api_route("/thing", lambda: called.append(1), dependencies=[needs("read") for _ in range(declared)])
+    add_first(app, router)
+    with serving(app) as client:
+        answer = client.get(path)
+    assert answer.status_code == 403
+    assert "does not declare exactly one scope" in answer.json()["detail"]
+    assert not called
+
+
+def test_a_route_that_others_add_with_one_scope_is_open(tmp_path: Path) -> None:
+    router = APIRouter(prefix="/v1", dependencies=[needs("read")])
+    router.add_api_route("/thing", lambda: 7)
+    app = create_app(ServerSettings(data=tmp_path))
+    add_first(app, router)
+    with serving(app) as client:
+        assert client.get("/v1/thing").json() == 7
+
+
+def add_first(app: FastAPI, router: APIRouter) -> None:
+    """Include a router before the page, which takes whatever is left."""
     app.include_router(router)
     app.router.routes.insert(0, app.router.routes.pop())
-    app.router.routes.insert(0, APIRoute("/outside", lambda: called.append(2)))
-    with serving(app) as client:
-        for path in ("/v1/extra/thing", "/outside")[: 2 - declared // 2]:
-            answer = client.get(path)
-            assert answer.status_code == 403
-            assert "does not declare exactly one scope" in answer.json()["detail"]
-    assert not called
 
 
 def test_without_the_gate_a_route_is_closed(tmp_path: Path) -> None:
@@ -144,7 +156,7 @@ class _As:
         await self.app(scope | {"caller": self.caller}, receive, send)
 
 
-@pytest.mark.parametrize("header", ["Bearer", "Bearer ", "Basic eDp5", "Bearer dentine_0123456789ab_guess", "bearer \xff", "x" * 5000])
+@pytest.mark.parametrize("header", ["Bearer", "Basic eDp5", "Bearer dentine_0123456789ab_guess", "bearer \xff", "x" * 5000])
 def test_a_wrong_credential_is_refused(server: Guarded, header: str) -> None:
     answer = server.client.get("/v1/jobs", headers={"Authorization": header.encode("latin-1")})
     assert (answer.status_code, answer.json()["code"]) == (401, "unauthenticated")
@@ -171,7 +183,6 @@ def sign_in(server: Guarded, scope: Scope = Scope.SUBMIT) -> dict[str, str]:
     """The cookie header of a new session."""
     answer = server.ask("POST", "/v1/session", scope)
     assert answer.status_code == 200
-    server.client.cookies.clear()
     set_cookie = answer.headers["set-cookie"]
     assert re.search(r"HttpOnly; Max-Age=\d+; Path=/v1; SameSite=strict$", set_cookie), set_cookie
     return {"Cookie": set_cookie.split(";")[0]}
@@ -278,8 +289,8 @@ def test_changes_refusals_and_artifacts_are_audited_and_reads_are_not(tmp_path: 
         rows = [row for row in audit(server) if row["id"] > base][::-1]
         assert [(row["who"], row["action"], row["outcome"], row["ids"]) for row in rows] == [
             ("of-submit", "POST /v1/jobs", 201, {"made": f"/v1/jobs/{job}"}),
-            ("of-read", "GET /v1/jobs/{job_id}/artifacts/{path:path}", 200, {"job_id": job, "path": "report.html"}),
-            ("of-read", "GET /v1/jobs/{job_id}/artifacts/{path:path}", 404, {"job_id": job, "path": "../../session.key"}),
+            ("of-read", "GET /v1/jobs/{job_id}/artifacts/{path}", 200, {"job_id": job, "path": "report.html"}),
+            ("of-read", "GET /v1/jobs/{job_id}/artifacts/{path}", 404, {"job_id": job, "path": "../../session.key"}),
             ("of-submit", "POST /v1/jobs/{job_id}/cancel", 409, {"job_id": job}),
             ("of-read", "POST /v1/jobs", 403, {}),
             ("unknown", "GET /v1/jobs", 401, {}),
@@ -330,10 +341,9 @@ def test_a_change_that_breaks_is_audited_as_broken(tmp_path: Path) -> None:
 
     router = APIRouter(prefix="/v1")
     router.add_api_route("/broken", break_down, methods=["POST"], dependencies=[needs("admin")])
-    app.include_router(router)
-    app.router.routes.insert(0, app.router.routes.pop())
+    add_first(app, router)
     with serving(app) as client:
-        assert client.post("/v1/broken").json()["code"] == "internal-error"
+        assert client.post("/v1/broken", headers={"Connection": "close"}).json()["code"] == "internal-error"
         (row,) = client.get("/v1/audit").json()["entries"]
     assert (row["who"], row["action"], row["outcome"]) == ("local", "POST /v1/broken", 500)
 

@@ -43,9 +43,11 @@ class Guarded:
     data: Path
 
     def ask(self, method: str, path: str, scope: Scope | None = None, **options: Any) -> httpx.Response:
-        """A request with the token of a scope, or without one."""
+        """A request with the token of a scope, or without one; no cookie is kept from it."""
         headers = options.pop("headers", {}) | ({"Authorization": f"Bearer {self.tokens[scope]}"} if scope else {})
-        return self.client.request(method, path, headers=headers, **options)
+        answer = self.client.request(method, path, headers=headers, **options)
+        self.client.cookies.clear()
+        return answer
 
 
 def run_nothing(*_: object) -> None:

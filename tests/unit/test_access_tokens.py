@@ -167,7 +167,8 @@ def test_making_and_revoking_are_audited_with_the_change_itself(table: Tokens, e
     issue(table)
     table.revoke("rig-1", make_deed())
     rows = AuditLog(engine).page(10)
-    assert [(row.who, row.outcome, row.ids) for row in rows] == [("local", 200, {"token_id": table.list()[0].id}), ("local", 201, {"token_id": table.list()[0].id})]
+    ids = {"token_id": table.list()[0].id}
+    assert [(row.who, row.outcome, row.ids) for row in rows] == [("local", 200, ids), ("local", 201, ids)]
     with pytest.raises(InputError):
         issue(table, "a b")
     assert len(AuditLog(engine).page(10)) == 2
