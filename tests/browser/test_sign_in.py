@@ -12,17 +12,27 @@ from playwright.sync_api import Browser, Page, expect
 from services.api.app import STATIC
 from services.api.sessions import COOKIE
 from services.api.tokens import Scope
+from services.core.errors import CaptureInputError
+from services.core.records import JobSpec
 from tests.browser.contrast import contrast_failures
 from tests.support.guarded_server import Guarded, guarded
 
 pytestmark = pytest.mark.browser
+
+FAILING_SEED = 2
+
+
+def run(spec: JobSpec, *_: object) -> None:
+    """A job that succeeds at once, or fails at once by its seed."""
+    if spec.seed == FAILING_SEED:
+        raise CaptureInputError("Frame c0_l3.npy is missing; copy it there.")
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Guarded]:
     if not (STATIC / "app.js").exists():
         pytest.skip("the dashboard is not built; run make dashboard")
-    with guarded(tmp_path) as server:
+    with guarded(tmp_path, run) as server:
         server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"})
         yield server
 
@@ -74,12 +84,11 @@ def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: P
 
 
 def test_a_reader_is_told_why_a_retry_is_refused(page: Page, server: Guarded) -> None:
-    server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": 2})
-    page.route("**/v1/jobs/*", lambda route: route.fulfill(json=route.fetch().json() | {"state": "FAILED"}))
+    server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED})
     page.goto("/")
     sign_in(page, server.tokens[Scope.READ])
     page.get_by_role("button", name="Retry").click()
-    expect(page.get_by_role("alert")).to_have_text("This needs scope 'submit', which token of-read does not have; use a token with that scope.")
+    expect(page.get_by_role("alert").last).to_have_text("This needs scope 'submit', which token of-read does not have; use a token with that scope.")
 
 
 def test_a_revoked_token_brings_the_form_back(page: Page, server: Guarded) -> None:
