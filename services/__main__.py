@@ -55,7 +55,9 @@ def main() -> NoReturn:
 
 def build_app() -> typer.Typer:
     """Put the commands together."""
+    from services.core.settings import read_settings
     from services.slab_command import simulate_slab_command
+    from services.token_command import build_token_app
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
@@ -65,6 +67,7 @@ def build_app() -> typer.Typer:
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)
     app.add_typer(simulate, name="simulate")
+    app.add_typer(build_token_app(lambda: read_settings(os.environ).server.database_url), name="token")
     return app
 
 
@@ -271,8 +274,8 @@ def _client(server: str | None) -> Any:
     from services.api.client import Client
     from services.core.settings import read_settings
 
-    settings = read_settings(os.environ).server
-    return Client(server or f"http://{settings.host}:{settings.port}")
+    settings = read_settings(os.environ)
+    return Client(server or f"http://{settings.server.host}:{settings.server.port}", settings.client.token)
 
 
 def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:

@@ -33,12 +33,13 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     from starlette.middleware.trustedhost import TrustedHostMiddleware
     from starlette.staticfiles import StaticFiles
 
-    from services.api import problems
+    from services.api import access, problems
     from services.api.feed import EventFeed
     from services.api.observation import Observation
     from services.api.routes import build_router
     from services.api.shield import Shield
 
+    access.refuse_open_network(settings)
     workers = Workers(settings.scheduler)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
@@ -61,12 +62,14 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
             await asyncio.to_thread(jobs.close)
             await asyncio.to_thread(workers.close)
 
-    app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
+    app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)
     app.include_router(build_router(jobs, feed))
     observation.include_routes(app)
+    access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host}))
-    app.add_middleware(Shield)
+    names = {name.strip() for name in settings.names.split(",") if name.strip()}
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host} | names))
+    app.add_middleware(Shield, secure=not settings.is_loopback)
     observation.watch_requests(app)
     return app

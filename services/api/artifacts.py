@@ -57,7 +57,7 @@ def artifact_response(request: Request, path: Path) -> Response:
 
     stat = path.stat()
     tag = f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
-    headers = {"ETag": tag, "Cache-Control": "no-cache"}
+    headers = {"ETag": tag}
     if path.suffix == ".html":
         headers["Content-Security-Policy"] = REPORT_POLICY
     if tag in (request.headers.get("if-none-match") or ""):

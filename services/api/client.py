@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Self
 
+from pydantic import SecretStr
+
 from services.api.events import JobEvent
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, UnknownJobError
+from services.core.errors import DentineError, InputError, JobStateError, PlatformError, RateError, ScopeError, UnauthenticatedError, UnknownJobError
 from services.core.records import JobSpec
 
 RECONNECT_S = 1.0
@@ -18,13 +20,14 @@ RECONNECT_TRIES = 30
 class Client:
     """Speaks to one server; a context manager."""
 
-    def __init__(self, server: str) -> None:
+    def __init__(self, server: str, token: SecretStr | None = None) -> None:
         try:
             import httpx
         except ModuleNotFoundError as problem:
             raise PlatformError("The client's packages are not installed; install dentine[api].") from problem
         self._server = server
-        self._http = httpx.Client(base_url=f"{server.rstrip('/')}/v1", timeout=httpx.Timeout(10.0, read=60.0), trust_env=False)
+        headers = {} if token is None else {"Authorization": f"Bearer {token.get_secret_value()}"}
+        self._http = httpx.Client(base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=httpx.Timeout(10.0, read=60.0), trust_env=False)
 
     def __enter__(self) -> Self:
         return self
@@ -100,4 +103,7 @@ def _error(response: Any) -> DentineError:
         detail = str(response.json()["detail"])
     except (ValueError, KeyError):
         detail = f"The server answered {response.status_code}; is it a dentine server?"
-    return {404: UnknownJobError, 409: JobStateError, 422: InputError}.get(response.status_code, DentineError)(detail)
+    if response.status_code == 401:
+        detail += " The command line reads it from the variable DENTINE__CLIENT__TOKEN."
+    kinds = {401: UnauthenticatedError, 403: ScopeError, 404: UnknownJobError, 409: JobStateError, 422: InputError, 429: RateError}
+    return kinds.get(response.status_code, DentineError)(detail)

@@ -50,7 +50,7 @@ def open_database(url: str) -> sql.Engine:
     if parsed.get_backend_name() != "postgresql":
         raise SettingsError(f"The database {parsed.get_backend_name()!r} is not supported; use sqlite or postgresql.")
     try:
-        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
+        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True)
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
 
@@ -76,7 +76,7 @@ def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
 
 
 def _sqlite(url: sql.URL) -> sql.Engine:
-    engine = sql.create_engine(url)
+    engine = sql.create_engine(url, hide_parameters=True)  # errors end in logs
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:

@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from pydantic import Field
 
+from services.api.guard import needs
 from services.api.problems import MEDIA_TYPE, Problem
 from services.api.readiness import Check, Readiness
 from services.core.geometry import Record
@@ -28,7 +29,7 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
     """Routes over the given checks and metrics."""
     router = APIRouter(prefix="/v1", tags=["health"])
 
-    @router.get("/health/ready", response_model=Ready, responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}})
+    @router.get("/health/ready", response_model=Ready, responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}}, dependencies=[needs("read")])
     def ready(request: Request) -> Response:
         """Whether a submitted job would run: database, scheduler, store and disk are each tried."""
         checks = readiness.checks()
@@ -37,7 +38,7 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
             return Response(NotReady(**told.model_dump(), checks=checks).model_dump_json(), told.status, media_type=MEDIA_TYPE)
         return Response(Ready(status="ready", checks=checks).model_dump_json(), media_type="application/json")
 
-    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, dependencies=[needs("read")])
     def metrics() -> Response:
         """Metrics for Prometheus, in its text format."""
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)

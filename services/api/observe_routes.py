@@ -8,6 +8,7 @@ from fastapi.responses import StreamingResponse
 
 from services.api.archive import stream_zip
 from services.api.artifacts import artifact_response, list_artifacts, open_artifact
+from services.api.guard import needs
 from services.api.history import History, LogPage, PreviewPage, read_history, read_log, read_previews
 from services.api.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
@@ -29,7 +30,7 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
 
     Found = Annotated[Job, Depends(find_job)]
 
-    @router.get("/jobs/{job_id}/logs", tags=["jobs"])
+    @router.get("/jobs/{job_id}/logs", tags=["jobs"], dependencies=[needs("read")])
     def logs(
         job: Found,
         after: After = 0,
@@ -40,17 +41,17 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         """What the job's stages said, oldest first."""
         return read_log(jobs.repository.events_of(job.id), after, limit, stage, attempt)
 
-    @router.get("/jobs/{job_id}/history", tags=["jobs"])
+    @router.get("/jobs/{job_id}/history", tags=["jobs"], dependencies=[needs("read")])
     def history(job: Found, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> History:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
         return read_history(jobs.repository.events_of(job.id), points, channel)
 
-    @router.get("/jobs/{job_id}/previews", tags=["artifacts"])
+    @router.get("/jobs/{job_id}/previews", tags=["artifacts"], dependencies=[needs("read")])
     def previews(job: Found, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
         """Pictures that the fit has made so far, oldest first."""
         return read_previews(jobs.repository.events_of(job.id), job.id, after, limit)
 
-    @router.get("/jobs/{job_id}/previews/{preview_id}/{picture}", response_class=Response, tags=["artifacts"])
+    @router.get("/jobs/{job_id}/previews/{preview_id}/{picture}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
     def preview(
         job: Found, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request
     ) -> Response:
@@ -61,7 +62,7 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
             raise UnknownJobError(f"The job has no {picture} of preview {preview_id}; list its previews to see their ids.")
         return artifact_response(request, open_artifact(jobs.folder(job.id), path))
 
-    @router.get("/jobs/{job_id}/artifacts.zip", response_class=Response, tags=["artifacts"])
+    @router.get("/jobs/{job_id}/artifacts.zip", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
     def archive(job: Found) -> Response:
         """All artifacts as one zip file, made while it is sent."""
         root = jobs.folder(job.id)
@@ -69,12 +70,12 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.zip"', "Cache-Control": "no-store"}
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
 
-    @router.get("/presets", tags=["options"])
+    @router.get("/presets", tags=["options"], dependencies=[needs("read")])
     def presets() -> list[Preset]:
         """Named sets of options."""
         return list_presets()
 
-    @router.get("/presets/{name}", tags=["options"])
+    @router.get("/presets/{name}", tags=["options"], dependencies=[needs("read")])
     def preset(name: str) -> Preset:
         """One set of options, to merge into a job's own."""
         return find_preset(name)

@@ -8,16 +8,22 @@ from typing import TYPE_CHECKING, Self
 from pydantic import Field
 
 from services.core.errors import (
+    BodyTooLargeError,
     DentineError,
     InputError,
     JobStateError,
     PlatformError,
+    RateError,
+    ScopeError,
     TooLargeError,
+    UnauthenticatedError,
     UnknownJobError,
     UnknownPresetError,
+    UnknownTokenError,
     UnknownWebhookError,
 )
 from services.core.geometry import Record
+from services.core.redaction import redacted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,15 +47,21 @@ class Problem(Record):
     @classmethod
     def of(cls, status: HTTPStatus, code: str, detail: str, instance: str) -> Self:
         """The document for a status and one of our codes."""
-        return cls(type=f"urn:dentine:problem:{code}", title=status.phrase, status=status, detail=detail, instance=instance, code=code)
+        fields = {"detail": redacted(detail), "instance": redacted(instance), "code": code}
+        return cls(type=f"urn:dentine:problem:{code}", title=status.phrase, status=status, **fields)
 
 
 _STATUS = {
     UnknownJobError: HTTPStatus.NOT_FOUND,
     UnknownPresetError: HTTPStatus.NOT_FOUND,
+    UnknownTokenError: HTTPStatus.NOT_FOUND,
     UnknownWebhookError: HTTPStatus.NOT_FOUND,
     JobStateError: HTTPStatus.CONFLICT,
     TooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,
+    BodyTooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    UnauthenticatedError: HTTPStatus.UNAUTHORIZED,
+    ScopeError: HTTPStatus.FORBIDDEN,
+    RateError: HTTPStatus.TOO_MANY_REQUESTS,
     InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
     PlatformError: HTTPStatus.SERVICE_UNAVAILABLE,
     DentineError: HTTPStatus.INTERNAL_SERVER_ERROR,
@@ -59,6 +71,14 @@ _STATUS = {
 def status_of(problem: DentineError) -> HTTPStatus:
     """The HTTP status that an error means."""
     return next(status for kind, status in _STATUS.items() if isinstance(problem, kind))
+
+
+def response_of(problem: DentineError, path: str, headers: dict[str, str] | None = None) -> Response:
+    """The answer to a request that raised an error outside the application."""
+    from starlette.responses import Response
+
+    status = status_of(problem)
+    return Response(Problem.of(status, problem.code, problem.message, path).model_dump_json(), status, headers, MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:

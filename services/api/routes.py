@@ -9,6 +9,7 @@ from pydantic import Field
 
 from services.api.artifacts import Artifact, artifact_response, list_artifacts, open_artifact
 from services.api.feed import EventFeed, follow
+from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import MEDIA_TYPE, Problem
@@ -39,7 +40,7 @@ class Health(Record):
 
 def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     """Routes over the given jobs."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 422, 507)}
+    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (401, 403, 404, 409, 413, 422, 429, 507)}
     router = APIRouter(prefix="/v1", responses=failures)
 
     def find_job(job_id: str) -> Job:
@@ -50,7 +51,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
 
     Found = Annotated[Job, Depends(find_job)]
 
-    @router.post("/jobs", status_code=201, tags=["jobs"])
+    @router.post("/jobs", status_code=201, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200."""
         creation = jobs.submit(spec, idempotency_key, request.state.request_id)
@@ -58,7 +59,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
         return creation.job
 
-    @router.get("/jobs", tags=["jobs"])
+    @router.get("/jobs", tags=["jobs"], dependencies=[needs("read")])
     def page(
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: int | None = None,
@@ -73,32 +74,32 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         found = jobs.repository.page(limit + 1, before, only=only)
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
-    @router.get("/jobs/{job_id}", tags=["jobs"])
+    @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("read")])
     def get(job: Found) -> JobDetail:
         """One job with its stages."""
         return detail(job)
 
-    @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"])
+    @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def cancel(job: Found) -> Job:
         """Cancel a job. The lights go off first; what it has published is kept."""
         return jobs.cancel(job.id)
 
-    @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"])
+    @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def retry(job: Found) -> Job:
         """Queue a failed or cancelled job again; it resumes from what it had published."""
         return jobs.retry(job.id)
 
-    @router.delete("/jobs/{job_id}", tags=["jobs"])
+    @router.delete("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
     def delete(job: Found) -> Deletion:
         """Remove everything that is stored of a job that has ended; the answer is the receipt."""
         return jobs.delete(job.id)
 
-    @router.get("/deletions/{job_id}", tags=["jobs"])
+    @router.get("/deletions/{job_id}", tags=["jobs"], dependencies=[needs("read")])
     def deletion(job_id: str) -> Deletion:
         """The receipt of a deleted job."""
         return jobs.repository.deletion(job_id)
 
-    @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, tags=["jobs"])
+    @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, tags=["jobs"], dependencies=[needs("read")])
     async def events(job: Found, last_event_id: Annotated[int | None, Header()] = None) -> AsyncIterator[ServerSentEvent]:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         async for event in follow(jobs.repository, feed, job.id, last_event_id or 0):
@@ -107,20 +108,26 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
             else:
                 yield ServerSentEvent(id=str(event.id), data=event)
 
-    @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"])
+    @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
     def artifacts(job: Found) -> list[Artifact]:
         """List the job's files."""
         return list_artifacts(jobs.folder(job.id))
 
-    @router.get("/jobs/{job_id}/artifacts/{path:path}", response_class=Response, tags=["artifacts"])
+    @router.get("/jobs/{job_id}/artifacts/{path:path}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
     def artifact(job: Found, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
         return artifact_response(request, open_artifact(jobs.folder(job.id), path))
 
-    @router.get("/options", tags=["options"])
+    @router.get("/options", tags=["options"], dependencies=[needs("read")])
     def options() -> dict[str, Any]:
         """JSON schema of a job's options with defaults, units and help."""
         return JobSpec.model_json_schema()
+
+    @router.get("/openapi.json", include_in_schema=False, dependencies=[needs("read")])
+    def description(request: Request) -> dict[str, Any]:
+        """The OpenAPI description."""
+        described: dict[str, Any] = request.app.openapi()
+        return described
 
     @router.get("/health/live", tags=["health"])
     def live() -> Health:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app
 from services.api.logs import configure_logs
 from services.api.runner import RunJob
@@ -22,7 +23,9 @@ def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
 
     Raises:
         PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
+        SettingsError: other machines reach the server and access is open.
     """
+    refuse_open_network(settings)
     try:
         import uvicorn
     except ModuleNotFoundError as problem:
@@ -34,7 +37,16 @@ def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
-        config = uvicorn.Config(create_app(settings, run), log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+        proxies = settings.trusted_proxies
+        config = uvicorn.Config(
+            create_app(settings, run),
+            log_config=None,
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=1,
+            proxy_headers=bool(proxies),
+            forwarded_allow_ips=proxies,
+        )
         server = uvicorn.Server(config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order

@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 from http import HTTPStatus
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from services.api.problems import MEDIA_TYPE, Problem
 
 if TYPE_CHECKING:
+    from starlette.datastructures import Headers
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+_ALWAYS = MappingProxyType(
+    {
+        "Content-Security-Policy": PAGE_POLICY,
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Permissions-Policy": "camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()",
+    }
+)
+_YEAR_S = 365 * 86400
 
 
 class Shield:
     """Adds security headers; refuses changes that another site's page asks a visitor's browser to make."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    def __init__(self, app: ASGIApp, *, secure: bool) -> None:
+        self._app, self._secure = app, secure
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
+        """Serve one request; ``secure`` servers tell browsers to come by TLS only."""
         from starlette.datastructures import Headers, MutableHeaders
         from starlette.responses import Response
 
@@ -35,17 +48,27 @@ class Shield:
         async def send_shielded(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                headers.setdefault("Content-Security-Policy", PAGE_POLICY)
-                headers.setdefault("X-Content-Type-Options", "nosniff")
-                headers.setdefault("Referrer-Policy", "no-referrer")
-                headers.setdefault("Cross-Origin-Resource-Policy", "same-origin")
+                for name, value in _ALWAYS.items():
+                    headers.setdefault(name, value)
+                if self._secure:
+                    headers.setdefault("Strict-Transport-Security", f"max-age={_YEAR_S}")
+                if scope["path"].startswith("/v1/"):
+                    headers["Cache-Control"] = "no-store"
             await send(message)
 
-        asked = Headers(scope=scope)
-        origin = asked.get("origin")
-        if scope["method"] not in _SAFE_METHODS and origin is not None and urlsplit(origin).netloc != asked.get("host"):
+        if scope["method"] not in SAFE_METHODS and _is_foreign(Headers(scope=scope)):
             detail = "Another site asked for this change; use the dashboard or the API itself."
             refusal = Problem.of(HTTPStatus.FORBIDDEN, "foreign-origin", detail, scope["path"])
             await Response(refusal.model_dump_json(), 403, media_type=MEDIA_TYPE)(scope, receive, send_shielded)
             return
         await self._app(scope, receive, send_shielded)
+
+
+def _is_foreign(asked: Headers) -> bool:
+    """Whether another site's page may be behind a change. A browser says where a change comes from; one that sends a cookie must."""
+    origin, site = asked.get("origin"), asked.get("sec-fetch-site")
+    if origin is not None and urlsplit(origin).netloc != asked.get("host"):
+        return True
+    if site not in {None, "same-origin", "none"}:
+        return True
+    return origin is None and site is None and "cookie" in asked and "authorization" not in asked

@@ -12,7 +12,13 @@
     │   ├── UnknownPresetError no such set of options
     │   ├── UnknownWebhookError no such webhook or delivery
     │   ├── WebhookAddressError a webhook may not go there
-    │   └── JobStateError     the job's state does not allow what was asked
+    │   ├── JobStateError     the job's state does not allow what was asked
+    │   ├── UnknownTokenError no such token
+    │   └── BodyTooLargeError a request's body is over the limit
+    ├── AccessError           the caller may not do this
+    │   ├── UnauthenticatedError no token, or one that is unknown, expired or revoked
+    │   ├── ScopeError        the token lacks the scope that the route needs
+    │   └── RateError         too many requests in a short time
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
     │   ├── CorruptStoreError a shard is missing, truncated or altered
@@ -124,6 +130,43 @@ class JobStateError(InputError):
     """The job's state, or an earlier submission, does not allow what was asked."""
 
     code = "job-state"
+
+
+class UnknownTokenError(InputError):
+    """There is no such token."""
+
+    code = "token-unknown"
+
+
+class BodyTooLargeError(InputError):
+    """A request's body is longer than the server reads."""
+
+    code = "body-too-large"
+
+
+class AccessError(DentineError):
+    """The caller may not do what was asked."""
+
+    code = "access-denied"
+    exit_status = 8
+
+
+class UnauthenticatedError(AccessError):
+    """The caller gave no token, or one that is unknown, expired or revoked."""
+
+    code = "unauthenticated"
+
+
+class ScopeError(AccessError):
+    """The caller's token lacks the scope that the route needs."""
+
+    code = "scope-missing"
+
+
+class RateError(AccessError):
+    """The caller asked too often in a short time."""
+
+    code = "rate-limited"
 
 
 class StoreError(DentineError):

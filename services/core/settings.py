@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, SecretStr, ValidationError
 
@@ -15,6 +16,14 @@ from services.core.records import JobSpec
 
 DATABASE_FILE = "dentine.sqlite"
 """Name of the database in the data folder."""
+
+
+class RateSettings(Record):
+    """How often one token, or one address without a token, may ask."""
+
+    reads_per_10_s: int = Field(default=10_000, gt=0, description="requests that change nothing; an event stream counts once")
+    writes_per_10_s: int = Field(default=2_000, gt=0, description="requests that change something")
+    refusals_per_minute: int = Field(default=60, gt=0, description="requests of one address without a valid token that are answered and audited one by one")
 
 
 class ServerSettings(Record):
@@ -27,17 +36,38 @@ class ServerSettings(Record):
     scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
     keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
     private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
+    access: Literal["tokens", "open"] = Field(default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only")
+    names: str = Field(default="", description="further host names that clients use for this server, separated by commas")
+    trusted_proxies: str = Field(default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas")
+    session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
+    body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
+    rates: RateSettings = RateSettings()
 
     @property
     def database_url(self) -> str:
         """URL of the database, with its password."""
         return self.database.get_secret_value() if self.database is not None else f"sqlite:///{self.data.resolve() / DATABASE_FILE}"
 
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches the server."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+class ClientSettings(Record):
+    """The command line as a client of a server."""
+
+    token: SecretStr | None = Field(default=None, description="what `dentine token create` printed")
+
 
 class Settings(Record):
     """Everything a deployment may set."""
 
     server: ServerSettings = ServerSettings()
+    client: ClientSettings = ClientSettings()
 
 
 def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> Settings:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from services.api.app import create_app
+from services.api.guard import needs
 from services.api.logs import configure_logs, log_context
 from services.core.settings import ServerSettings
 from tests.support.live_server import serving, toy_server
@@ -78,7 +79,7 @@ def test_a_line_holds_the_route_and_never_path_or_query(tmp_path: Path, lines: A
 
 def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, lines: Any) -> None:
     app = create_app(ServerSettings(data=tmp_path))
-    app.add_api_route("/v1/broken", broken)
+    app.add_api_route("/v1/broken", broken, dependencies=[needs("read")])
     app.router.routes.insert(0, app.router.routes.pop())  # before the page, which takes every path
     with serving(app) as client:
         answer = client.get("/v1/broken", headers={"X-Request-ID": "r-500"})

@@ -56,14 +56,27 @@ export interface JobPage {
   next_before: number | null;
 }
 
-async function ask<T>(path: string, method = "GET"): Promise<T> {
-  const answer = await fetch(`/v1${path}`, { method });
+export interface Session {
+  name: string;
+  scopes: string[];
+  is_open: boolean;
+}
+
+/** The server does not know who asks; a token is needed. */
+export class Unauthenticated extends Error {}
+
+async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}): Promise<T> {
+  const answer = await fetch(`/v1${path}`, { method, headers });
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
-    throw new Error(problem?.detail ?? `The server answered ${answer.status}.`);
+    throw new (answer.status === 401 ? Unauthenticated : Error)(problem?.detail ?? `The server answered ${answer.status}.`);
   }
-  return answer.json() as Promise<T>;
+  return (answer.status === 204 ? undefined : answer.json()) as Promise<T>;
 }
+
+export const getSession = (): Promise<Session> => ask("/session");
+export const signIn = (token: string): Promise<Session> => ask("/session", "POST", { Authorization: `Bearer ${token}` });
+export const signOut = (): Promise<void> => ask("/session", "DELETE");
 
 export const listJobs = (before: number | null): Promise<JobPage> => ask(`/jobs?limit=50${before === null ? "" : `&before=${before}`}`);
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);

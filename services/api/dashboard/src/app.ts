@@ -1,18 +1,23 @@
-/** The page: a list of jobs and the job that the address names. */
+/** The page: a list of jobs and the job that the address names; a form for a token where the server asks for one. */
 
+import { getSession, signOut, Unauthenticated } from "./api";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
 import { JobView } from "./jobView";
+import { SignIn } from "./signIn";
 
 const REFRESH_MS = 3000;
 
 const main = find("main");
+const jobs = find("jobs");
+const account = find("account");
 const connection = find("connection");
-const list = new JobList(find("jobs"));
+const list = new JobList(jobs);
 let view: JobView | null = null;
+let isSignedOut = false;
 
 function showConnection(open: boolean): void {
-  connection.textContent = open ? "" : "Connection lost; trying again.";
+  connection.textContent = open || isSignedOut ? "" : "Connection lost; trying again.";
 }
 
 async function refreshList(): Promise<void> {
@@ -20,14 +25,15 @@ async function refreshList(): Promise<void> {
     const newest = await list.refresh();
     showConnection(true);
     if (!location.hash && newest) location.replace(`#/${newest}`);
-  } catch {
+  } catch (problem) {
+    if (problem instanceof Unauthenticated) askForToken();
     showConnection(false);
   }
 }
 
 async function open(): Promise<void> {
   const id = location.hash.match(/^#\/(\w+)$/)?.[1];
-  if (!id) return;
+  if (!id || isSignedOut) return;
   view?.stop();
   list.select(id);
   view = new JobView(id, () => void refreshList(), showConnection);
@@ -35,12 +41,48 @@ async function open(): Promise<void> {
   try {
     await view.start();
   } catch (problem) {
-    main.replaceChildren(element("p", { class: "failure", role: "alert" }, problem instanceof Error ? problem.message : String(problem)));
+    if (problem instanceof Unauthenticated) askForToken();
+    else main.replaceChildren(element("p", { class: "failure", role: "alert" }, problem instanceof Error ? problem.message : String(problem)));
   }
 }
 
+function askForToken(): void {
+  if (isSignedOut) return;
+  isSignedOut = true;
+  view?.stop();
+  view = null;
+  jobs.hidden = true;
+  account.replaceChildren();
+  const form = new SignIn(() => void start());
+  main.replaceChildren(form.root);
+  form.root.querySelector("input")?.focus();
+}
+
+async function showAccount(): Promise<void> {
+  const session = await getSession();
+  if (session.is_open) return;
+  const button = element("button", { type: "button" }, "Sign out");
+  button.addEventListener("click", () => void signOut().finally(() => location.reload()));
+  account.replaceChildren(`${session.name} `, button);
+}
+
+async function start(): Promise<void> {
+  isSignedOut = false;
+  jobs.hidden = false;
+  main.replaceChildren();
+  await refreshList();
+  if (isSignedOut) return;
+  void showAccount();
+  await open();
+}
+
 window.addEventListener("hashchange", () => void open());
+window.addEventListener("unhandledrejection", (event) => {
+  if (!(event.reason instanceof Unauthenticated)) return;
+  event.preventDefault();
+  askForToken();
+});
 setInterval(() => {
-  if (!document.hidden) void refreshList();
+  if (!document.hidden && !isSignedOut) void refreshList();
 }, REFRESH_MS);
-void refreshList().then(open);
+void start();

@@ -1,6 +1,6 @@
 /** One job, live: fed by its event stream, completed from its artifacts when it ends. */
 
-import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob } from "./api";
+import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, when } from "./format";
@@ -14,6 +14,7 @@ export class JobView {
   readonly root = element("article", { class: "job" });
   private readonly state = element("span", { class: "badge", role: "status" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
+  private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly action = element("button", { type: "button" });
   private readonly report = element("a", { class: "report", target: "_blank", rel: "noopener" }, "Open the report");
   private readonly stages = new StageList();
@@ -31,6 +32,7 @@ export class JobView {
   ) {
     this.comparison = new Comparison(id);
     this.failure.hidden = true;
+    this.refusal.hidden = true;
     this.report.hidden = true;
     this.report.href = artifactUrl(id, "report.html");
     this.action.addEventListener("click", () => void this.act());
@@ -45,6 +47,7 @@ export class JobView {
       element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action, this.report),
       element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
       this.failure,
+      this.refusal,
       section("Stages", this.stages.root),
       section("Fit", this.chart.root),
       section("Render and photograph", this.comparison.root),
@@ -104,7 +107,15 @@ export class JobView {
 
   private async act(): Promise<void> {
     const retry = FINAL.includes(this.current);
-    this.showState(await (retry ? retryJob : cancelJob)(this.id));
+    this.refusal.hidden = true;
+    try {
+      this.showState(await (retry ? retryJob : cancelJob)(this.id));
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.refusal.hidden = false;
+      this.refusal.textContent = problem instanceof Error ? problem.message : String(problem);
+      return;
+    }
     if (retry) this.follow();
     this.onChange();
   }

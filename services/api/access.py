@@ -1,0 +1,74 @@
+"""Finds out whom a request comes from, and puts all that guards the API in front of it."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from services.api.audit import AuditLog
+from services.api.sessions import COOKIE, Sessions, read_key
+from services.api.tokens import LOCAL, Caller, Tokens
+from services.core.errors import SettingsError, UnauthenticatedError
+from services.core.settings import ServerSettings
+
+if TYPE_CHECKING:
+    import sqlalchemy as sql
+    from fastapi import FastAPI
+    from starlette.requests import HTTPConnection
+
+
+class Access:
+    """The callers of one server; ``sessions`` is None where access is open."""
+
+    def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
+        self.tokens, self.sessions = tokens, sessions
+
+    async def identify(self, request: HTTPConnection) -> Caller:
+        """The caller, by the Authorization header or else by the session cookie.
+
+        Raises:
+            UnauthenticatedError: neither is there, or what is there is not valid.
+        """
+        if self.sessions is None:
+            return LOCAL
+        if (authorization := request.headers.get("authorization")) is not None:
+            scheme, _, presented = authorization.partition(" ")
+            if scheme.lower() != "bearer":
+                raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
+            return Caller.of(await asyncio.to_thread(self.tokens.authenticate, presented.strip()))
+        if (cookie := request.cookies.get(COOKIE)) is not None:
+            token_id = self.sessions.token_id(cookie)
+            return Caller.of(await asyncio.to_thread(self.tokens.living, token_id), by_session=True)
+        raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
+
+    @staticmethod
+    def credential(request: HTTPConnection) -> str | None:
+        """What the caller has presented, whether valid or not."""
+        authorization = request.headers.get("authorization")
+        return request.cookies.get(COOKIE) if authorization is None else authorization.partition(" ")[2].strip()
+
+
+def refuse_open_network(settings: ServerSettings) -> None:
+    """Keep a server without tokens off the network.
+
+    Raises:
+        SettingsError: access is open and the address is not loopback.
+    """
+    if settings.access == "open" and not settings.is_loopback:
+        raise SettingsError(
+            f"Host {settings.host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens, or listen on 127.0.0.1."
+        )
+
+
+def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine) -> None:
+    """Add the routes of tokens, sessions and audit, and the gate in front of all routes."""
+    from services.api.access_routes import build_access_router
+    from services.api.body_limit import BodyLimit
+    from services.api.gate import Gate
+    from services.api.rates import Rates
+
+    sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
+    access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
+    app.include_router(build_access_router(access, audit, secure=not settings.is_loopback))
+    app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
+    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit)

@@ -1,0 +1,94 @@
+"""Routes of tokens, browser sessions and the audit log. Annotations are evaluated here, because FastAPI reads them."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field
+
+from services.api.access import Access
+from services.api.audit import AuditEntry, AuditLog
+from services.api.guard import needs
+from services.api.problems import MEDIA_TYPE, Problem
+from services.api.sessions import COOKIE
+from services.api.tokens import Caller, IssuedToken, Scope, Token
+from services.core.errors import UnauthenticatedError
+from services.core.geometry import Record
+
+
+class TokenRequest(Record):
+    """A token to make."""
+
+    name: str = Field(description="who or what uses it")
+    scopes: tuple[Scope, ...] = Field(description="what it may do")
+    expires_days: float | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
+
+
+class Session(Record):
+    """Whom the server takes the caller for."""
+
+    name: str
+    scopes: tuple[Scope, ...] = Field(description="included ones too")
+    is_open: bool = Field(description="whether this server asks nobody for a token")
+
+
+class AuditPage(Record):
+    """Some rows of the audit log, newest first."""
+
+    entries: list[AuditEntry]
+    next_before: int | None = Field(description="give as 'before' to get the next page; null on the last")
+
+
+def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> APIRouter:
+    """Routes over the given callers; ``secure`` cookies travel over TLS only."""
+    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (401, 403, 404, 422, 429)}
+    router = APIRouter(prefix="/v1", responses=failures)
+
+    @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
+    def create(wanted: TokenRequest, request: Request, response: Response) -> IssuedToken:
+        """Make a token. Its secret is in this answer and nowhere else."""
+        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["deed"])
+        response.headers["Location"] = f"/v1/tokens/{issued.id}"
+        return issued
+
+    @router.get("/tokens", tags=["access"], dependencies=[needs("admin")])
+    def tokens() -> list[Token]:
+        """List all tokens without their secrets, newest first."""
+        return access.tokens.list()
+
+    @router.delete("/tokens/{token_id}", tags=["access"], dependencies=[needs("admin")])
+    def revoke(token_id: str, request: Request) -> Token:
+        """End a token now, with the sessions and streams that it has opened."""
+        return access.tokens.revoke(token_id, request.scope["deed"])
+
+    @router.get("/session", tags=["access"], dependencies=[needs("read")])
+    def whoami(request: Request) -> Session:
+        """Whom the server takes the caller for."""
+        return _session(request.scope["caller"], access)
+
+    @router.post("/session", tags=["access"], dependencies=[needs("read")])
+    def sign_in(request: Request, response: Response) -> Session:
+        """Open a browser session for the token in the Authorization header; the answer sets a cookie that scripts cannot read."""
+        caller: Caller = request.scope["caller"]
+        if access.sessions is not None:
+            if caller.token is None or caller.by_session:
+                raise UnauthenticatedError("A session does not open another one; send the token itself as 'Authorization: Bearer …'.")
+            value, lifetime_s = access.sessions.issue(caller.token)
+            response.set_cookie(COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure)
+        return _session(caller, access)
+
+    @router.delete("/session", status_code=204, tags=["access"], dependencies=[needs("read")])
+    def sign_out(response: Response) -> None:
+        """Take the cookie from the browser."""
+        response.delete_cookie(COOKIE, path="/v1", httponly=True, samesite="strict", secure=secure)
+
+    @router.get("/audit", tags=["access"], dependencies=[needs("admin")])
+    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, lt=2**63)] = None, who: str | None = None) -> AuditPage:
+        """Who did what, newest first."""
+        found = audit.page(limit + 1, before, who)
+        return AuditPage(entries=found[:limit], next_before=found[limit - 1].id if len(found) > limit else None)
+
+    return router
+
+
+def _session(caller: Caller, access: Access) -> Session:
+    return Session(name=caller.name, scopes=tuple(sorted(caller.scopes)), is_open=access.sessions is None)

@@ -1,0 +1,166 @@
+"""Who may pass to the routes, decided before a byte of the body is read. What passes, and what is refused, is audited here."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from functools import cached_property
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+from services.api.access import Access
+from services.api.audit import AuditLog, Deed
+from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
+from services.api.problems import MEDIA_TYPE, Problem, response_of
+from services.api.rates import Rates, network_of
+from services.api.shield import SAFE_METHODS
+from services.api.tokens import public_id
+from services.core.errors import PlatformError, RateError, ScopeError, UnauthenticatedError
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.requests import HTTPConnection
+    from starlette.responses import Response
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+RECHECK_S = 5.0
+"""A stream of a token that was revoked ends at its first message after this time."""
+
+
+class Gate:
+    """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
+
+    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog) -> None:
+        self._app, self._owner, self._access, self._rates, self._audit = app, owner, access, rates, audit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        from starlette.requests import HTTPConnection
+
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        found = find_route(self._routes, scope["method"], scope["path"]) if scope["type"] == "http" else None
+        if found is None or _is_public(scope, found):
+            await self._app(scope, receive, send)
+            return
+        request = HTTPConnection(scope)
+        deed = Deed(f"{scope['method']} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
+        refusal = await self._refusal(request, found, deed)
+        if refusal is not None:
+            await refusal(scope, receive, send)
+            return
+        await self._pass(request, found.route, deed, receive, send)
+
+    @cached_property
+    def _routes(self) -> Sequence[GuardedRoute]:
+        return guarded_routes(self._owner.routes)
+
+    async def _refusal(self, request: HTTPConnection, found: Found, deed: Deed) -> Response | None:
+        """The answer to a request that may not pass."""
+        path, is_change = request.scope["path"], request.scope["method"] not in SAFE_METHODS
+        try:
+            caller = await self._access.identify(request)
+        except UnauthenticatedError as problem:
+            return await self._refuse_unknown(request, problem, deed)
+        deed.who, deed.token = caller.name, caller.token.id if caller.token else None
+        if wait_s := self._rates.count(deed.token or network_of(deed.address), is_change=is_change):
+            return _too_many(f"Token {caller.name} asked" if caller.token else f"Address {deed.address} asked", wait_s, path)
+        if found.route is None:
+            return _nothing_there(found, path, request.scope["method"])
+        try:
+            found.route.admit(caller)
+        except ScopeError as problem:
+            await asyncio.to_thread(self._audit.append, deed, HTTPStatus.FORBIDDEN)
+            lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
+            return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
+        request.scope["caller"], request.scope["deed"] = caller, deed
+        return None
+
+    async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, deed: Deed) -> Response:
+        """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
+        credential = Access.credential(request)
+        deed.token = public_id(credential) if credential else None
+        if wait_s := self._rates.count_refusal(network_of(deed.address)):
+            if self._rates.is_worth_telling(network_of(deed.address)):
+                await asyncio.to_thread(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+            return _too_many(f"Address {deed.address} was refused", wait_s, request.scope["path"])
+        await asyncio.to_thread(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
+        challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
+        return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
+
+    async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
+        import anyio
+        from sqlalchemy.exc import SQLAlchemyError
+
+        scope = request.scope
+        is_audited = scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
+        known_at, is_over = time.monotonic(), False
+
+        async def send_audited(message: Message) -> None:
+            nonlocal known_at, is_over
+            if is_over:
+                return
+            if message["type"] == "http.response.start" and is_audited:
+                deed.ids |= _made(message)
+                try:
+                    await asyncio.to_thread(self._audit.append, deed, message["status"])
+                except SQLAlchemyError:
+                    is_over = True
+                    full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
+                    await response_of(full, scope["path"])(scope, receive, send)
+                    return
+            if message["type"] == "http.response.body" and message.get("more_body") and time.monotonic() - known_at > RECHECK_S:
+                known_at, is_over = time.monotonic(), not await self._is_still_known(request)
+                if is_over:
+                    await send({"type": "http.response.body", "body": b""})
+                    work.cancel()
+                    return
+            await send(message)
+
+        with anyio.CancelScope() as work:
+            try:
+                await self._app(scope, receive, send_audited)
+            except Exception:
+                if is_audited:
+                    await asyncio.to_thread(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                raise
+
+    async def _is_still_known(self, request: HTTPConnection) -> bool:
+        try:
+            await self._access.identify(request)
+        except UnauthenticatedError:
+            return False
+        return True
+
+
+def _is_public(scope: Scope, found: Found) -> bool:
+    """The liveness route, and whatever only the page's static files can answer."""
+    if found.route is not None:
+        return found.route.template == LIVENESS
+    return not scope["path"].startswith("/v1/") and not found.allowed_methods
+
+
+def _address(scope: Scope) -> str:
+    return scope["client"][0] if scope.get("client") else "unknown"
+
+
+def _made(message: Message) -> dict[str, str]:
+    location = next((value for name, value in message["headers"] if name.lower() == b"location"), None)
+    return {} if location is None else {"made": location.decode("latin-1")}
+
+
+def _too_many(who: str, wait_s: int, path: str) -> Response:
+    return response_of(RateError(f"{who} too often; wait {wait_s} s."), path, {"Retry-After": str(wait_s)})
+
+
+def _nothing_there(found: Found, path: str, method: str) -> Response:
+    from starlette.responses import Response
+
+    if found.allowed_methods:
+        allowed = ", ".join(sorted(found.allowed_methods))
+        problem = Problem.of(HTTPStatus.METHOD_NOT_ALLOWED, "method-not-allowed", f"{path} does not take {method}; it takes {allowed}.", path)
+        return Response(problem.model_dump_json(), problem.status, {"Allow": allowed}, MEDIA_TYPE)
+    problem = Problem.of(HTTPStatus.NOT_FOUND, "not-found", f"There is nothing at {path}; GET /v1/openapi.json lists what there is.", path)
+    return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)

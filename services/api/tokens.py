@@ -1,0 +1,208 @@
+"""Tokens: who may call, and what for. The database holds their hashes; the token itself is shown once.
+
+::
+
+    dentine_<id>_<secret>     id: public, 48 bits, finds the row; secret: 256 random bits
+
+A secret of 256 random bits needs no slow hash: SHA-256 of it cannot be searched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import sqlalchemy as sql
+from pydantic import Field, SecretStr, field_serializer
+
+from services.api.audit import Deed
+from services.api.database import metadata, writing
+from services.core.errors import InputError, UnauthenticatedError, UnknownTokenError
+from services.core.geometry import Record
+
+LAST_USE_STEP_S = 3600.0
+"""The last use is noted once in this time, so that reading stays reading."""
+DAY_S = 86400.0
+
+token_table = sql.Table(
+    "token",
+    metadata,
+    sql.Column("id", sql.Text, primary_key=True),
+    sql.Column("name", sql.Text, nullable=False),
+    sql.Column("scopes", sql.Text, nullable=False),
+    sql.Column("sha256", sql.Text, nullable=False),
+    sql.Column("created_s", sql.Float, nullable=False),
+    sql.Column("expires_s", sql.Float),
+    sql.Column("revoked_s", sql.Float),
+    sql.Column("last_used_s", sql.Float),
+)
+
+
+class Scope(StrEnum):
+    """What a token may do. ``admin`` includes all, ``submit`` includes ``read``."""
+
+    READ = "read"
+    SUBMIT = "submit"
+    OPERATE_DOME = "operate-dome"
+    ADMIN = "admin"
+
+    @property
+    def included(self) -> frozenset[Scope]:
+        """This scope and those that come with it."""
+        return {Scope.ADMIN: frozenset(Scope), Scope.SUBMIT: frozenset({Scope.SUBMIT, Scope.READ})}.get(self, frozenset({self}))
+
+
+class Token(Record):
+    """A token as it may be shown at any time."""
+
+    id: str = Field(description="public part of the token")
+    name: str = Field(description="who or what uses it")
+    scopes: tuple[Scope, ...]
+    created_s: float = Field(description="Unix time")
+    expires_s: float | None = Field(description="Unix time; null: never")
+    revoked_s: float | None = Field(description="Unix time; null: not revoked")
+    last_used_s: float | None = Field(description="Unix time, noted at most once an hour; null: never")
+
+
+class IssuedToken(Token):
+    """A token on the one occasion when its secret is shown."""
+
+    token: SecretStr = Field(description="send it as 'Authorization: Bearer …'; it is not shown again")
+
+    @field_serializer("token", when_used="json")
+    def _reveal(self, token: SecretStr) -> str:
+        return token.get_secret_value()
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whom a request comes from."""
+
+    name: str
+    scopes: frozenset[Scope]
+    token: Token | None = None
+    by_session: bool = False
+
+    @classmethod
+    def of(cls, token: Token, *, by_session: bool = False) -> Caller:
+        """The caller that a valid token stands for."""
+        return cls(token.name, frozenset().union(*(scope.included for scope in token.scopes)), token, by_session)
+
+
+LOCAL = Caller("local", frozenset(Scope))
+"""Whoever is on this machine where access is open."""
+
+
+class Tokens:
+    """The token table."""
+
+    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time) -> None:
+        self._engine, self._clock = engine, clock
+
+    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed) -> IssuedToken:
+        """Make a token; the result is the only place where its secret is.
+
+        Raises:
+            InputError: the name is malformed or belongs to a living token, or there is no scope.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.-]{0,63}", name) or name == LOCAL.name:
+            raise InputError(f"Token name {name!r} does not serve; use up to 64 letters, digits, points and hyphens, and not '{LOCAL.name}'.")
+        if not (wanted := sorted(set(scopes))):
+            raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
+        token_id, now = secrets.token_hex(6), self._clock()
+        secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
+        row = {"id": token_id, "name": name, "scopes": " ".join(wanted), "sha256": _hash(secret.get_secret_value()), "created_s": now}
+        row |= {"expires_s": None if expires_days is None else now + expires_days * DAY_S, "revoked_s": None, "last_used_s": None}
+        with writing(self._engine) as connection:
+            namesake = sql.select(token_table).where(token_table.c.name == name, token_table.c.revoked_s.is_(None))
+            if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
+                raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
+            connection.execute(token_table.insert().values(row))
+            deed.ids["token_id"] = token_id
+            deed.write(connection, 201)
+        return IssuedToken(**_fields(row), token=secret)
+
+    def list(self) -> list[Token]:
+        """Every token, newest first, revoked and expired ones too."""
+        with self._engine.connect() as connection:
+            return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
+
+    def revoke(self, token_id: str, deed: Deed) -> Token:
+        """End a token now, by its id or by the name of a living one; ending it again changes nothing.
+
+        Raises:
+            UnknownTokenError: there is none.
+        """
+        now = self._clock()
+        with writing(self._engine) as connection:
+            is_meant = sql.or_(token_table.c.id == token_id, sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)))
+            found = connection.execute(sql.select(token_table).where(is_meant).order_by(token_table.c.created_s.desc())).mappings().first()
+            if found is None:
+                raise UnknownTokenError(f"There is no token {token_id}; list the tokens to see their ids.")
+            row = dict(found)
+            if row["revoked_s"] is None:
+                row["revoked_s"] = now
+                connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(revoked_s=now))
+            deed.ids["token_id"] = row["id"]
+            deed.write(connection, 200)
+        return Token(**_fields(row))
+
+    def authenticate(self, presented: str) -> Token:
+        """The token that was presented.
+
+        Raises:
+            UnauthenticatedError: it is malformed, unknown, expired or revoked; the message does not tell which.
+        """
+        row = self._find(public_id(presented) or "")
+        is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
+        if row is None or not is_same or not _is_living(row, self._clock()):
+            raise UnauthenticatedError("This token is unknown, expired or revoked; ask an administrator for a new one.")
+        self._note_use(row)
+        return Token(**_fields(row))
+
+    def living(self, token_id: str) -> Token:
+        """The token with this id, for a session that it has opened.
+
+        Raises:
+            UnauthenticatedError: it has expired or was revoked since.
+        """
+        row = self._find(token_id)
+        if row is None or not _is_living(row, self._clock()):
+            raise UnauthenticatedError("The token of this session has expired or was revoked; sign in with another one.")
+        return Token(**_fields(row))
+
+    def _find(self, token_id: str) -> Any:
+        with self._engine.connect() as connection:
+            return connection.execute(sql.select(token_table).where(token_table.c.id == token_id)).mappings().first()
+
+    def _note_use(self, row: Any) -> None:
+        now = self._clock()
+        if row["last_used_s"] is None or now - row["last_used_s"] >= LAST_USE_STEP_S:
+            with suppress(sql.exc.OperationalError), writing(self._engine) as connection:  # a full disk must not refuse a reader
+                connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
+
+
+def public_id(credential: str) -> str | None:
+    """The public part of a token or session, whether valid or not."""
+    match = re.match(r"dentine_([0-9a-f]{12})_", credential)
+    return match[1] if match else None
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def _is_living(row: Any, now: float) -> bool:
+    return row["revoked_s"] is None and (row["expires_s"] is None or now < row["expires_s"])
+
+
+def _fields(row: Any) -> dict[str, Any]:
+    return {name: row[name] for name in Token.model_fields} | {"scopes": tuple(Scope(name) for name in row["scopes"].split())}

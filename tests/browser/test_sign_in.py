@@ -1,0 +1,101 @@
+"""The dashboard on a server that asks for tokens."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from services.api.app import STATIC
+from services.api.sessions import COOKIE
+from services.api.tokens import Scope
+from services.core.errors import CaptureInputError
+from services.core.records import JobSpec
+from tests.browser.contrast import contrast_failures
+from tests.support.guarded_server import Guarded, guarded
+
+pytestmark = pytest.mark.browser
+
+FAILING_SEED = 2
+
+
+def run(spec: JobSpec, *_: object) -> None:
+    """A job that succeeds at once, or fails at once by its seed."""
+    if spec.seed == FAILING_SEED:
+        raise CaptureInputError("Frame c0_l3.npy is missing; copy it there.")
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Guarded]:
+    if not (STATIC / "app.js").exists():
+        pytest.skip("the dashboard is not built; run make dashboard")
+    with guarded(tmp_path, run) as server:
+        server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"})
+        yield server
+
+
+@pytest.fixture
+def page(chromium: Browser, server: Guarded, request: pytest.FixtureRequest) -> Iterator[Page]:
+    scheme = getattr(request, "param", "light")
+    context = chromium.new_context(base_url=str(server.client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 700})
+    page = context.new_page()
+    broken: list[str] = []
+    page.on("pageerror", lambda problem: broken.append(str(problem)))
+    page.on("console", lambda message: broken.append(message.text) if "Content Security Policy" in message.text else None)
+    yield page
+    context.close()
+    assert not broken
+
+
+def sign_in(page: Page, token: str) -> None:
+    page.get_by_label("Token").fill(token)
+    page.keyboard.press("Enter")
+
+
+@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
+def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: Page, server: Guarded, request: pytest.FixtureRequest) -> None:
+    page.goto("/")
+    expect(page.get_by_label("Token")).to_be_focused()
+    expect(page.locator("#jobs")).to_be_hidden()
+    sign_in(page, "dentine_0123456789ab_a-guess")
+    expect(page.get_by_role("alert")).to_have_text("This token is unknown, expired or revoked; ask an administrator for a new one.")
+    assert contrast_failures(page) == []
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/sign-in-{request.node.callspec.params['page']}.png")
+
+    sign_in(page, f" {server.tokens[Scope.SUBMIT]} ")
+    expect(page.locator(".job .badge")).to_have_text("succeeded")
+    expect(page.locator("#account")).to_contain_text("of-submit")
+    assert contrast_failures(page) == []
+    if folder:
+        page.screenshot(path=f"{folder}/signed-in-{request.node.callspec.params['page']}.png")
+    assert page.evaluate("[document.cookie, localStorage.length, sessionStorage.length]") == ["", 0, 0]
+    (cookie,) = page.context.cookies()
+    assert (cookie["name"], cookie["httpOnly"], cookie["sameSite"]) == (COOKIE, True, "Strict")
+
+    page.reload()
+    expect(page.locator(".job .badge")).to_have_text("succeeded")
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Token")).to_be_visible()
+    assert page.context.cookies() == []
+
+
+def test_a_reader_is_told_why_a_retry_is_refused(page: Page, server: Guarded) -> None:
+    server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED})
+    page.goto("/")
+    sign_in(page, server.tokens[Scope.READ])
+    page.get_by_role("button", name="Retry").click()
+    expect(page.get_by_role("alert").last).to_have_text("This needs scope 'submit', which token of-read does not have; use a token with that scope.")
+
+
+def test_a_revoked_token_brings_the_form_back(page: Page, server: Guarded) -> None:
+    page.goto("/")
+    sign_in(page, server.tokens[Scope.READ])
+    expect(page.locator(".job .badge")).to_have_text("succeeded")
+    server.ask("DELETE", f"/v1/tokens/{server.tokens[Scope.READ].split('_')[1]}", Scope.ADMIN)
+    expect(page.get_by_label("Token")).to_be_visible()
+    expect(page.locator(".job")).to_have_count(0)
+    expect(page.locator("#jobs")).to_be_hidden()

@@ -1,0 +1,64 @@
+"""A server that asks for tokens, with one token of each scope."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from fastapi import FastAPI
+
+from services.api.app import create_app
+from services.api.audit import Deed
+from services.api.database import open_database
+from services.api.migrations import upgrade
+from services.api.tokens import Scope, Tokens
+from services.core.settings import ServerSettings
+from tests.support.live_server import serving
+
+
+def make_deed() -> Deed:
+    return Deed("test", "command line", "local")
+
+
+def make_token(data: Path, name: str, *scopes: Scope) -> str:
+    """A new token on a data folder, as ``dentine token create`` makes it."""
+    engine = open_database(ServerSettings(data=data).database_url)
+    try:
+        upgrade(engine)
+        return Tokens(engine).create(name, scopes, None, make_deed()).token.get_secret_value()
+    finally:
+        engine.dispose()
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A running server and its tokens by scope."""
+
+    app: FastAPI
+    client: httpx.Client
+    tokens: Mapping[Scope, str]
+    data: Path
+
+    def ask(self, method: str, path: str, scope: Scope | None = None, **options: Any) -> httpx.Response:
+        """A request with the token of a scope, or without one; no cookie is kept from it."""
+        headers = options.pop("headers", {}) | ({"Authorization": f"Bearer {self.tokens[scope]}"} if scope else {})
+        answer = self.client.request(method, path, headers=headers, **options)
+        self.client.cookies.clear()
+        return answer
+
+
+def run_nothing(*_: object) -> None:
+    """A job that succeeds at once."""
+
+
+@contextmanager
+def guarded(data: Path, run: Any = run_nothing, **settings: Any) -> Iterator[Guarded]:
+    """Serve a data folder with tokens for the time of the block."""
+    tokens = {scope: make_token(data, f"of-{scope}", scope) for scope in Scope}
+    app = create_app(ServerSettings(data=data, access="tokens", **settings), run)
+    with serving(app) as client:
+        yield Guarded(app, client, tokens, data)

@@ -1,0 +1,242 @@
+"""Tokens: what is stored, who is let in, and when that ends."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sql
+
+from services.api import sessions, tokens
+from services.api.audit import AuditLog
+from services.api.database import open_database, sqlite_url
+from services.api.migrations import upgrade
+from services.api.sessions import Sessions, read_key
+from services.api.tokens import DAY_S, LAST_USE_STEP_S, Caller, Scope, Tokens, token_table
+from services.core.errors import InputError, UnauthenticatedError, UnknownTokenError
+from services.core.redaction import redacted
+from tests.support.guarded_server import make_deed
+
+NOON_S = 1_800_000_000.0
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = NOON_S
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[sql.Engine]:
+    engine = open_database(sqlite_url(tmp_path / "x.sqlite"))
+    upgrade(engine)
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def table(engine: sql.Engine, clock: Clock) -> Tokens:
+    return Tokens(engine, clock)
+
+
+def issue(table: Tokens, name: str = "rig-1", scopes: tuple[Scope, ...] = (Scope.READ,), days: float | None = None) -> str:
+    return table.create(name, scopes, days, make_deed()).token.get_secret_value()
+
+
+def test_only_the_hash_is_stored_and_the_secret_has_256_bits(table: Tokens, engine: sql.Engine, tmp_path: Path) -> None:
+    token = issue(table)
+    with engine.connect() as connection:
+        row = connection.execute(sql.select(token_table)).mappings().one()
+    assert row["sha256"] == hashlib.sha256(token.encode()).hexdigest()
+    assert token.startswith(f"dentine_{row['id']}_")
+    secret = token.split("_", 2)[2]
+    assert len(secret) == 43
+    assert secret.encode() not in b"".join(path.read_bytes() for path in tmp_path.iterdir())
+
+
+def test_a_thousand_tokens_differ(table: Tokens) -> None:
+    made = {issue(table, f"t-{number}") for number in range(1000)}
+    assert len({token.split("_", 2)[2] for token in made}) == len(made) == 1000
+
+
+def test_a_token_is_known_by_all_of_it(table: Tokens) -> None:
+    token = issue(table)
+    assert table.authenticate(token).name == "rig-1"
+    other = issue(table, "rig-2")
+    mixed = f"dentine_{token.split('_')[1]}_{other.split('_', 2)[2]}"
+    for wrong in (mixed, token[:-1], token + "A", token.upper(), "", "dentine_", "dentine_000000000000_x", "\udcff\x00é"):
+        with pytest.raises(UnauthenticatedError, match="unknown, expired or revoked; ask an administrator"):
+            table.authenticate(wrong)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_decision_is_compare_digest_of_two_hashes(table: Tokens, monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+    token = issue(table) if known else "dentine_0123456789ab_guess"
+    compared: list[tuple[str, str]] = []
+
+    def refuse(given: str, stored: str) -> bool:
+        compared.append((given, stored))
+        return False
+
+    monkeypatch.setattr(hmac, "compare_digest", refuse)
+    assert tokens.hmac is hmac
+    with pytest.raises(UnauthenticatedError):
+        table.authenticate(token)
+    ((given, stored),) = compared
+    assert given == hashlib.sha256(token.encode()).hexdigest()
+    assert len(stored) == len(given) == 64
+    assert (given == stored) is known
+
+
+@pytest.mark.parametrize(
+    ("held", "allowed"),
+    [
+        ({Scope.READ}, {Scope.READ}),
+        ({Scope.SUBMIT}, {Scope.READ, Scope.SUBMIT}),
+        ({Scope.OPERATE_DOME}, {Scope.OPERATE_DOME}),
+        ({Scope.SUBMIT, Scope.OPERATE_DOME}, {Scope.READ, Scope.SUBMIT, Scope.OPERATE_DOME}),
+        ({Scope.ADMIN}, set(Scope)),
+    ],
+)
+def test_scopes_include_each_other(table: Tokens, held: set[Scope], allowed: set[Scope]) -> None:
+    assert Caller.of(table.authenticate(issue(table, scopes=tuple(held)))).scopes == allowed
+
+
+def test_a_token_ends_when_it_expires(table: Tokens, clock: Clock) -> None:
+    token = issue(table, days=2)
+    clock.now_s = NOON_S + 2 * DAY_S - 1
+    assert table.authenticate(token)
+    clock.now_s = NOON_S + 2 * DAY_S
+    with pytest.raises(UnauthenticatedError):
+        table.authenticate(token)
+
+
+def test_a_revoked_token_ends_at_once_and_stays_listed(table: Tokens) -> None:
+    token = issue(table)
+    ended = table.revoke("rig-1", make_deed())
+    with pytest.raises(UnauthenticatedError):
+        table.authenticate(token)
+    assert table.revoke(ended.id, make_deed()) == ended
+    assert [one.revoked_s for one in table.list()] == [NOON_S]
+    with pytest.raises(UnknownTokenError, match="There is no token rig-1"):
+        table.revoke("rig-1", make_deed())
+
+
+def test_a_name_has_one_living_token(table: Tokens, clock: Clock) -> None:
+    issue(table, days=1)
+    with pytest.raises(InputError, match="'rig-1' is in use"):
+        issue(table)
+    clock.now_s += DAY_S
+    issue(table)
+    table.revoke("rig-1", make_deed())
+    assert issue(table)
+
+
+@pytest.mark.parametrize("name", ["", "local", "a b", "-x", "x" * 65, "dentine_0123456789ab_secret", "é"])
+def test_malformed_names_are_refused(table: Tokens, name: str) -> None:
+    with pytest.raises(InputError, match="Token name"):
+        issue(table, name)
+
+
+def test_a_token_needs_a_scope(table: Tokens) -> None:
+    with pytest.raises(InputError, match="has no scope; give at least one of read, submit"):
+        issue(table, scopes=())
+
+
+def test_the_last_use_is_noted_once_an_hour(table: Tokens, engine: sql.Engine, clock: Clock) -> None:
+    token = issue(table)
+    assert table.list()[0].last_used_s is None
+    writes: list[str] = []
+    sql.event.listen(engine, "before_cursor_execute", lambda *arguments: writes.append(arguments[2]) if arguments[2].startswith("UPDATE") else None)
+    for step in range(11):
+        clock.now_s = NOON_S + step * LAST_USE_STEP_S / 10
+        table.authenticate(token)
+    assert len(writes) == 2
+    assert table.list()[0].last_used_s == NOON_S + LAST_USE_STEP_S
+
+
+def test_making_and_revoking_are_audited_with_the_change_itself(table: Tokens, engine: sql.Engine) -> None:
+    issue(table)
+    table.revoke("rig-1", make_deed())
+    rows = AuditLog(engine).page(10)
+    ids = {"token_id": table.list()[0].id}
+    assert [(row.who, row.outcome, row.ids) for row in rows] == [("local", 200, ids), ("local", 201, ids)]
+    with pytest.raises(InputError):
+        issue(table, "a b")
+    assert len(AuditLog(engine).page(10)) == 2
+
+
+def test_nothing_that_is_printed_shows_a_secret(table: Tokens) -> None:
+    issued = table.create("rig-1", [Scope.READ], None, make_deed())
+    secret = issued.token.get_secret_value().split("_", 2)[2]
+    assert secret in issued.model_dump_json()
+    for text in (repr(issued), str(issued), f"{issued}", str(issued.model_dump()), str(table.list()), redacted(f"no {issued.token.get_secret_value()} here")):
+        assert secret not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a dentine_0123456789ab_x-Y_z012345 b", "a dentine_0123456789ab_… b"),
+        ("dentine_0123456789ab_1800000000.abcdef0123", "dentine_0123456789ab_…"),
+        ("whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw=", "whsec_…"),
+        ("/v1/jobs/dentine", "/v1/jobs/dentine"),
+    ],
+)
+def test_redaction_keeps_what_is_public(text: str, shown: str) -> None:
+    assert redacted(text) == shown
+
+
+def test_a_session_stands_for_its_token_until_it_is_over(table: Tokens, clock: Clock) -> None:
+    issuer = Sessions(b"k" * 32, 60.0, clock)
+    token = table.authenticate(issue(table))
+    cookie, lifetime_s = issuer.issue(token)
+    assert (issuer.token_id(cookie), lifetime_s) == (token.id, 60)
+    clock.now_s += 60
+    with pytest.raises(UnauthenticatedError, match="This session is over"):
+        issuer.token_id(cookie)
+
+
+def test_a_session_never_outlives_its_token(table: Tokens, clock: Clock) -> None:
+    token = table.authenticate(issue(table, days=1))
+    clock.now_s = NOON_S + DAY_S - 10
+    assert Sessions(b"k" * 32, 60.0, clock).issue(token)[1] == 10
+
+
+def test_a_changed_session_is_refused(table: Tokens, clock: Clock) -> None:
+    issuer = Sessions(b"k" * 32, 60.0, clock)
+    cookie, _ = issuer.issue(table.authenticate(issue(table)))
+    claim, _, signature = cookie.rpartition(".")
+    later = f"{claim[:-10]}{int(NOON_S) + 9999}.{signature}"
+    for wrong in (later, cookie[:-1], claim, "", ".", "é", f"{claim}.é", cookie.replace("dentine_", "dentine_0", 1)):
+        with pytest.raises(UnauthenticatedError):
+            issuer.token_id(wrong)
+    with pytest.raises(UnauthenticatedError):
+        Sessions(b"l" * 32, 60.0, clock).token_id(cookie)
+
+
+def test_signatures_are_compared_by_compare_digest(table: Tokens, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    issuer = Sessions(b"k" * 32, 60.0, clock)
+    cookie, _ = issuer.issue(table.authenticate(issue(table)))
+    monkeypatch.setattr(hmac, "compare_digest", lambda *_: False)
+    assert sessions.hmac is hmac
+    with pytest.raises(UnauthenticatedError):
+        issuer.token_id(cookie)
+
+
+def test_the_signing_key_is_kept_and_is_its_owners_alone(tmp_path: Path) -> None:
+    key = read_key(tmp_path)
+    assert len(key) == 32
+    assert read_key(tmp_path) == key
+    (path,) = tmp_path.iterdir()
+    assert path.stat().st_mode & 0o777 == 0o600
