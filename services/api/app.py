@@ -33,11 +33,12 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
     from starlette.staticfiles import StaticFiles
 
     from services.api import problems
+    from services.api.captures_routes import build_captures_router
     from services.api.feed import EventFeed
     from services.api.routes import build_router
     from services.api.shield import Shield
 
-    jobs = Jobs(settings.data, run)
+    jobs = Jobs(settings.data, run, settings.uploads)
     feed = EventFeed(jobs.repository.newest_event)
 
     @asynccontextmanager
@@ -55,6 +56,7 @@ def create_app(settings: ServerSettings, run: RunJob = run_locally) -> FastAPI:
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url="/v1/openapi.json")
     problems.install(app)
     app.include_router(build_router(jobs, feed))
+    app.include_router(build_captures_router(jobs.captures))
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host}))
     app.add_middleware(Shield)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from services.api.captures import Captures, is_uploaded
 from services.api.events import EventAddress, JobEvent
 from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.pipeline import request_cancel, stages_of, withdraw_cancel
@@ -17,6 +18,7 @@ from services.api.repository import Creation, Failure, Job, Repository
 from services.core.errors import DentineError, JobCancelledError, JobStateError, SettingsError
 from services.core.geometry import Record
 from services.core.records import JobSpec
+from services.core.settings import UploadLimits
 from services.core.stage import StageName
 
 RunJob = Callable[[JobSpec, Path, EventAddress], object]
@@ -38,9 +40,10 @@ class StageProgress(Record):
 class Jobs:
     """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run."""
 
-    def __init__(self, data: Path, run: RunJob) -> None:
+    def __init__(self, data: Path, run: RunJob, uploads: UploadLimits | None = None) -> None:
         self._data, self._run = data.resolve(), run
         self.repository = Repository(self._data / DATABASE_FILE)
+        self.captures = Captures(self.repository.engine, self._data, uploads or UploadLimits())
         self._wake = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run_queued, name="jobs")
@@ -69,14 +72,15 @@ class Jobs:
         """Queue a job.
 
         Raises:
-            SettingsError: a path is relative or absent. JobStateError: the key belongs to another job.
+            SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobStateError: the key belongs to another job.
         """
         for option, path in (("capture", spec.capture), ("rig.mouth", spec.rig.mouth if spec.rig else None)):
-            if path is not None and not path.is_absolute():
+            if path is not None and not path.is_absolute() and not (option == "capture" and is_uploaded(path)):
                 raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
-            if path is not None and not path.exists():
+            if path is not None and path.is_absolute() and not path.exists():
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
-        creation = self.repository.create(spec, key)
+        with self.captures.keeping(spec.capture):
+            creation = self.repository.create(spec, key)
         self._wake.set()
         return creation
 
@@ -128,7 +132,7 @@ class Jobs:
         try:
             if self._closing:
                 request_cancel(folder)
-            self._run(job.spec, folder, self.repository.address_of(job.id))
+            self._run(self.captures.locate(job.spec), folder, self.repository.address_of(job.id))
         except JobCancelledError:
             trigger = Trigger.STOPPED if self.repository.get(job.id).state is JobState.CANCELLING else Trigger.LOSE
         except DentineError as problem:

@@ -7,7 +7,21 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import Field
 
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, UnknownJobError
+from services.core.errors import (
+    CaptureStateError,
+    ChecksumError,
+    DentineError,
+    DiskFullError,
+    ExpiredError,
+    InputError,
+    JobStateError,
+    LockedError,
+    OffsetError,
+    PlatformError,
+    TooLargeError,
+    UnknownCaptureError,
+    UnknownJobError,
+)
 from services.core.geometry import Record
 
 if TYPE_CHECKING:
@@ -17,6 +31,8 @@ if TYPE_CHECKING:
     from fastapi import FastAPI, Request, Response
 
 MEDIA_TYPE = "application/problem+json"
+CHECKSUM_MISMATCH = 460
+"""Of the tus protocol, no registered status."""
 
 
 class Problem(Record):
@@ -30,21 +46,32 @@ class Problem(Record):
     code: str = Field(description="stable and machine-readable")
 
     @classmethod
-    def of(cls, status: HTTPStatus, code: str, detail: str, instance: str) -> Self:
-        """The document for a status and one of our codes."""
-        return cls(type=f"urn:dentine:problem:{code}", title=status.phrase, status=status, detail=detail, instance=instance, code=code)
+    def of(cls, status: int, code: str, detail: str, instance: str, **more: object) -> Self:
+        """The document for a status and one of our codes; ``more`` are the members of a subclass."""
+        title = "Checksum Mismatch" if status == CHECKSUM_MISMATCH else HTTPStatus(status).phrase
+        return cls.model_validate(
+            {"type": f"urn:dentine:problem:{code}", "title": title, "status": status, "detail": detail, "instance": instance, "code": code} | more
+        )
 
 
-_STATUS = {
+_STATUS: dict[type[DentineError], int] = {
     UnknownJobError: HTTPStatus.NOT_FOUND,
     JobStateError: HTTPStatus.CONFLICT,
+    UnknownCaptureError: HTTPStatus.NOT_FOUND,
+    CaptureStateError: HTTPStatus.CONFLICT,
+    TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    OffsetError: HTTPStatus.CONFLICT,
+    ChecksumError: CHECKSUM_MISMATCH,
+    LockedError: HTTPStatus.LOCKED,
+    ExpiredError: HTTPStatus.GONE,
     InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    DiskFullError: HTTPStatus.INSUFFICIENT_STORAGE,
     PlatformError: HTTPStatus.SERVICE_UNAVAILABLE,
     DentineError: HTTPStatus.INTERNAL_SERVER_ERROR,
 }
 
 
-def status_of(problem: DentineError) -> HTTPStatus:
+def status_of(problem: DentineError) -> int:
     """The HTTP status that an error means."""
     return next(status for kind, status in _STATUS.items() if isinstance(problem, kind))
 
@@ -55,7 +82,7 @@ def install(app: FastAPI) -> None:
     from fastapi.responses import Response
     from starlette.exceptions import HTTPException
 
-    def answer(request: Request, status: HTTPStatus, code: str, detail: str, headers: Any = None) -> Response:
+    def answer(request: Request, status: int, code: str, detail: str, headers: Any = None) -> Response:
         return Response(Problem.of(status, code, detail, request.url.path).model_dump_json(), status, headers, MEDIA_TYPE)
 
     @app.exception_handler(DentineError)

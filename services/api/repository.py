@@ -74,6 +74,11 @@ class Repository:
         self._path = path
         self._engine = open_database(path)
 
+    @property
+    def engine(self) -> sql.Engine:
+        """For other tables of the same database."""
+        return self._engine
+
     def close(self) -> None:
         """Close every connection."""
         self._engine.dispose()

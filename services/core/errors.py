@@ -8,12 +8,22 @@
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
     │   ├── CaptureInputError a frame or file is missing or malformed
     │   ├── UnknownJobError   no such job or artifact
-    │   └── JobStateError     the job's state does not allow what was asked
+    │   ├── JobStateError     the job's state does not allow what was asked
+    │   ├── UnknownCaptureError no such capture or file of it
+    │   ├── CaptureStateError the capture's state does not allow what was asked
+    │   └── UploadError       a manifest, or bytes sent for it, cannot be accepted
+    │       ├── TooLargeError     over a limit of size or number
+    │       ├── CorruptUploadError what was received is not what the manifest says
+    │       ├── OffsetError       bytes for another place than the next
+    │       ├── ChecksumError     bytes of one request were altered on their way
+    │       ├── LockedError       another request sends the same file
+    │       └── ExpiredError      the capture was not committed in time
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
     │   ├── CorruptStoreError a shard is missing, truncated or altered
     │   └── FencedError       a newer attempt owns this stage
     ├── PlatformError         the machine lacks something: a library, a device
+    │   └── DiskFullError     too little free disk for what was asked
     ├── RigError              the dome or a camera misbehaves; lights are dark when it is raised
     │   ├── InterlockError    e-stop or interlock open
     │   ├── ExposureLimitError photobiological limit, refused before anything is sent
@@ -80,6 +90,60 @@ class JobStateError(InputError):
     code = "job-state"
 
 
+class UnknownCaptureError(InputError):
+    """There is no such capture, or no such file in it."""
+
+    code = "capture-unknown"
+
+
+class CaptureStateError(InputError):
+    """The capture's state, or an earlier request, does not allow what was asked."""
+
+    code = "capture-state"
+
+
+class UploadError(InputError):
+    """A manifest, or bytes sent for it, cannot be accepted."""
+
+    code = "upload-refused"
+
+
+class TooLargeError(UploadError):
+    """A file, a capture or the number of files is over its limit."""
+
+    code = "upload-too-large"
+
+
+class CorruptUploadError(UploadError):
+    """A file's received content is not what the manifest says; it was discarded."""
+
+    code = "upload-corrupt"
+
+
+class OffsetError(UploadError):
+    """Bytes were sent for another place than the next one."""
+
+    code = "upload-offset"
+
+
+class ChecksumError(UploadError):
+    """The bytes of one request do not have their stated checksum; they were discarded."""
+
+    code = "upload-checksum"
+
+
+class LockedError(UploadError):
+    """Another request is sending the same file."""
+
+    code = "upload-locked"
+
+
+class ExpiredError(UploadError):
+    """The capture was not committed in time; what was received is gone."""
+
+    code = "upload-expired"
+
+
 class StoreError(DentineError):
     """Stored data cannot be used."""
 
@@ -110,6 +174,12 @@ class PlatformError(DentineError):
 
     code = "platform-missing"
     exit_status = 4
+
+
+class DiskFullError(PlatformError):
+    """Too little free disk for what was asked."""
+
+    code = "disk-full"
 
 
 class RigError(DentineError):
