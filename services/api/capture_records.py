@@ -11,6 +11,7 @@ from pydantic import Field
 
 from services.core.geometry import Record
 
+SUBJECT = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -34,7 +35,7 @@ class UploadManifest(Record):
     """What a client wants to upload."""
 
     files: tuple[ManifestFile, ...] = Field(min_length=1, description="every file of the capture")
-    subject: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="pseudonymous label of the person; never a name")
+    subject: str | None = Field(default=None, pattern=f"^{SUBJECT}$", description="pseudonymous label of the person; never a name")
 
     def digest(self) -> str:
         """The same for the same files in any order and the same subject."""

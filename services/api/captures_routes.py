@@ -14,6 +14,7 @@ from services.api.captures import Captures
 from services.api.problems import MEDIA_TYPE, Problem
 from services.api.receiving import in_thread
 from services.api.tus_routes import build_tus_router
+from services.core.errors import IncompleteCaptureError
 
 SWEEP_S = 600.0
 
@@ -69,7 +70,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
         """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused. Repeating it changes nothing."""
         if faults := captures.commit(capture):
             detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (f" It is one of {len(faults)} such files." if len(faults) > 1 else "")
-            problem = IncompleteCapture.of(HTTPStatus.CONFLICT, "capture-incomplete", detail, request.url.path, files=faults)
+            problem = IncompleteCapture.of(HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.url.path, files=faults)
             return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)
         return captures.get(capture)
 

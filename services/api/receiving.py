@@ -17,6 +17,7 @@ from typing import ParamSpec, TypeVar
 from starlette.requests import ClientDisconnect
 
 from services.api.blobs import PartialFile
+from services.api.tus import Checksum
 from services.api.uploads import Upload, Uploads
 from services.core.errors import ChecksumError, DentineError, TooLargeError
 
@@ -31,14 +32,6 @@ DRAIN_BYTES = 16 * 2**20
 
 class SilenceError(Exception):
     """The client sent nothing for too long."""
-
-
-@dataclass(frozen=True)
-class Checksum:
-    """What a request says of its own bytes."""
-
-    algorithm: str
-    digest: bytes
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import base64
 import binascii
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from email.utils import formatdate
 from types import MappingProxyType
 
-from services.api.receiving import Checksum
 from services.core.errors import UploadError
 
 VERSION = "1.0.0"
@@ -17,6 +17,14 @@ EXTENSIONS = "creation,termination,expiration,checksum"
 CHUNK_TYPE = "application/offset+octet-stream"
 DIGEST_BYTES: Mapping[str, int] = MappingProxyType({"sha256": 32, "sha1": 20})
 _KEY = re.compile(r"[!-+\--~]+")
+
+
+@dataclass(frozen=True)
+class Checksum:
+    """What a request says of its own bytes."""
+
+    algorithm: str
+    digest: bytes
 
 
 def parse_metadata(header: str) -> dict[str, str]:

@@ -11,6 +11,7 @@
     │   ├── JobStateError     the job's state does not allow what was asked
     │   ├── UnknownCaptureError no such capture or file of it
     │   ├── CaptureStateError the capture's state does not allow what was asked
+    │   │   └── IncompleteCaptureError files are missing, corrupt or refused
     │   └── UploadError       a manifest, or bytes sent for it, cannot be accepted
     │       ├── TooLargeError     over a limit of size or number
     │       ├── CorruptUploadError what was received is not what the manifest says
@@ -100,6 +101,12 @@ class CaptureStateError(InputError):
     """The capture's state, or an earlier request, does not allow what was asked."""
 
     code = "capture-state"
+
+
+class IncompleteCaptureError(CaptureStateError):
+    """A capture cannot be committed: files of it are missing, corrupt or refused."""
+
+    code = "capture-incomplete"
 
 
 class UploadError(InputError):
@@ -226,3 +233,13 @@ class JobCancelledError(DentineError):
 
     code = "cancelled"
     exit_status = 130
+
+
+def error_of(code: str, message: str) -> DentineError | None:
+    """The error of the tree that a code means, None if it means none."""
+    kinds: list[type[DentineError]] = [DentineError]
+    for kind in kinds:
+        if kind.code == code:
+            return kind(message)
+        kinds.extend(kind.__subclasses__())
+    return None
