@@ -55,7 +55,7 @@ def world() -> World:
 @pytest.fixture
 def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     engine = open_database(tmp_path / "db.sqlite")
-    limits = UploadLimits(open_for_s=100, silence_s=0.5, keep_free_bytes=10)
+    limits = UploadLimits(open_for_s=100, silence_s=2, keep_free_bytes=10)
     app = FastAPI()
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
@@ -308,4 +308,30 @@ def test_a_whole_file_that_was_never_verified_is_verified_by_an_empty_request(cl
     engine.dispose()
     assert not is_known(client, upload)
     assert patch(client, upload, len(CONTENT), b"").status_code == 204
+    assert is_known(client, upload)
+
+
+def test_a_long_request_is_recorded_before_it_ends(client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.receiving.BLOCK_BYTES", 256)
+    monkeypatch.setattr("services.api.receiving.RECORD_BYTES", 1024)
+    may_end = threading.Event()
+
+    def slowly() -> Iterator[bytes]:
+        for start in range(0, 2048, 256):
+            yield CONTENT[start : start + 256]
+        assert may_end.wait(30)
+        yield CONTENT[2048:]
+
+    def request() -> None:
+        with httpx.Client(base_url=client.base_url, trust_env=False) as other:
+            answers.append(patch(other, upload, 0, slowly()).status_code)
+
+    answers: list[int] = []
+    thread = threading.Thread(target=request)
+    thread.start()
+    while offset_of(client, upload) < 1024:
+        time.sleep(0.02)
+    may_end.set()
+    thread.join()
+    assert answers == [204]
     assert is_known(client, upload)
