@@ -65,7 +65,7 @@ def _description_fault(name: str, description: FolderCapture, limits: UploadLimi
             return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
     for image in description.images:
         for file in (image.file, image.variance_file):
-            if file is not None and file not in names:
+            if file is not None and str(PurePosixPath(file)) not in names:
                 return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
     return None
 

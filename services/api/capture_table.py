@@ -132,6 +132,19 @@ class CaptureTable:
             raise UnknownCaptureError(f"Capture {capture} has no file number {number}; ask for the capture to see its files.")
         return _file(row)
 
+    def file_at(self, capture: str, path: str) -> FileRow:
+        """One file by its path.
+
+        Raises:
+            UnknownCaptureError: the capture has no such file.
+        """
+        query = sql.select(file_table).where(file_table.c.capture == capture, file_table.c.path == path)
+        with self._engine.connect() as connection:
+            row = connection.execute(query).mappings().first()
+        if row is None:
+            raise UnknownCaptureError(f"Capture {capture} has no file {path!r}; its manifest says which it has.")
+        return _file(row)
+
     def change_file(self, capture: str, number: int, expires_s: float | None = None, **columns: object) -> None:
         """Change a file's columns and, if it is given, the capture's expiry, in one transaction."""
         with writing(self._engine) as connection:

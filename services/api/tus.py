@@ -42,6 +42,8 @@ def parse_metadata(header: str) -> dict[str, str]:
             found[key] = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, ValueError) as problem:
             raise UploadError(f"Upload-Metadata: the value of {key!r} is not UTF-8 in Base64; encode it so.") from problem
+        if not found[key].isprintable():
+            raise UploadError(f"Upload-Metadata: the value of {key!r} has a control character; leave it out.")
     return found
 
 

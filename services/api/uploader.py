@@ -102,8 +102,8 @@ class Uploader:
 
         url = file.upload.removeprefix("/v1")
         metadata = {"Upload-Length": str(file.bytes), "Upload-Metadata": format_metadata({"capture": capture, "path": file.path})}
-        self._patiently(lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata))
-        base, offset = self._done_bytes - file.received_bytes, -1
+        created = self._patiently(lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata))
+        base, offset = self._done_bytes - file.received_bytes, int(created.headers["Upload-Offset"])
         with source.open("rb") as stream:
 
             def step() -> int:

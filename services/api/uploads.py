@@ -47,9 +47,7 @@ class Uploads:
             UnknownCaptureError: no such capture or file. CorruptUploadError: its size is another. ExpiredError, CaptureStateError: the capture is not open.
         """
         self.require_open(capture)
-        row = next((row for row in self._table.files(capture) if row.file.path == path), None)
-        if row is None:
-            raise UnknownCaptureError(f"Capture {capture} has no file {path!r}; its manifest says which it has.")
+        row = self._table.file_at(capture, path)
         if row.file.bytes != size_bytes:
             raise CorruptUploadError(f"File {path!r} has {row.file.bytes} bytes by the manifest and {size_bytes} by Upload-Length; correct the wrong one.")
         self._table.change_file(capture, row.number, is_created=True)
