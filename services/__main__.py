@@ -61,7 +61,7 @@ def build_app() -> typer.Typer:
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
-    for command in (serve, dome_sim, capture, run, submit, watch, cancel, retry, export, phantom, bench):
+    for command in (serve, dome_sim, capture, run, upload, submit, watch, cancel, retry, export, phantom, bench):
         app.command()(command)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
@@ -235,9 +235,24 @@ def phantom(
     print(f"phantom: {out}")
 
 
+def upload(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder capture, or a published capture.")],
+    server: Server = None,
+    subject: Annotated[str | None, typer.Option(help="Pseudonymous label of the person; never a name.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Upload a capture to a server; the same command again goes on with an upload that broke."""
+    from services.upload_command import upload_folder
+
+    with _client(server) as client:
+        uploaded = upload_folder(client, folder, subject)
+    print(uploaded.model_dump_json() if as_json else uploaded.path)
+
+
 def submit(
     job: JobFile,
     server: Server = None,
+    send: Annotated[bool, typer.Option("--upload", help="Upload the job's capture folder first.")] = False,
     key: Annotated[str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")] = None,
     follow: Annotated[bool, typer.Option("--watch", help="Watch the job until it ends.")] = False,
     as_json: Json = False,
@@ -245,8 +260,13 @@ def submit(
     """Submit a job to a server."""
     from services.core.settings import read_job
 
+    spec = read_job(job)
     with _client(server) as client:
-        created = client.submit(read_job(job), key)
+        if send:
+            from services.upload_command import with_uploaded_capture
+
+            spec = with_uploaded_capture(client, spec, job)
+        created = client.submit(spec, key)
         print(json.dumps(created) if as_json else created["id"])
         if follow:
             _watch(client, created["id"])

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from services.core.errors import DentineError, DiskFullError, TooLargeError
+from services.core.errors import DentineError, DiskFullError, JobTooLargeError
 from services.core.records import JobSpec
 
 DISK_PER_CAPTURE = 4.0
@@ -89,16 +89,16 @@ class Admission:
         """Refuse what this machine could never run.
 
         Raises:
-            TooLargeError: it needs more disk or memory than there is in all.
+            JobTooLargeError: it needs more disk or memory than there is in all.
         """
         needs, machine = predict(spec), self._look()
         if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
-            raise TooLargeError(
+            raise JobTooLargeError(
                 f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all; put the server's data on a larger one.",
                 {"needed_disk_bytes": needs.disk_bytes, "disk_bytes": machine.disk_bytes},
             )
         if needs.memory_bytes > machine.memory_bytes:
-            raise TooLargeError(
+            raise JobTooLargeError(
                 f"{spec.workers} workers need about {_gib(needs.memory_bytes)} of memory and there are {_gib(machine.memory_bytes)}; ask for fewer workers.",
                 {"needed_memory_bytes": needs.memory_bytes, "memory_bytes": machine.memory_bytes},
             )

@@ -34,6 +34,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     from starlette.staticfiles import StaticFiles
 
     from services.api import access, problems
+    from services.api.captures_routes import build_captures_router
     from services.api.feed import EventFeed
     from services.api.observation import Observation
     from services.api.routes import build_router
@@ -65,6 +66,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)
     app.include_router(build_router(jobs, feed))
+    app.include_router(build_captures_router(jobs.captures))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import SecretStr
 
 from services.api.events import JobEvent
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, RateError, ScopeError, UnauthenticatedError, UnknownJobError
+from services.core.errors import DentineError, InputError, JobStateError, PlatformError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
 from services.core.records import JobSpec
+
+if TYPE_CHECKING:
+    from services.api.uploader import UploadProgress, UploadResult
 
 RECONNECT_S = 1.0
 RECONNECT_TRIES = 30
@@ -39,6 +43,17 @@ class Client:
         """Submit a job; the same key and options give the same job."""
         headers = {"Idempotency-Key": key} if key is not None else {}
         return self._ask("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True), headers=headers)
+
+    def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> UploadResult:
+        """Upload a folder capture and commit it. Files that the server knows are not sent; a broken upload resumes, also in a new process.
+
+        Args:
+            progress: called as files are hashed and sent.
+            subject: pseudonymous label of the person.
+        """
+        from services.api.uploader import Uploader
+
+        return Uploader(self._http, self._ask, progress).upload(folder, subject)
 
     def get(self, job_id: str) -> dict[str, Any]:
         """One job with its stages."""
@@ -75,7 +90,7 @@ class Client:
         with self._http.stream("GET", f"/jobs/{job_id}/events", headers={"Last-Event-ID": str(after)}) as response:
             if response.is_error:
                 response.read()
-                raise _error(response)
+                raise error_in(response)
             is_end = False
             for line in response.iter_lines():
                 field, _, value = line.partition(": ")
@@ -92,18 +107,21 @@ class Client:
         except httpx.HTTPError as problem:
             raise PlatformError(f"Server {self._server} does not answer ({problem}); start it with dentine serve or give --server.") from problem
         if response.is_error:
-            raise _error(response)
+            raise error_in(response)
         answer: dict[str, Any] = response.json()
         return answer
 
 
-def _error(response: Any) -> DentineError:
+def error_in(response: Any) -> DentineError:
     """The error that a problem document tells of."""
     try:
-        detail = str(response.json()["detail"])
+        problem = response.json()
+        detail, code = str(problem["detail"]), str(problem["code"])
     except (ValueError, KeyError):
-        detail = f"The server answered {response.status_code}; is it a dentine server?"
+        detail, code = f"The server answered {response.status_code}; is it a dentine server?", ""
     if response.status_code == 401:
         detail += " The command line reads it from the variable DENTINE__CLIENT__TOKEN."
+    if (known := error_of(code, detail)) is not None:
+        return known
     kinds = {401: UnauthenticatedError, 403: ScopeError, 404: UnknownJobError, 409: JobStateError, 422: InputError, 429: RateError}
     return kinds.get(response.status_code, DentineError)(detail)

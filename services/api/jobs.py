@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import Field
 
 from services.api.admission import Admission, Machine
+from services.api.captures import Captures, is_uploaded
 from services.api.erasure import erase, forget_listing
 from services.api.events import JobEvent
 from services.api.lifecycle import Instruction, Trigger
@@ -41,8 +42,9 @@ class Jobs:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(settings.database_url)
+        self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self._admission = Admission(lambda: Machine.of(self._data))
-        self._runner = Runner(self.repository, self.folder, run, self._admission, self._tidy)
+        self._runner = Runner(self.repository, self.folder, self.captures.locate, run, self._admission, self._tidy)
         self._is_alone = settings.database is None
 
     def start(self) -> None:
@@ -62,15 +64,17 @@ class Jobs:
         """Queue a job.
 
         Raises:
-            SettingsError: a path is relative or absent. TooLargeError: the machine could never run it. JobStateError: the key belongs to another job.
+            SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
+            JobStateError: the key belongs to another job.
         """
         for option, path in (("capture", spec.capture), ("rig.mouth", spec.rig.mouth if spec.rig else None)):
-            if path is not None and not path.is_absolute():
+            if path is not None and not path.is_absolute() and not (option == "capture" and is_uploaded(path)):
                 raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
-            if path is not None and not path.exists():
+            if path is not None and path.is_absolute() and not path.exists():
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
-        self._admission.refuse_too_large(spec)
-        creation = self.repository.create(spec, key, request_id)
+        with self.captures.keeping(spec.capture):
+            self._admission.refuse_too_large(self.captures.locate(spec))
+            creation = self.repository.create(spec, key, request_id)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
         return creation

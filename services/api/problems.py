@@ -9,14 +9,22 @@ from pydantic import Field
 
 from services.core.errors import (
     BodyTooLargeError,
+    CaptureStateError,
+    ChecksumError,
     DentineError,
+    DiskFullError,
+    ExpiredError,
     InputError,
     JobStateError,
+    JobTooLargeError,
+    LockedError,
+    OffsetError,
     PlatformError,
     RateError,
     ScopeError,
     TooLargeError,
     UnauthenticatedError,
+    UnknownCaptureError,
     UnknownJobError,
     UnknownPresetError,
     UnknownTokenError,
@@ -32,6 +40,8 @@ if TYPE_CHECKING:
     from fastapi import FastAPI, Request, Response
 
 MEDIA_TYPE = "application/problem+json"
+CHECKSUM_MISMATCH = 460
+"""Of the tus protocol, no registered status."""
 
 
 class Problem(Record):
@@ -45,30 +55,39 @@ class Problem(Record):
     code: str = Field(description="stable and machine-readable")
 
     @classmethod
-    def of(cls, status: HTTPStatus, code: str, detail: str, instance: str) -> Self:
-        """The document for a status and one of our codes."""
+    def of(cls, status: int, code: str, detail: str, instance: str, **more: object) -> Self:
+        """The document for a status and one of our codes; ``more`` are the members of a subclass."""
+        title = "Checksum Mismatch" if status == CHECKSUM_MISMATCH else HTTPStatus(status).phrase
         fields = {"detail": redacted(detail), "instance": redacted(instance), "code": code}
-        return cls(type=f"urn:dentine:problem:{code}", title=status.phrase, status=status, **fields)
+        return cls.model_validate({"type": f"urn:dentine:problem:{code}", "title": title, "status": status} | fields | more)
 
 
-_STATUS = {
+_STATUS: dict[type[DentineError], int] = {
     UnknownJobError: HTTPStatus.NOT_FOUND,
     UnknownPresetError: HTTPStatus.NOT_FOUND,
     UnknownTokenError: HTTPStatus.NOT_FOUND,
     UnknownWebhookError: HTTPStatus.NOT_FOUND,
     JobStateError: HTTPStatus.CONFLICT,
-    TooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,
+    JobTooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,
     BodyTooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     UnauthenticatedError: HTTPStatus.UNAUTHORIZED,
     ScopeError: HTTPStatus.FORBIDDEN,
     RateError: HTTPStatus.TOO_MANY_REQUESTS,
+    UnknownCaptureError: HTTPStatus.NOT_FOUND,
+    CaptureStateError: HTTPStatus.CONFLICT,
+    TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    OffsetError: HTTPStatus.CONFLICT,
+    ChecksumError: CHECKSUM_MISMATCH,
+    LockedError: HTTPStatus.LOCKED,
+    ExpiredError: HTTPStatus.GONE,
     InputError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    DiskFullError: HTTPStatus.INSUFFICIENT_STORAGE,
     PlatformError: HTTPStatus.SERVICE_UNAVAILABLE,
     DentineError: HTTPStatus.INTERNAL_SERVER_ERROR,
 }
 
 
-def status_of(problem: DentineError) -> HTTPStatus:
+def status_of(problem: DentineError) -> int:
     """The HTTP status that an error means."""
     return next(status for kind, status in _STATUS.items() if isinstance(problem, kind))
 
@@ -88,7 +107,7 @@ def install(app: FastAPI) -> None:
     from sqlalchemy.exc import DBAPIError
     from starlette.exceptions import HTTPException
 
-    def answer(request: Request, status: HTTPStatus, code: str, detail: str, headers: Any = None) -> Response:
+    def answer(request: Request, status: int, code: str, detail: str, headers: Any = None) -> Response:
         return Response(Problem.of(status, code, detail, request.url.path).model_dump_json(), status, headers, MEDIA_TYPE)
 
     @app.exception_handler(DentineError)

@@ -36,10 +36,19 @@ class Runner:
 
     Args:
         folder: of a job by its id.
+        locate: a job's options with the folder of an uploaded capture.
     """
 
-    def __init__(self, repository: Repository, folder: Callable[[str], Path], run: RunJob, admission: Admission, on_round: Callable[[], None]) -> None:
-        self._repository, self._folder, self._run, self._admission, self._on_round = repository, folder, run, admission, on_round
+    def __init__(
+        self,
+        repository: Repository,
+        folder: Callable[[str], Path],
+        locate: Callable[[JobSpec], JobSpec],
+        run: RunJob,
+        admission: Admission,
+        on_round: Callable[[], None],
+    ) -> None:
+        self._repository, self._folder, self._locate, self._run, self._admission, self._on_round = repository, folder, locate, run, admission, on_round
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing = threading.Event(), threading.Event()
         self._current: Lease | None = None
@@ -90,7 +99,7 @@ class Runner:
     def _next(self) -> Lease | None:
         # The oldest job that may start; those that wait for disk or memory let others pass.
         for job in self._repository.queued():
-            if self._admission.holds(job.id, job.spec):
+            if self._admission.holds(job.id, self._locate(job.spec)):
                 continue
             try:
                 return self._repository.lease(job.id, self._holder, LEASE_S)
@@ -119,7 +128,7 @@ class Runner:
             request_cancel(folder)
         trigger, failure = Trigger.SUCCEED, None
         try:
-            self._run(job.spec, folder, self._repository.address_of(lease))
+            self._run(self._locate(job.spec), folder, self._repository.address_of(lease))
         except JobCancelledError:
             state = patiently(lambda: self._repository.get(job.id).state)
             trigger = Trigger.STOPPED if state is JobState.CANCELLING else Trigger.LOSE

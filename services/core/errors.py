@@ -8,13 +8,23 @@
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
     │   ├── CaptureInputError a frame or file is missing or malformed
     │   ├── UnknownJobError   no such job or artifact
-    │   ├── TooLargeError     more disk or memory than the machine has
+    │   ├── JobTooLargeError  more disk or memory than the machine has
     │   ├── UnknownPresetError no such set of options
     │   ├── UnknownWebhookError no such webhook or delivery
     │   ├── WebhookAddressError a webhook may not go there
     │   ├── JobStateError     the job's state does not allow what was asked
     │   ├── UnknownTokenError no such token
-    │   └── BodyTooLargeError a request's body is over the limit
+    │   ├── BodyTooLargeError a request's body is over the limit
+    │   ├── UnknownCaptureError no such capture or file of it
+    │   ├── CaptureStateError the capture's state does not allow what was asked
+    │   │   └── IncompleteCaptureError files are missing, corrupt or refused
+    │   └── UploadError       a manifest, or bytes sent for it, cannot be accepted
+    │       ├── TooLargeError     over a limit of size or number
+    │       ├── CorruptUploadError what was received is not what the manifest says
+    │       ├── OffsetError       bytes for another place than the next
+    │       ├── ChecksumError     bytes of one request were altered on their way
+    │       ├── LockedError       another request sends the same file
+    │       └── ExpiredError      the capture was not committed in time
     ├── AccessError           the caller may not do this
     │   ├── UnauthenticatedError no token, or one that is unknown, expired or revoked
     │   ├── ScopeError        the token lacks the scope that the route needs
@@ -102,7 +112,7 @@ class UnknownJobError(InputError):
     code = "job-unknown"
 
 
-class TooLargeError(InputError):
+class JobTooLargeError(InputError):
     """A job needs more disk or memory than the machine has in all."""
 
     code = "job-too-large"
@@ -167,6 +177,66 @@ class RateError(AccessError):
     """The caller asked too often in a short time."""
 
     code = "rate-limited"
+
+
+class UnknownCaptureError(InputError):
+    """There is no such capture, or no such file in it."""
+
+    code = "capture-unknown"
+
+
+class CaptureStateError(InputError):
+    """The capture's state, or an earlier request, does not allow what was asked."""
+
+    code = "capture-state"
+
+
+class IncompleteCaptureError(CaptureStateError):
+    """A capture cannot be committed: files of it are missing, corrupt or refused."""
+
+    code = "capture-incomplete"
+
+
+class UploadError(InputError):
+    """A manifest, or bytes sent for it, cannot be accepted."""
+
+    code = "upload-refused"
+
+
+class TooLargeError(UploadError):
+    """A file, a capture or the number of files is over its limit."""
+
+    code = "upload-too-large"
+
+
+class CorruptUploadError(UploadError):
+    """A file's received content is not what the manifest says; it was discarded."""
+
+    code = "upload-corrupt"
+
+
+class OffsetError(UploadError):
+    """Bytes were sent for another place than the next one."""
+
+    code = "upload-offset"
+
+
+class ChecksumError(UploadError):
+    """The bytes of one request do not have their stated checksum; they were discarded."""
+
+    code = "upload-checksum"
+
+
+class LockedError(UploadError):
+    """Another request is sending the same file."""
+
+    code = "upload-locked"
+
+
+class ExpiredError(UploadError):
+    """The capture was not committed in time; what was received is gone."""
+
+    code = "upload-expired"
 
 
 class StoreError(DentineError):
@@ -275,3 +345,13 @@ class JobCancelledError(DentineError):
 
     code = "cancelled"
     exit_status = 130
+
+
+def error_of(code: str, message: str) -> DentineError | None:
+    """The error of the tree that a code means, None if it means none."""
+    kinds: list[type[DentineError]] = [DentineError]
+    for kind in kinds:
+        if kind.code == code:
+            return kind(message)
+        kinds.extend(kind.__subclasses__())
+    return None

@@ -26,6 +26,19 @@ class RateSettings(Record):
     refusals_per_minute: int = Field(default=60, gt=0, description="requests of one address without a valid token that are answered and audited one by one")
 
 
+class UploadLimits(Record):
+    """What captures may be uploaded. Sizes are checked when a capture is created, images when it is committed."""
+
+    largest_file_bytes: int = Field(default=16 * 2**30, ge=1, description="largest file of a capture")
+    largest_text_bytes: int = Field(default=64 * 2**20, ge=1, description="largest .json, .jsonl or .toml file, which is read whole")
+    largest_capture_bytes: int = Field(default=256 * 2**30, ge=1, description="largest capture")
+    most_files: int = Field(default=5000, ge=1, le=100_000, description="most files in a capture")
+    largest_image_bytes: int = Field(default=4 * 2**30, ge=1, description="largest image, as its header declares it decoded")
+    open_for_s: float = Field(default=7 * 86400.0, gt=0, description="an open capture expires this long after the last byte received")
+    silence_s: float = Field(default=30.0, gt=0, description="a request that sends nothing for this long is ended; what it sent is kept")
+    keep_free_bytes: int = Field(default=2**30, ge=0, description="free disk that open captures, fully received, must leave")
+
+
 class ServerSettings(Record):
     """The API server."""
 
@@ -42,6 +55,7 @@ class ServerSettings(Record):
     session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
     body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
     rates: RateSettings = RateSettings()
+    uploads: UploadLimits = UploadLimits()
 
     @property
     def database_url(self) -> str:

@@ -78,7 +78,8 @@ def test_every_route_with_every_scope(server: Guarded) -> None:
     for method, template, scope in operations(server.app):
         path = re.sub(r"{\w+}", "none", template)
         unknown = server.ask(method, path)
-        assert (unknown.status_code, unknown.json()["code"]) == (401, "unauthenticated"), path
+        assert unknown.status_code == 401, path
+        assert method == "HEAD" or unknown.json()["code"] == "unauthenticated", path
         assert unknown.headers["www-authenticate"] == 'Bearer realm="dentine"'
         for held in Scope:
             answer = server.ask(method, path, held)
@@ -87,8 +88,9 @@ def test_every_route_with_every_scope(server: Guarded) -> None:
                 continue
             assert answer.status_code == 403, f"{method} {path} as {held}"
             assert answer.headers["content-type"] == "application/problem+json"
-            assert answer.json()["code"] == "scope-missing"
-            assert f"'{scope}'" in answer.json()["detail"]
+            if method != "HEAD":
+                assert answer.json()["code"] == "scope-missing"
+                assert f"'{scope}'" in answer.json()["detail"]
             assert f'scope="{scope}"' in answer.headers["www-authenticate"]
 
 

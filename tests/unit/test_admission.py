@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.api.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
-from services.core.errors import DiskFullError, SchedulerLostError, TooLargeError
+from services.core.errors import DiskFullError, JobTooLargeError, SchedulerLostError
 from services.core.records import JobSpec
 
 GIB = 2**30
@@ -64,9 +64,9 @@ def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> No
     world = World()
     world.free(0)
     world.admission.refuse_too_large(spec)  # it may wait
-    with pytest.raises(TooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB") as refusal:
+    with pytest.raises(JobTooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB") as refusal:
         world.admission.refuse_too_large(spec.model_copy(update={"workers": 64}))
     assert refusal.value.evidence == {"needed_memory_bytes": 64 * WORKER_BYTES, "memory_bytes": 16 * GIB}
     world.machine = Machine(0, LEAST_DISK_BYTES, 16 * GIB)
-    with pytest.raises(TooLargeError, match=r"of disk and there are 0\.1 GiB in all"):
+    with pytest.raises(JobTooLargeError, match=r"of disk and there are 0\.1 GiB in all"):
         world.admission.refuse_too_large(spec)

@@ -12,7 +12,7 @@ import sqlalchemy as sql
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from services.api import audit, tokens, webhook_tables
+from services.api import audit, capture_table, tokens, webhook_tables
 from services.api.database import metadata, open_database, sqlite_url
 from services.api.events import event_table
 from services.api.lifecycle import JobState, Trigger
@@ -199,7 +199,7 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
-    for table in (webhook_tables.webhook_table, tokens.token_table, audit.audit_table):
+    for table in (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table):
         assert table.metadata is metadata
     with repository.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []

@@ -1,0 +1,86 @@
+"""What is looked at in a received file before its capture is accepted: what it declares, never what it decodes to."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import from_json
+
+from services.api.image_headers import declared
+from services.core.records import CaptureManifest, FolderCapture
+from services.core.settings import UploadLimits
+
+MOST_TIMES_PACKED = 1100
+"""Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""
+_ITEM_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "float16": 2, "int32": 4, "uint32": 4, "float32": 4}
+_PIXEL_BYTES = 4
+
+
+def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[str]) -> str | None:
+    """What is wrong with one file's content, one sentence, None if nothing is.
+
+    Args:
+        path: where the content lies.
+        name: its path in the capture.
+        names: paths of all files of the capture.
+    """
+    pure = PurePosixPath(name)
+    try:
+        if name == "capture.json":
+            return _description_fault(name, FolderCapture.model_validate_json(path.read_bytes()), limits, names)
+        if name == "manifest.json":
+            return _published_fault(name, from_json(path.read_bytes()), limits, names)
+        if pure.name == "zarr.json":
+            return _array_fault(name, from_json(path.read_bytes()), limits)
+        return _image_fault(path, name, pure.suffix.lower(), limits)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        return f"{name}: {place}: {first['msg']}; correct it."
+    except (ValueError, KeyError, TypeError) as problem:
+        return f"{name} cannot be read: {str(problem) or type(problem).__name__}; export it again."
+
+
+def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> str | None:
+    image = declared(path, suffix)
+    if image is None:
+        return None
+    size = path.stat().st_size
+    if image.decoded_bytes > limits.largest_image_bytes:
+        return f"Image {name} declares {image.size}, more than {limits.largest_image_bytes} bytes when decoded; crop or bin it."
+    if image.file_bytes is not None and image.file_bytes != size:
+        return f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
+    if image.decoded_bytes > MOST_TIMES_PACKED * size:
+        return f"Image {name} declares {image.size} in {size} bytes, which no photograph packs to; export it again."
+    return None
+
+
+def _description_fault(name: str, description: FolderCapture, limits: UploadLimits, names: frozenset[str]) -> str | None:
+    for camera in description.cameras:
+        if math.prod(camera.size) * len(description.channels) * _PIXEL_BYTES > limits.largest_image_bytes:
+            size = " x ".join(map(str, camera.size))
+            return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
+    for image in description.images:
+        for file in (image.file, image.variance_file):
+            if file is not None and str(PurePosixPath(file)) not in names:
+                return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
+    return None
+
+
+def _published_fault(name: str, manifest: Any, limits: UploadLimits, names: frozenset[str]) -> str | None:
+    if absent := sorted(set(manifest["files"]) - names):
+        return f"{name} lists {absent[0]}, which is not among the files; add it."
+    return _description_fault(name, CaptureManifest.model_validate(manifest["record"]).description, limits, names)
+
+
+def _array_fault(name: str, array: Any, limits: UploadLimits) -> str | None:
+    if array["node_type"] != "array":
+        return None
+    lengths = [int(length) for length in array["chunk_grid"]["configuration"]["chunk_shape"]]
+    if math.prod(lengths) * _ITEM_BYTES.get(str(array["data_type"]), 8) > limits.largest_image_bytes:
+        size = " x ".join(map(str, lengths))
+        return f"{name} declares chunks of {size} numbers, more than {limits.largest_image_bytes} bytes when decoded; export it in smaller ones."
+    return None

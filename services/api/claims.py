@@ -1,0 +1,39 @@
+"""Who is busy with which file, within this process: it is the only server of its data folder."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from services.core.errors import LockedError
+
+
+class Claims:
+    """Files of captures that some request is working on."""
+
+    def __init__(self) -> None:
+        self._guard = threading.Lock()
+        self._taken: set[tuple[str, int]] = set()
+
+    @contextmanager
+    def claim(self, capture: str, number: int) -> Iterator[None]:
+        """Have a file to oneself.
+
+        Raises:
+            LockedError: another request has it.
+        """
+        with self._guard:
+            if (capture, number) in self._taken:
+                raise LockedError(f"Another request is sending file number {number} of capture {capture}; wait for it to end.")
+            self._taken.add((capture, number))
+        try:
+            yield
+        finally:
+            with self._guard:
+                self._taken.discard((capture, number))
+
+    def any_of(self, capture: str) -> bool:
+        """Whether some request is working on a file of this capture."""
+        with self._guard:
+            return any(taken == capture for taken, _ in self._taken)

@@ -1,0 +1,153 @@
+"""How large an image says it is, from its header alone; nothing is decoded."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from types import MappingProxyType
+
+HEADER_BYTES = 2**20
+"""Whatever a header says beyond this is not believed."""
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a header declares."""
+
+    size: str
+    """In words, such as 4000 x 3000 pixels of 3 channels."""
+    decoded_bytes: int
+    file_bytes: int | None = None
+    """Size of the file if the format fixes it."""
+
+
+def declared(path: Path, suffix: str) -> Declared | None:
+    """Read an image's header; None where the suffix is no image's.
+
+    Raises:
+        ValueError: it is no image of that format.
+    """
+    if suffix not in _READERS:
+        return None
+    with path.open("rb") as stream:
+        head = stream.read(HEADER_BYTES)
+    try:
+        return _READERS[suffix](head)
+    except (struct.error, IndexError, KeyError, OverflowError) as problem:
+        raise ValueError("its header is cut off or damaged") from problem
+
+
+def _pixels(width: int, height: int, channels: int, channel_bytes: int) -> Declared:
+    if min(width, height, channels, channel_bytes) < 1:
+        raise ValueError("its header declares no pixels")
+    return Declared(f"{width} x {height} pixels of {channels} channels", width * height * channels * channel_bytes)
+
+
+def _npy(head: bytes) -> Declared:
+    from numpy.lib import format as npy
+
+    stream = BytesIO(head)
+    version = npy.read_magic(stream)
+    if version not in {(1, 0), (2, 0)}:
+        raise ValueError(f"it is of version {version[0]}.{version[1]} and 1.0 and 2.0 are read")
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, which are never loaded")
+    if any(length < 0 for length in shape):
+        raise ValueError("its header declares a negative length")
+    array_bytes = math.prod(shape) * dtype.itemsize
+    return Declared(f"{' x '.join(map(str, shape)) or 'one'} numbers of {dtype.itemsize} bytes", array_bytes, stream.tell() + array_bytes)
+
+
+def _png(head: bytes) -> Declared:
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+        raise ValueError("it is no PNG")
+    width, height, depth, colour = struct.unpack(">IIBB", head[16:26])
+    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[colour]  # a palette decodes to three
+    return _pixels(width, height, channels, -(-depth // 8))
+
+
+def _tiff(head: bytes) -> Declared:
+    order = {b"II": "<", b"MM": ">"}.get(head[:2])
+    if order is None:
+        raise ValueError("it is no TIFF")
+    (magic,) = struct.unpack_from(f"{order}H", head, 2)
+    if magic not in {42, 43}:
+        raise ValueError("it is no TIFF")
+    is_big = magic == 43
+    offset_at, offset_code, count_code, entry_bytes = (8, "Q", "Q", 20) if is_big else (4, "I", "H", 12)
+    (start,) = struct.unpack_from(f"{order}{offset_code}", head, offset_at)
+    if start >= len(head):
+        raise ValueError(f"its directory lies beyond the first {HEADER_BYTES} bytes; write it with the directory in front")
+    (count,) = struct.unpack_from(f"{order}{count_code}", head, start)
+    first = start + struct.calcsize(f"{order}{count_code}")
+    tags = {}
+    for place in range(first, first + min(count, 4096) * entry_bytes, entry_bytes):
+        tag, kind = struct.unpack_from(f"{order}HH", head, place)
+        if tag in {256, 257, 258, 277}:
+            tags[tag] = _tiff_values(head, order, kind, place + 4, is_big=is_big)
+    return _pixels(tags[256][0], tags[257][0], tags.get(277, [1])[0], -(-max(tags.get(258, [1])) // 8))
+
+
+def _tiff_values(head: bytes, order: str, kind: int, place: int, *, is_big: bool) -> list[int]:
+    code, room = {1: "B", 3: "H", 4: "I", 16: "Q"}[kind], 8 if is_big else 4
+    wide = "Q" if is_big else "I"
+    (count,) = struct.unpack_from(f"{order}{wide}", head, place)
+    if not 1 <= count <= 64:
+        raise ValueError("its header is cut off or damaged")
+    value = place + room
+    if count * struct.calcsize(f"{order}{code}") > room:
+        (value,) = struct.unpack_from(f"{order}{wide}", head, value)
+    return list(struct.unpack_from(f"{order}{count}{code}", head, value))
+
+
+def _exr(head: bytes) -> Declared:
+    if head[:4] != b"\x76\x2f\x31\x01":
+        raise ValueError("it is no OpenEXR image")
+    (flags,) = struct.unpack_from("<I", head, 4)
+    is_multipart, place, parts = bool(flags & 0x1000), 8, []
+    while True:
+        attributes, place = _exr_attributes(head, place)
+        if not attributes:
+            break
+        left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
+        channels = _exr_channels(attributes["channels"])
+        parts.append(_pixels(right - left + 1, bottom - top + 1, len(channels), max(channels, default=0)))
+        if not is_multipart:
+            break
+    if not parts:
+        raise ValueError("its header is cut off or damaged")
+    return Declared("; ".join(part.size for part in parts[:4]), sum(part.decoded_bytes for part in parts))
+
+
+def _exr_attributes(head: bytes, place: int) -> tuple[dict[str, bytes], int]:
+    found = {}
+    while head[place] != 0:
+        end_of_name = head.index(0, place)
+        name = head[place:end_of_name].decode("latin-1")
+        place = head.index(0, end_of_name + 1) + 1  # past the attribute's type
+        (length,) = struct.unpack_from("<i", head, place)
+        if not 0 <= length <= len(head) - place - 4:
+            raise ValueError("its header is cut off or damaged")
+        found[name] = head[place + 4 : place + 4 + length]
+        place += 4 + length
+    return found, place + 1
+
+
+def _exr_channels(value: bytes) -> list[int]:
+    """Bytes of each channel's numbers."""
+    place, widths = 0, []
+    while value[place] != 0:
+        place = value.index(0, place) + 1
+        (kind,) = struct.unpack_from("<i", value, place)
+        widths.append({0: 4, 1: 2, 2: 4}[kind])
+        place += 16
+    return widths
+
+
+_READERS: Mapping[str, Callable[[bytes], Declared]] = MappingProxyType({".npy": _npy, ".png": _png, ".tif": _tiff, ".tiff": _tiff, ".exr": _exr})
