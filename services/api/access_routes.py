@@ -1,6 +1,6 @@
 """Routes of tokens, browser sessions and the audit log. Annotations are evaluated here, because FastAPI reads them."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
@@ -8,7 +8,7 @@ from pydantic import Field
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
 from services.api.guard import needs
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import refusals
 from services.api.sessions import COOKIE
 from services.api.tokens import Caller, IssuedToken, Scope, Token
 from services.core.errors import UnauthenticatedError
@@ -40,8 +40,7 @@ class AuditPage(Record):
 
 def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> APIRouter:
     """Routes over the given callers; ``secure`` cookies travel over TLS only."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (401, 403, 404, 422, 429)}
-    router = APIRouter(prefix="/v1", responses=failures)
+    router = APIRouter(prefix="/v1", responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: TokenRequest, request: Request, response: Response) -> IssuedToken:

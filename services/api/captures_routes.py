@@ -12,7 +12,7 @@ from pydantic import Field
 from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
 from services.api.guard import needs
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import MEDIA_TYPE, Problem, refusals
 from services.api.receiving import in_thread
 from services.api.tus_routes import build_tus_router
 from services.core.errors import IncompleteCaptureError
@@ -28,7 +28,6 @@ class IncompleteCapture(Problem):
 
 def build_captures_router(captures: Captures) -> APIRouter:
     """Routes over the given captures, uploads of their files included; while it lives, captures expire."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 410, 413, 422, 423, 507)}
 
     @asynccontextmanager
     async def sweeping(_app: Any) -> AsyncIterator[None]:
@@ -46,7 +45,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
                 await task
 
     router = APIRouter(lifespan=sweeping)
-    under = APIRouter(prefix="/v1/captures", responses=failures, tags=["captures"])
+    under = APIRouter(prefix="/v1/captures", responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
 
     @under.post("", status_code=201, dependencies=[needs("submit")])
     def create(manifest: UploadManifest, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> CaptureDetail:

@@ -7,7 +7,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from pydantic import Field
 
 from services.api.guard import needs
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import MEDIA_TYPE, Problem, refusals
 from services.api.readiness import Check, Readiness
 from services.core.geometry import Record
 
@@ -27,7 +27,7 @@ class NotReady(Problem):
 
 def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> APIRouter:
     """Routes over the given checks and metrics."""
-    router = APIRouter(prefix="/v1", tags=["health"])
+    router = APIRouter(prefix="/v1", tags=["health"], responses=refusals())
 
     @router.get("/health/ready", response_model=Ready, responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}}, dependencies=[needs("read")])
     def ready(request: Request) -> Response:

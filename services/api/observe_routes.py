@@ -1,6 +1,6 @@
 """Routes that show what a job did and does, and the presets. Annotations are evaluated here, because FastAPI reads them."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi import Path as PathParameter
@@ -12,7 +12,7 @@ from services.api.guard import needs
 from services.api.history import History, LogPage, PreviewPage, read_history, read_log, read_previews
 from services.api.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import refusals
 from services.api.repository import Job
 from services.core.errors import UnknownJobError
 from services.core.stage import StageName
@@ -22,8 +22,7 @@ After = Annotated[int, Query(ge=0, lt=2**63, description="id of the last one tha
 
 def build_observe_router(jobs: Jobs) -> APIRouter:
     """Routes over the given jobs."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 422)}
-    router = APIRouter(prefix="/v1", responses=failures)
+    router = APIRouter(prefix="/v1", responses=refusals(404, 422))
 
     def find_job(job_id: str) -> Job:
         return jobs.repository.get(job_id)

@@ -100,6 +100,11 @@ def response_of(problem: DentineError, path: str, headers: dict[str, str] | None
     return Response(Problem.of(status, problem.code, problem.message, path).model_dump_json(), status, headers, MEDIA_TYPE)
 
 
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """What the description says of routes that may answer so, besides what the gate and a lost database answer everywhere."""
+    return {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in sorted({401, 403, 429, 503, *statuses})}
+
+
 def install(app: FastAPI) -> None:
     """Answer every error of the application with a problem document."""
     from fastapi.exceptions import RequestValidationError

@@ -12,7 +12,7 @@ from services.api.feed import EventFeed, follow
 from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import refusals
 from services.api.repository import Deletion, Job, JobFilter
 from services.core.geometry import Record
 from services.core.records import JobSpec
@@ -40,8 +40,7 @@ class Health(Record):
 
 def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     """Routes over the given jobs."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (401, 403, 404, 409, 413, 422, 429, 507)}
-    router = APIRouter(prefix="/v1", responses=failures)
+    router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
 
     def find_job(job_id: str) -> Job:
         return jobs.repository.get(job_id)

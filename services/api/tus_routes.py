@@ -1,7 +1,7 @@
 """tus 1.0 below ``/v1/uploads``: one file of a capture each. Annotations are evaluated here, because FastAPI reads them."""
 
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, HTTPException, Path, Request, Response
 from fastapi.routing import APIRoute
@@ -11,7 +11,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from services.api import tus
 from services.api.guard import needs
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import refusals
 from services.api.receiving import SilenceError, receive
 from services.api.uploads import Upload, Uploads, upload_path
 from services.core.errors import UploadError
@@ -41,10 +41,7 @@ def require_version(tus_resumable: Annotated[str | None, Header()] = None) -> No
 
 def build_tus_router(uploads: Uploads) -> APIRouter:
     """Routes over the given uploads."""
-    failures: dict[int | str, dict[str, Any]] = {
-        status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507)
-    }
-    router = APIRouter(prefix="/v1/uploads", route_class=TusRoute, responses=failures, tags=["uploads"])
+    router = APIRouter(prefix="/v1/uploads", route_class=TusRoute, responses=refusals(404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507), tags=["uploads"])
     versioned = [Depends(require_version)]
 
     def told(upload: Upload) -> dict[str, str]:

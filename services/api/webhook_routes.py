@@ -1,14 +1,14 @@
 """Routes of webhooks. Annotations are evaluated here, because FastAPI reads them."""
 
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 from pydantic import Field
 
 from services.api.deliveries import Deliveries, Delivery
 from services.api.guard import needs
-from services.api.problems import MEDIA_TYPE, Problem
+from services.api.problems import refusals
 from services.api.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
 from services.core.geometry import Record
 
@@ -22,8 +22,7 @@ class DeliveryPage(Record):
 
 def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRouter:
     """Routes over the given subscriptions and their log."""
-    failures: dict[int | str, dict[str, Any]] = {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in (404, 409, 422)}
-    router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], responses=failures, dependencies=[needs("admin")])
+    router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], responses=refusals(404, 409, 422), dependencies=[needs("admin")])
 
     @router.post("", status_code=201)
     def create(wanted: WebhookRequest, response: Response) -> NewWebhook:
