@@ -1,0 +1,164 @@
+"""The compose file: valid, and what it starts works together. Its own commands and environments run as processes on loopback, and a small job through them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+import yaml
+
+from tests.support.live_server import connect
+from tests.support.postgres import PostgresServer, new_database, postgres_server
+from tests.support.small_system import free_port
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = ROOT / "deploy" / "compose.yaml"
+DENTINE = [sys.executable, "-m", "services"]
+PROGRAMS = {"dentine": DENTINE, "dask": [sys.executable, "-m", "dask"]}
+PATIENCE_S = 600.0
+JOB = """
+capture = "mouth"
+boundary = "matched"
+dentin = "known"
+samples_per_pixel = 16
+max_samples_per_pixel = 16
+max_steps = 1
+search_candidates = 100
+advise = false
+"""
+
+pytestmark = pytest.mark.timeout(1800)
+
+
+def services() -> dict[str, dict[str, Any]]:
+    return dict(yaml.safe_load(COMPOSE.read_text())["services"])
+
+
+def test_the_file_follows_the_compose_specification() -> None:
+    checked = subprocess.run(
+        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(COMPOSE)], capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stdout
+
+
+def test_only_the_api_is_published_and_only_on_loopback() -> None:
+    assert {name: one["ports"] for name, one in services().items() if "ports" in one} == {"api": ["127.0.0.1:8000:8000"]}
+
+
+def test_one_worker_alone_may_reach_the_dome() -> None:
+    able = [name for name, one in services().items() if "DOME=1" in one.get("command", [])]
+    assert able == ["rig"]
+    assert "deploy" not in services()["rig"]
+
+
+def test_every_service_is_checked_and_starts_again() -> None:
+    for name, one in services().items():
+        assert {"healthcheck", "restart"} <= one.keys(), name
+
+
+class Composition:
+    """The file's services as processes, with names and folders of this machine."""
+
+    def __init__(self, folder: Path, postgres: PostgresServer) -> None:
+        self._folder = folder
+        ports = {"8786": str(free_port()), "8000": str(free_port()), "5020": str(free_port())}
+        self.address = f"http://127.0.0.1:{ports['8000']}"
+        database = services()["api"]["environment"]["DENTINE__SERVER__DATABASE"]
+        self._names = {
+            database: new_database(postgres, "composed"),
+            "scheduler:": "127.0.0.1:",
+            "/data": str(folder / "data"),
+            "/tmp/dask": str(folder / "dask"),
+        }
+        self._names |= {port: mine for port, mine in ports.items() if port != "8000"} | {"8000": ports["8000"]}
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def environment(self, name: str) -> dict[str, str]:
+        """Of a service, on top of this machine's own."""
+        return os.environ | {"PYTHONPATH": str(ROOT)} | {key: self._here(value) for key, value in services()[name].get("environment", {}).items()}
+
+    def start(self, name: str) -> None:
+        """Start a service by its own command."""
+        program, *arguments = services()[name]["command"]
+        with (self._folder / f"{name}.log").open("wb") as log:
+            command = [*PROGRAMS[program], *map(self._here, arguments)]
+            self._processes[name] = subprocess.Popen(command, env=self.environment(name), cwd=self._folder, stdout=log, stderr=log, start_new_session=True)
+
+    def close(self) -> None:
+        """End all of them in order, as the engine does."""
+        for process in self._processes.values():
+            below = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
+            process.terminate()
+            try:
+                process.wait(60)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            for one in psutil.wait_procs(below, timeout=30)[1]:
+                one.kill()
+
+    def _here(self, text: str) -> str:
+        for theirs, ours in self._names.items():
+            text = text.replace(theirs, ours)
+        return text
+
+
+@pytest.fixture
+def composition(tmp_path: Path) -> Iterator[Composition]:
+    with postgres_server() as postgres:
+        made = Composition(tmp_path, postgres)
+        try:
+            for name in services():
+                if name != "postgres":
+                    made.start(name)
+            deadline = time.monotonic() + PATIENCE_S
+            while not _is_live(made.address):
+                assert time.monotonic() < deadline, (tmp_path / "api.log").read_text()
+                time.sleep(0.1)
+            yield made
+        finally:
+            made.close()
+
+
+def _is_live(address: str) -> bool:
+    try:
+        with connect(address) as client:
+            return client.get("/v1/health/live").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def dentine(folder: Path, environment: Mapping[str, str], *arguments: str) -> str:
+    done = subprocess.run([*DENTINE, *arguments], cwd=folder, env=dict(environment), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_small_job_runs_through_what_the_file_starts(composition: Composition, tmp_path: Path) -> None:
+    environment = composition.environment("api")
+    with connect(composition.address) as client:
+        assert client.get("/v1/jobs").status_code == 401
+    token = dentine(tmp_path, environment, "token", "create", "laboratory", "--scope", "submit")
+    environment |= {"DENTINE__CLIENT__TOKEN": token}
+
+    size = ["--pixel-mm", "1.5", "--cameras", "1", "--lights", "4", "--samples", "64"]
+    dentine(tmp_path, environment, "phantom", "--out", "mouth", *size)
+    (tmp_path / "job.toml").write_text(JOB)
+    job = dentine(tmp_path, environment, "submit", "job.toml", "--upload", "--watch", "--server", composition.address).splitlines()[0]
+
+    headers = {"Authorization": f"Bearer {token}"}
+    with connect(composition.address) as client:
+        detail = client.get(f"/v1/jobs/{job}", headers=headers).json()
+        assert detail["state"] == "SUCCEEDED"
+        assert client.get("/v1/health/ready", headers=headers).status_code == 200
+        report = client.get(f"/v1/jobs/{job}/artifacts/report.html", headers=headers)
+        assert "Tooth" in report.text
+    for log in tmp_path.glob("*.log"):
+        assert token not in log.read_text()
