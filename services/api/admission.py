@@ -25,7 +25,7 @@ RIG_CAPTURE_BYTES = 2 * 2**30
 """A capture that a rig is about to take."""
 WORKER_BYTES = 3 * 2**29
 """Memory of one worker and its rendering process in a jaw's fit; 1.2 GiB were measured."""
-MOST_FILES = 20_000
+MOST_FILES = 5_000
 """Of a capture that are looked at."""
 KEPT_FREE_BYTES = 256 * 2**20
 """Disk that no job may count on."""
@@ -82,6 +82,7 @@ class Admission:
     def __init__(self, look: Callable[[], Machine], clock: Callable[[], float] = time.monotonic) -> None:
         self._look, self._clock = look, clock
         self._lock = threading.Lock()
+        self._needs: dict[str, Needs] = {}
         self._paused: dict[str, tuple[float, str]] = {}
         self._reasons: dict[str, str] = {}
 
@@ -107,15 +108,16 @@ class Admission:
         """Whether a queued job must wait; ``reason`` then says why."""
         machine = self._look()
         with self._lock:
+            needs = self._needs.pop(job_id, None) or predict(spec)
             until, reason = self._paused.get(job_id, (0.0, ""))
             if self._clock() >= until:
-                needed, reason = predict(spec).disk_bytes + KEPT_FREE_BYTES, ""
+                needed, reason = needs.disk_bytes + KEPT_FREE_BYTES, ""
                 if machine.free_disk_bytes < needed:
                     reason = f"Waits for disk: about {_gib(needed)} are needed and {_gib(machine.free_disk_bytes)} are free."
                 self._paused.pop(job_id, None)
             self._reasons.pop(job_id, None)
             if reason:
-                self._reasons[job_id] = reason
+                self._needs[job_id], self._reasons[job_id] = needs, reason
             return bool(reason)
 
     def pause(self, job_id: str, problem: DentineError) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -203,3 +206,18 @@ def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: Scrip
 def expect_state(page: Page, job_id: str, state: str) -> None:
     while page.request.get(f"/v1/jobs/{job_id}").json()["state"] != state:
         time.sleep(0.05)
+
+
+def test_a_queued_job_says_what_it_waits_for(page: Page, job: ScriptedJob, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2**28, total=2**50))
+    monkeypatch.setattr("services.api.runner.ROUND_S", 0.2)
+    number = submit(page)
+    page.goto(f"/#/{number}")
+    expect(page.locator(".job header + p + p")).to_have_text(re.compile(r"Waits for disk: about [0-9.]+ GiB are needed and [0-9.]+ GiB are free\."))
+    assert contrast_failures(page) == []
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/waiting.png", full_page=True)
+    monkeypatch.undo()
+    job.steps.release(STEPS)
+    expect_state(page, number, "SUCCEEDED")
+    expect(page.locator(".job header + p + p")).to_be_hidden()

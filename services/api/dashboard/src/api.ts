@@ -1,6 +1,6 @@
 /** The public REST API, as far as this page uses it. */
 
-export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED";
+export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
 
 export interface Job {
   id: string;
@@ -22,6 +22,8 @@ export interface Stage {
 
 export interface JobDetail extends Job {
   stages: Stage[];
+  /** Why a queued job does not start. */
+  waits_for: string | null;
 }
 
 export interface JobEvent {

@@ -1,6 +1,6 @@
 /** One job, live: fed by its event stream, completed from its artifacts when it ends. */
 
-import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
+import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobDetail, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, when } from "./format";
@@ -9,10 +9,12 @@ import { ParameterTable } from "./parameterTable";
 import { StageList } from "./stageList";
 
 const FINAL: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
+const WAITING_MS = 5000;
 
 export class JobView {
   readonly root = element("article", { class: "job" });
   private readonly state = element("span", { class: "badge", role: "status" });
+  private readonly waits = element("p", { class: "soft", role: "status" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly action = element("button", { type: "button" });
@@ -23,6 +25,7 @@ export class JobView {
   private readonly comparison: Comparison;
   private readonly files = element("ul", { class: "files" });
   private current: JobState = "SUBMITTED";
+  private timer = 0;
   private close: () => void = () => undefined;
 
   constructor(
@@ -46,6 +49,7 @@ export class JobView {
     this.root.replaceChildren(
       element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action, this.report),
       element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
+      this.waits,
       this.failure,
       this.refusal,
       section("Stages", this.stages.root),
@@ -56,11 +60,13 @@ export class JobView {
     );
     this.stages.show(job.stages);
     this.showState(job);
+    this.showWaiting(job);
     this.follow();
     await this.showFiles();
   }
 
   stop(): void {
+    window.clearTimeout(this.timer);
     this.close();
   }
 
@@ -82,9 +88,10 @@ export class JobView {
   }
 
   /** The replay tells old states too, so the state itself is always asked for. */
-  private async refreshState(): Promise<Job> {
+  private async refreshState(): Promise<JobDetail> {
     const job = await getJob(this.id);
     this.showState(job);
+    this.showWaiting(job);
     if (FINAL.includes(job.state)) this.stages.show(job.stages);
     this.onChange();
     return job;
@@ -95,13 +102,21 @@ export class JobView {
     await this.showFiles();
   }
 
+  /** What a queued job waits for is no event, so it is asked for again. */
+  private showWaiting(job: JobDetail): void {
+    this.waits.hidden = job.waits_for === null;
+    this.waits.textContent = job.waits_for ?? "";
+    window.clearTimeout(this.timer);
+    if (job.state === "QUEUED") this.timer = window.setTimeout(() => void this.refreshState(), WAITING_MS);
+  }
+
   private showState(job: Job): void {
     this.current = job.state;
     this.state.textContent = job.state.toLowerCase();
     this.state.dataset["state"] = job.state;
     this.failure.hidden = job.failure === null;
     this.failure.textContent = job.failure ? `${job.failure.stage ?? "job"}: ${job.failure.message}` : "";
-    this.action.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING";
+    this.action.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
     this.action.textContent = FINAL.includes(job.state) ? "Retry" : "Cancel";
   }
 
