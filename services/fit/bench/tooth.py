@@ -188,4 +188,6 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
             label += f", {'over ' if end['lower_bound'] else ''}{end['efficiency_ratio']:.3g} times our time"
         axes.plot([row["seconds"] for row in mine], [100 * row["error"] for row in mine], "o-", color=f"C{number}", markersize=4, label=label)
     finish(axes, "processor time, s", "held-out error, %")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+    figure.set_size_inches(6.0, 6.0)
     return figure
