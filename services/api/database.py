@@ -59,11 +59,8 @@ def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
     """Make a call again while the database does not answer, for so long."""
     import stamina
 
-    away = (sql.exc.OperationalError, sql.exc.InterfaceError)
-    for attempt in stamina.retry_context(on=away, attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0):
-        with attempt:
-            return call()
-    raise AssertionError
+    again = stamina.RetryingCaller(attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0)
+    return again((sql.exc.OperationalError, sql.exc.InterfaceError), call)
 
 
 @contextmanager

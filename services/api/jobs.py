@@ -16,7 +16,7 @@ from services.api.lifecycle import Instruction, Trigger
 from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
-from services.core.errors import SettingsError
+from services.core.errors import SettingsError, StoreError
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -43,7 +43,7 @@ class Jobs:
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(settings.database_url)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
-        self._admission = Admission(lambda: Machine.of(self._data))
+        self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
         self._runner = Runner(self.repository, self.folder, self.captures.locate, run, self._admission, self._tidy)
         self._is_alone = settings.database is None
 
@@ -128,7 +128,10 @@ class Jobs:
         # Finish deletions that were cut short, and delete what has been kept long enough.
         oldest_s = 0.0 if self._keep_days is None else time.time() - self._keep_days * DAY_S
         for job_id in self.repository.ended_before(oldest_s):
-            self.delete(job_id)
+            try:
+                self.delete(job_id)
+            except StoreError as problem:
+                logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
 
 
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:

@@ -23,7 +23,7 @@ class Observation:
 
     def __init__(self, jobs: Jobs, settings: ServerSettings) -> None:
         engine, policy = jobs.repository.engine, AddressPolicy(settings.private_webhooks)
-        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes)
+        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler)
         deliveries = Deliveries(engine)
         self._registry = build_registry(engine, readiness, jobs.free_bytes)
         self._routers = (

@@ -111,7 +111,8 @@ def run_stages(
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
-                with nullcontext(cluster) if cluster is not None else Workers() as processes, processes.client(workers or spec.workers) as client:
+                with nullcontext(cluster) if cluster is not None else Workers() as processes:
+                    client = processes.connect(workers or spec.workers)
                     _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo], watch)
             watch.tell()
 
@@ -159,10 +160,8 @@ class StageTask:
                 context = LocalContext(self.root, attempt, tell)
                 context.raise_if_cancelled()
                 module, function = self.door.split(":")
-                try:
+                with _telling_a_full_disk(self.root):
                     getattr(importlib.import_module(module), function)(self.spec, context)
-                except OSError as problem:
-                    raise _disk_full(self.root, problem) from problem
                 if "finished" not in told:
                     tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
@@ -176,14 +175,15 @@ class StageTask:
         return stage_logs(self.stage, attempt, self.events)
 
 
-def _disk_full(root: Path, problem: OSError) -> Exception:
-    # What an error of the system means, itself if not a full disk.
-    if problem.errno not in {errno.ENOSPC, errno.EDQUOT}:
-        return problem
-    free = shutil.disk_usage(root).free
-    return DiskFullError(
-        f"The disk was full at {problem.filename or root}; free some space, the job goes on from what it had published.", {"free_disk_bytes": free}
-    )
+@contextmanager
+def _telling_a_full_disk(root: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as problem:
+        if problem.errno not in {errno.ENOSPC, errno.EDQUOT}:
+            raise
+        what = f"The disk was full at {problem.filename or root}; free some space, the job goes on from what it had published."
+        raise DiskFullError(what, {"free_disk_bytes": shutil.disk_usage(root).free}) from problem
 
 
 class _Watch:

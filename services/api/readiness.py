@@ -12,13 +12,13 @@ from typing import Literal
 import sqlalchemy as sql
 from pydantic import Field
 
+from services.api.admission import KEPT_FREE_BYTES
 from services.api.database import writing
 from services.api.events import event_table
+from services.api.workers import require_scheduler
 from services.core.errors import DentineError, PlatformError, StoreError
 from services.core.geometry import Record
 
-FREE_BYTES_NEEDED = 256 * 2**20
-"""Below this a stage could not publish."""
 PROBE_S = 1.0
 """How long the database may take to grant a write."""
 _BLOCK = bytes(4096)
@@ -41,11 +41,14 @@ class Readiness:
         jobs_folder: where jobs are stored.
         is_running: whether queued jobs are run.
         free_bytes: free space where jobs are stored.
+        scheduler: address of the workers' scheduler; None where workers are the server's own.
     """
 
-    def __init__(self, engine: sql.Engine, jobs_folder: Path, is_running: Callable[[], bool], free_bytes: Callable[[], int]) -> None:
+    def __init__(
+        self, engine: sql.Engine, jobs_folder: Path, is_running: Callable[[], bool], free_bytes: Callable[[], int], scheduler: str | None = None
+    ) -> None:
         self._engine, self._jobs_folder = engine, jobs_folder
-        self._is_running, self._free_bytes = is_running, free_bytes
+        self._is_running, self._free_bytes, self._address = is_running, free_bytes, scheduler
         self._file = _identity(engine)
         self._prober = ThreadPoolExecutor(1, "readiness")
 
@@ -79,6 +82,8 @@ class Readiness:
     def _scheduler(self) -> str:
         if not self._is_running():
             raise PlatformError("Jobs are not being run; restart the server and read its log.")
+        if self._address is not None:
+            require_scheduler(self._address)
         return "Queued jobs are being run."
 
     def _store(self) -> str:
@@ -101,7 +106,7 @@ class Readiness:
             free_mib = self._free_bytes() // 2**20
         except OSError as problem:
             raise StoreError(f"The free space of the data folder cannot be read ({problem.strerror}); check that it exists.") from problem
-        needed_mib = FREE_BYTES_NEEDED // 2**20
+        needed_mib = KEPT_FREE_BYTES // 2**20
         if free_mib < needed_mib:
             raise StoreError(f"Only {free_mib} MiB of disk are free; free at least {needed_mib} MiB.")
         return f"{free_mib} MiB of disk are free."

@@ -176,15 +176,13 @@ class Repository:
         with self.engine.connect() as connection:
             return self._find(connection, job_id)
 
-    def page(self, limit: int, before: int | None = None, state: JobState | None = None, only: JobFilter | None = None) -> list[Job]:
+    def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
         query = sql.select(job_table).order_by(job_table.c.number.desc()).limit(limit)
         if only is not None:
             query = query.where(*only.conditions())
         if before is not None:
             query = query.where(job_table.c.number < before)
-        if state is not None:
-            query = query.where(job_table.c.state == state)
         with self.engine.connect() as connection:
             return [_job(row) for row in connection.execute(query).mappings()]
 
@@ -238,14 +236,16 @@ class Repository:
         """Tell every job under way that no process works on it any more."""
         return self._lose(sql.true())
 
-    def lose_expired(self, keep: str) -> list[str]:
+    def lose_expired(self, keep: Lease | None = None) -> list[str]:
         """Tell those that have no lease, or one that ran out.
 
         Args:
-            keep: holder whose leases hold whatever the clock says: the caller, who knows what it runs.
+            keep: holds whatever the clock says: the caller's own, who knows that it works on that job.
         """
-        current = sql.select(lease_table.c.job).where((lease_table.c.until_s >= self._clock()) | (lease_table.c.holder == keep))
-        return self._lose(job_table.c.id.not_in(current))
+        held = lease_table.c.until_s >= self._clock()
+        if keep is not None:
+            held |= (lease_table.c.job == keep.job.id) & (lease_table.c.number == keep.number)
+        return self._lose(job_table.c.id.not_in(sql.select(lease_table.c.job).where(held)))
 
     def _lose(self, which: sql.ColumnElement[bool]) -> list[str]:
         running = job_table.c.state.in_([JobState.RUNNING, JobState.CANCELLING])

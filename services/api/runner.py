@@ -6,10 +6,9 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-
-import sqlalchemy as sql
 
 from services.api.admission import Admission
 from services.api.database import patiently
@@ -87,17 +86,22 @@ class Runner:
             self._wake.clear()
             try:
                 while not self._closing.is_set() and (lease := self._next()) is not None:
-                    self._current = lease
-                    with log_context(job=lease.job.id, request_id=lease.job.request_id):
+                    with self._working_on(lease):
                         self._run_one(lease)
-                    self._current = None
-            except sql.exc.DBAPIError:
-                logging.getLogger(__name__).exception("the database does not answer; trying again in %g s", ROUND_S)
-            finally:
-                self._current = None
+            except Exception:  # of the database or the data folder; what was leased is lost when its lease runs out
+                logging.getLogger(__name__).exception("running jobs failed; trying again in %g s", ROUND_S)
+
+    @contextmanager
+    def _working_on(self, lease: Lease) -> Iterator[None]:
+        self._current = lease
+        try:
+            with log_context(job=lease.job.id, request_id=lease.job.request_id):
+                yield
+        finally:
+            self._current = None
 
     def _next(self) -> Lease | None:
-        # The oldest job that may start; those that wait for disk or memory let others pass.
+        # The oldest job that may start; those that wait for disk or workers let others pass.
         for job in self._repository.queued():
             if self._admission.holds(job.id, self._locate(job.spec)):
                 continue
@@ -113,7 +117,7 @@ class Runner:
             try:
                 if (lease := self._current) is not None and not self._repository.renew(lease, LEASE_S):
                     log.warning("job %s was taken over by another server", lease.job.id)
-                for job_id in self._repository.lose_expired(self._holder):
+                for job_id in self._repository.lose_expired(lease):
                     log.warning("job %s was lost by its server and is queued again", job_id)
                 self._on_round()
             except Exception:

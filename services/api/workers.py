@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
+from urllib.parse import urlsplit
 
 from services.core.errors import SchedulerLostError
 
@@ -19,6 +21,7 @@ WORKER_CONFIG: Mapping[str, Any] = MappingProxyType(
     {"distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]}  # Ctrl-C is the parent's to handle
 )
 CONNECT_S = 10.0
+PROBE_S = 1.0
 
 
 class Workers:
@@ -41,9 +44,8 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
-    @contextmanager
-    def client(self, count: int) -> Iterator[Client]:
-        """A connection to ``count`` workers, all of them where they run elsewhere.
+    def connect(self, count: int) -> Client:
+        """A connection to ``count`` workers, or to all where they run elsewhere; it stays this object's.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
@@ -52,38 +54,30 @@ class Workers:
             if self._client is not None and self._client.status != "running":
                 self._close()
             if self._client is None:
-                self._open(count)
+                self._client = self._open(count)
             elif self._cluster is not None:
                 self._cluster.scale(count)
-            client = self._client
-        assert client is not None
-        yield client
-
-    def answers(self) -> bool:
-        """Whether jobs could be given to workers: connected, or nothing to connect to yet."""
-        client = self._client
-        return self._scheduler is None or (client is not None and client.status == "running")
+            return self._client
 
     def close(self) -> None:
         """End the processes, or leave those that run elsewhere."""
         with self._lock:
             self._close()
 
-    def _open(self, count: int) -> None:
+    def _open(self, count: int) -> Client:
         import dask
         from distributed import Client, LocalCluster
 
         if self._scheduler is not None:
             try:
-                self._client = Client(self._scheduler, timeout=CONNECT_S)
+                return Client(self._scheduler, timeout=CONNECT_S)
             except OSError as problem:
                 raise SchedulerLostError(f"The scheduler {self._scheduler} does not answer; start it, the job waits.") from problem
-            return
         with dask.config.set(WORKER_CONFIG):
             self._cluster = LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
             )
-        self._client = Client(self._cluster)
+        return Client(self._cluster)
 
     def _close(self) -> None:
         for one in (self._client, self._cluster):
@@ -91,3 +85,19 @@ class Workers:
                 with suppress(OSError, TimeoutError):
                     one.close()
         self._client = self._cluster = None
+
+
+def require_scheduler(address: str) -> None:
+    """Look whether a scheduler listens.
+
+    Args:
+        address: ``tcp://HOST:PORT``
+
+    Raises:
+        SchedulerLostError: nobody listens there.
+    """
+    parts = urlsplit(address)
+    try:
+        socket.create_connection((parts.hostname, parts.port), PROBE_S).close()
+    except (OSError, ValueError) as problem:
+        raise SchedulerLostError(f"The scheduler {address} does not answer; start it, jobs wait for it.") from problem

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import socket
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
@@ -17,13 +18,15 @@ import httpx
 import pytest
 
 from services.api import readiness as readiness_module
+from services.api.admission import KEPT_FREE_BYTES
 from services.api.app import create_app
 from services.api.database import open_database, sqlite_url
 from services.api.jobs import Jobs
 from services.api.migrations import upgrade
-from services.api.readiness import FREE_BYTES_NEEDED, Readiness
+from services.api.readiness import Readiness
 from services.core.settings import DATABASE_FILE, ServerSettings
 from tests.support.live_server import serving
+from tests.support.small_system import free_port
 
 NOBODY = 65534
 
@@ -108,7 +111,7 @@ def test_a_database_replaced_under_the_server_is_told(tmp_path: Path) -> None:
 
 def test_a_disk_that_is_almost_full_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as full:
-        full.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=FREE_BYTES_NEEDED - 1, total=2 * FREE_BYTES_NEEDED))
+        full.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=KEPT_FREE_BYTES - 1, total=2 * KEPT_FREE_BYTES))
         assert bad_checks(client) == {"disk": "Only 255 MiB of disk are free; free at least 256 MiB."}
     assert bad_checks(client) == {}
 
@@ -171,3 +174,12 @@ def unprivileged() -> Iterator[None]:
         yield
     finally:
         os.seteuid(0)
+
+
+def test_a_scheduler_that_does_not_listen_is_told(tmp_path: Path) -> None:
+    settings = ServerSettings(data=tmp_path, scheduler=f"tcp://127.0.0.1:{free_port()}")
+    with serving(create_app(settings, lambda *_: None)) as client:
+        assert bad_checks(client) == {"scheduler": f"The scheduler {settings.scheduler} does not answer; start it, jobs wait for it."}
+        assert settings.scheduler is not None
+        with socket.create_server(("127.0.0.1", int(settings.scheduler.rpartition(":")[2]))):
+            assert bad_checks(client) == {}

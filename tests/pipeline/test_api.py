@@ -268,3 +268,19 @@ def test_failures_say_what_was_measured(serve: Any, capture_folder: str) -> None
     finish(client, job_id)
     failure = client.get(f"/v1/jobs/{job_id}").json()["failure"]
     assert (failure["code"], failure["evidence"]) == ("memory-killed", {"peak_memory_bytes": 5, "memory_limit_bytes": 4})
+
+
+def test_a_runner_that_broke_off_loses_the_job_and_runs_it_again(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.runner.LEASE_S", 0.3)
+    monkeypatch.setattr("services.api.runner.ROUND_S", 0.1)
+    broken = [OSError("The data folder is away.")]
+
+    def withdraw(_folder: Path) -> None:
+        if broken:
+            raise broken.pop()
+
+    monkeypatch.setattr("services.api.runner.withdraw_cancel", withdraw)
+    client = serve()
+    job_id = submit(client, capture_folder).json()["id"]
+    states = [json.loads(line.removeprefix("data: "))["data"]["state"] for line in finish(client, job_id).splitlines() if '"kind":"state"' in line]
+    assert states == ["SUBMITTED", "QUEUED", "RUNNING", "QUEUED", "RUNNING", "SUCCEEDED"]

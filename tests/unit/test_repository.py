@@ -89,10 +89,10 @@ def test_what_is_not_renewed_is_lost_and_its_holder_has_no_say_any_more(reposito
     clock.now_s += 50
     assert repository.renew(old, 60)
     clock.now_s += 50
-    assert repository.lose_expired("b") == []
+    assert repository.lose_expired() == []
     clock.now_s += 20
-    assert repository.lose_expired("a") == []  # the holder itself knows better than a clock
-    assert repository.lose_expired("b") == [job.id]
+    assert repository.lose_expired(old) == []  # the holder itself knows better than a clock
+    assert repository.lose_expired() == [job.id]
     new = repository.lease(job.id, "b", 60)
     assert not repository.renew(old, 60)
     with pytest.raises(FencedError, match="taken over under lease 2"):
@@ -102,6 +102,13 @@ def test_what_is_not_renewed_is_lost_and_its_holder_has_no_say_any_more(reposito
     with repository.address_of(new).open() as log:
         assert log.begin_stage("fit") == 1
     assert repository.settle(new, Trigger.SUCCEED).state is JobState.SUCCEEDED
+
+
+def test_a_server_that_stopped_working_on_a_job_loses_it_like_any_other(repository: Repository, clock: Clock) -> None:
+    # What it holds is told by the lease it works under now, not by its name: a runner that broke off must not keep its job for ever.
+    broken, current = (repository.lease(repository.create(SPEC, None).job.id, "a", 60) for _ in range(2))
+    clock.now_s += 70
+    assert repository.lose_expired(current) == [broken.job.id]
 
 
 def test_many_servers_at_once_never_lease_one_job_twice(opened: Callable[[], Repository]) -> None:
@@ -215,7 +222,7 @@ def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock)
     engine.dispose()
     repository = Repository(url, clock)
     assert [job.id for job in repository.page(9, only=JobFilter(kind="tooth", source="MOUTH"))] == ["old"]
-    assert repository.lose_expired("me") == ["old"]
+    assert repository.lose_expired() == ["old"]
     assert repository.lease("old", "me", 60).number == 1
     repository.close()
 
