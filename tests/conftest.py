@@ -1,8 +1,10 @@
-"""One option for all tests: the device on which paths are traced."""
+"""For all tests: the device on which paths are traced, and how long a slow one may take."""
 
 from __future__ import annotations
 
 import pytest
+
+SLOW_TIMEOUT_S = 3600
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -19,3 +21,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             prepare_device(backend=device)
         except PlatformError as problem:
             raise pytest.UsageError(str(problem)) from problem
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))

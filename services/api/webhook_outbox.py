@@ -1,7 +1,7 @@
 """From the event table to what is to be delivered. Everything here runs inside the caller's transaction.
 
 A cursor says how far the event table was read; it moves in the same transaction that adds the deliveries, so that a restart neither loses nor
-repeats one. That rests on event ids becoming visible in their order, for which ``events.writing`` lets one writer in at a time.
+repeats one. That rests on event ids becoming visible in their order, for which ``database.writing`` lets one writer in at a time.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from services.fit.anatomy.phantom import write_phantom
 from services.fit.stage import export, run
 from services.preprocess.stage import run as prepare
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,6 @@ def test_half_spaces_agree_with_the_h_function() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
 def test_half_spaces_agree_with_the_h_function_to_four_digits() -> None:
     # At 0.999 a path scatters 40 times on average, at 0.99999 several hundred times, which has the wider tolerance.
     cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99", "0.999")

@@ -14,7 +14,6 @@ from services.fit.figures.__main__ import main
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
 def test_a_figure_is_made_from_nothing_and_its_fit_used_again(tmp_path: Path) -> None:
     arguments = ["--quick", "--only", "fig13", "--out", str(tmp_path)]
     assert main(arguments) == 0

@@ -24,7 +24,6 @@ LEAST_GAIN = 0.2
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
 def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     write_phantom(capture, pixel_mm=PIXEL_MM, cameras=2, lights=12, renderer="mitsuba", samples=256, stains=True, seed=SEED)
