@@ -32,7 +32,7 @@ from services.fit.optics.parameters import Tissue
 from services.fit.schedule import ChannelSchedule
 from services.fit.stage import fitted_teeth, run
 from services.fit.transport.platform import prepare_device
-from tests.support.truths import SIDE_LIGHTS, Truth, write_capture
+from tests.support.truths import SIDE_LIGHTS, Truth, read, write_capture
 
 LAYERED = ("central-incisor", "canine", "premolar")
 HOMOGENEOUS = "homogeneous"
@@ -142,13 +142,11 @@ def known(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 
 def free(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """Dentin's shape fitted. Only the product of density and thickness shows, so that with enamel known the map is scaled by found over true density."""
+    """Dentin's shape fitted, enamel's density known."""
     for subject in subjects:
-        fit = bench.fit(subject, "free", dentin="fit")
-        scale = fit.tissue.enamel.sigma_s_reduced / fit.truth.medium("enamel")["sigma_s_reduced"]
-        value = float(np.abs(scale * thickness_mm(fit) - true_thickness_mm(fit)).mean())
-        unscaled = float(np.abs(thickness_mm(fit) - true_thickness_mm(fit)).mean())
-        note = f"{fit.note()}; {unscaled:.3f} mm unscaled; c = {', '.join(f'{c:.2f}' for c in fit.report.shape)}"
+        fit = bench.fit(subject, "free", dentin="fit", held=known_enamel(subject))
+        value = float(np.abs(thickness_mm(fit) - true_thickness_mm(fit)).mean())
+        note = f"{fit.note()}; c = {', '.join(f'{c:.2f}' for c in fit.report.shape)}"
         yield Figure("free", subject, "thickness, incisal half, mm", value, 0.15, 0.08, fit.seconds, note)
 
 
@@ -214,6 +212,16 @@ def _incisal_half(fit: Fit) -> NDArray[np.bool_]:
     rows = np.flatnonzero((np.nan_to_num(thickness) > 0.15).any(axis=1))
     middle = (rows[0] + rows[-1]) / 2
     return np.asarray(np.isfinite(thickness) & (np.arange(len(thickness)) > middle)[:, None])
+
+
+def known_enamel(subject: str) -> dict[str, float]:
+    """A truth's enamel as one lobe of the same reduced scattering and absorption, similar to its two lobes to the second order; only absorption is fitted."""
+    enamel = read(subject).medium("enamel")
+    lobes = ((enamel["beta"], enamel["g1"]), (1 - enamel["beta"], enamel["g2"]))
+    first, second = (sum(share * g**n for share, g in lobes) for n in (1, 2))
+    g = (1 - second) / (1 - first) - 1
+    sigma = enamel["sigma_s_reduced"] / (1 - g) + (1 - enamel["alpha"]) * enamel["sigma"]
+    return {"enamel.sigma": sigma, "enamel.g1": g}
 
 
 def _perturbed(seed: int) -> Callable[[ChannelSchedule], Tissue]:

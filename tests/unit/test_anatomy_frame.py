@@ -12,6 +12,7 @@ from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.anatomy.frame import ToothFrame, estimate_frame
 from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.jaw import build_jaw
 from tests.support.shared_data import shared_path
 
 VIEWPOINTS = np.array([[300.0, 950.0, 100.0], [-300.0, 950.0, -100.0]])
@@ -25,6 +26,14 @@ def test_the_procedural_incisor_is_recognised_in_any_pose(seed: int) -> None:
     # The wedge's axis of inertia leans a few degrees against the axis it is built on.
     assert np.degrees(np.arccos(np.clip(np.diag(frame.rotation @ turn), -1, 1))).max() < 8
     np.testing.assert_allclose(frame.rotation @ frame.rotation.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("subject", [None, 1])
+def test_every_tooth_with_a_stub_of_root_but_molars_points_to_its_edge(subject: int | None) -> None:
+    for tooth in build_jaw(subject).teeth:
+        if tooth.fdi % 10 <= 5:
+            frame = estimate_frame(tooth.outer, VIEWPOINTS)
+            assert frame.axes[2] @ tooth.frame.axes[2] > np.cos(np.radians(8)), tooth.fdi
 
 
 def test_the_scanned_incisor_is_seen_by_its_landmarks() -> None:

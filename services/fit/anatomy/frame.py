@@ -11,6 +11,10 @@ from services.core.geometry import Mesh
 
 ELONGATED = 1.3
 """Ratio of the two largest principal spreads above which a mesh holds enough root for its long axis to be the tooth's axis."""
+WHOLE_ROOT = 2.1
+"""Length over largest diameter above which a mesh holds a whole root: 2.4 to 3.4 with one, 1.4 to 1.8 with a stub of 4 mm."""
+END = 0.1
+"""Share of the length that counts as an end."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +44,12 @@ class ToothFrame:
 
 
 def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFrame:
-    """Canonical frame of a front tooth from its shape and from where it is seen.
+    """Canonical frame of an incisor, canine or premolar from its shape and from where it is seen.
 
-    The occlusal axis is the mesh's long axis where there is a root, towards the end with the flatter cross-section (the incisal edge); for a bare crown
-    it points from the centre of volume to the centre of the outline, because a front tooth thins towards its edge. Buccal is the direction of the
-    cameras across that axis. Mesial is y × z, which for the other half of the jaw is distal; the blend modes do not tell them apart.
+    The occlusal axis is the mesh's long axis where there is a root: away from the end to which a whole root tapers, or from the blunter end, which is
+    that of a root cut short. For a bare crown it points from the centre of volume to that of the outline, because a front tooth thins towards its edge.
+    Molars are not known by it. Buccal is the direction of the cameras across that axis. Mesial is y × z, which for the other half of the jaw is distal;
+    the blend modes do not tell them apart.
 
     Args:
         viewpoints_mm: camera centres (N, 3).
@@ -60,7 +65,7 @@ def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFram
     spread, principal = np.linalg.eigh(np.cov((middles - centroid).T, aweights=areas))
     if np.sqrt(spread[2] / spread[1]) > ELONGATED:
         axis = principal[:, 2]
-        axis = axis if _flatness(middles - centroid, areas, axis) > _flatness(middles - centroid, areas, -axis) else -axis
+        axis = axis if _leads_to_the_crown(middles - centroid, areas, axis) else -axis
     else:
         # Divergence theorem for the centre of volume; triangles weighted by their area seen along the view for the centre of the outline.
         volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
@@ -75,10 +80,16 @@ def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFram
     return ToothFrame(rotation, -rotation @ centre)
 
 
-def _flatness(offsets_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]) -> float:
-    # Ratio of the principal spreads of the cross-section in the last tenth along the axis.
+def _leads_to_the_crown(offsets_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
     along = offsets_mm @ axis
-    end = along > along.max() - 0.1 * np.ptp(along)
-    across = offsets_mm[end] - np.outer(along[end], axis)
-    spread = np.linalg.eigvalsh(np.cov(across.T, aweights=areas[end]))
-    return float(np.sqrt(spread[2] / max(spread[1], 1e-9)))
+    across = offsets_mm - np.outer(along, axis)
+    low, high, length = along.min(), along.max(), np.ptp(along)
+    if length > WHOLE_ROOT * 2 * np.linalg.norm(across, axis=1).max():
+        return bool(high < -low)  # from the centre of the surface, which lies in the crown's half
+    spreads = [np.sqrt(np.linalg.det(_plane_covariance(across[end], areas[end], axis))) for end in (along < low + END * length, along > high - END * length)]
+    return bool(spreads[1] < spreads[0])
+
+
+def _plane_covariance(across_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    plane = np.linalg.svd(axis[None])[2][1:]
+    return np.asarray(np.cov((across_mm @ plane.T).T, aweights=areas))
