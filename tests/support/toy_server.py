@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,24 +13,30 @@ from services.api.server import serve
 from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.core.stage import StageName
 from tests.support.toy_stages import DOORS
 
 LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 
 
+def serve_doors(settings: ServerSettings, doors: Mapping[StageName, str]) -> None:
+    """Serve with these stages on real workers."""
+    with Workers(settings.scheduler) as workers:
+
+        def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+            run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True)
+
+        serve(settings, run_toys)
+
+
 def main(settings: ServerSettings) -> None:
-    """Serve with toy stages on real workers."""
+    """Serve with toy stages and short leases."""
     with (
         patch("services.api.runner.LEASE_S", LEASE_S),
         patch("services.api.runner.ROUND_S", ROUND_S),
         patch("services.api.admission.RETRY_S", RETRY_S),
-        Workers(settings.scheduler) as workers,
     ):
-
-        def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-            run_job(spec, folder, events=events, doors=DOORS, cluster=workers, is_logged=True)
-
-        serve(settings, run_toys)
+        serve_doors(settings, DOORS)
 
 
 if __name__ == "__main__":

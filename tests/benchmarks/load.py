@@ -1,0 +1,43 @@
+"""The server under load: requests against a bare route, event streams, a long queue, and a day at speed, as JSON.
+
+python -m tests.benchmarks.load --json load.json [--quick] [--only mixed,streams,queue,day]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from tests.load import mixed
+
+PARTS: dict[str, tuple[Callable[..., Iterable[dict[str, Any]]], dict[str, Any], dict[str, Any]]] = {
+    "mixed": (mixed.measure, {"rounds": 12, "round_s": 15.0, "jobs": 1000, "fitted": 10}, {"rounds": 2, "round_s": 4.0, "jobs": 50, "fitted": 2}),
+}
+"""What measures, its size, and its size where it only has to be quick."""
+
+
+def main() -> None:
+    """Read the options, measure, print and write one row per point."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--quick", action="store_true", help="a few seconds each, which say whether it works, not how fast it is")
+    parser.add_argument("--only", default=",".join(PARTS), help="parts to measure, separated by commas")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    rows = []
+    for name in options.only.split(","):
+        measure, full, quick = PARTS[name]
+        with tempfile.TemporaryDirectory() as work:
+            for row in measure(Path(work), **(quick if options.quick else full), seed=options.seed):
+                print(json.dumps(row), flush=True)
+                rows.append(row)
+                if options.json is not None:
+                    options.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

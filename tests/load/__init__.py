@@ -1,0 +1,1 @@
+"""A server under load: a program of its own measures it, see ``tests.benchmarks.load``."""
