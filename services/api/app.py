@@ -47,7 +47,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
         run_job(spec, folder, events=events, cluster=workers, is_logged=True)
 
     jobs = Jobs(settings, run or run_on_workers)
-    feed = EventFeed(jobs.repository.newest_event)
+    feed = EventFeed(jobs.repository)
     observation = Observation(jobs, settings)
 
     @asynccontextmanager

@@ -14,16 +14,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import sqlalchemy as sql
 from pydantic import Field
+from pydantic_core import from_json
 
 from services.api.database import metadata, open_database, sqlite_url, writing
 from services.core.errors import FencedError
 from services.core.geometry import Record
 from services.core.stage import StageEvent, StageName
 
+PAGE = 1000
+"""Events read at once."""
 EVENTS_FILE = "events.sqlite"
 """Name of a job folder's own event table."""
 
@@ -63,6 +66,16 @@ class JobEvent(Record):
     kind: Literal["state", "started", "progress", "log", "step", "preview", "finished"]
     message: str
     done: float | None = Field(description="fraction of the stage done, 0 to 1")
+    data: dict[str, Any]
+
+
+_COLUMNS = tuple(JobEvent.model_fields)
+
+
+class Told(NamedTuple):
+    """When an event was told, and its data."""
+
+    time_s: float
     data: dict[str, Any]
 
 
@@ -137,12 +150,24 @@ class EventLog:
                 raise FencedError(f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are refused.")
             insert_event(connection, self.job, attempt, event)
 
-    def read(self, after: int = 0, limit: int = 1000, **only: str | int | None) -> list[JobEvent]:
+    def read(self, after: int = 0, limit: int = PAGE, **only: str | int | None) -> list[JobEvent]:
         """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None for anything."""
         query = sql.select(event_table).where(event_table.c.job == self.job, event_table.c.id > after).order_by(event_table.c.id).limit(limit)
         query = query.where(*(event_table.c[column] == value for column, value in only.items() if value is not None))
         with self._engine.connect() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
+
+    def told(self, kind: str) -> Iterator[Told]:
+        """All events of one kind, oldest first, as little of them as a curve of hundreds needs."""
+        columns = sql.select(event_table.c.id, event_table.c.time_s, event_table.c.data).where(event_table.c.job == self.job, event_table.c.kind == kind)
+        after: int | None = 0
+        while after is not None:
+            query = columns.where(event_table.c.id > after).order_by(event_table.c.id).limit(PAGE)
+            with self._engine.connect() as connection:
+                rows = connection.execute(query).all()
+            data = from_json("[" + ",".join(row.data for row in rows) + "]")
+            yield from map(Told, (row.time_s for row in rows), data)
+            after = rows[-1].id if len(rows) == PAGE else None
 
     def latest(self) -> list[JobEvent]:
         """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""
@@ -173,4 +198,5 @@ class EventLog:
 
 
 def _event(row: Any, **changes: Any) -> JobEvent:
-    return JobEvent(**{name: row[name] for name in JobEvent.model_fields} | {"data": json.loads(row["data"])} | changes)
+    # Not validated again: the row is this program's own, and a curve has hundreds.
+    return JobEvent.model_construct(**{name: row[name] for name in _COLUMNS} | {"data": json.loads(row["data"])} | changes)

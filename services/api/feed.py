@@ -1,57 +1,109 @@
-"""Wakes event streams when the event table has grown: one query for all of them, however many there are."""
+"""Event streams: one query finds which jobs have new events, and one read serves all streams that are equally far, however many there are."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import suppress
+from dataclasses import dataclass, field
 
 import sqlalchemy as sql
+from fastapi.responses import StreamingResponse
+from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
-from services.api.events import JobEvent
-from services.api.lifecycle import JobState
 from services.api.repository import Repository
 
 PERIOD_S = 0.2
+PING_S = 15.0
+"""A silent stream says that it lives this often."""
+MOST_EVENTS = 1000
+"""Read and sent at once."""
+
+
+class EventStream(StreamingResponse):
+    """Server-sent events. FastAPI's own goes through three tasks per stream, and sends events one by one."""
+
+    media_type = "text/event-stream"
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """Events of a job after some id, as they are sent; the last one carries the final state."""
+
+    text: bytes
+    last_id: int
+    is_last: bool
+    is_full: bool
+    """Whether more may have happened already."""
+
+
+@dataclass
+class Turn:
+    """From one growth of the event table to the next. Streams walk from turn to turn, so that they miss none while they send."""
+
+    ended: asyncio.Event = field(default_factory=asyncio.Event)
+    jobs: frozenset[str] = frozenset()
+    """Those that have new events, once it has ended."""
+    following: Turn | None = None
+    reads: dict[tuple[str, int], asyncio.Task[Chapter]] = field(default_factory=dict)
+    """Under way, by job and the id after which they read."""
 
 
 class EventFeed:
-    """Follows the newest event's id while ``run`` runs."""
+    """Follows the event table while ``run`` runs. Made before the first stream, so that no event falls between what that has read and what is looked for."""
 
-    def __init__(self, newest_event: Callable[[], int]) -> None:
-        self._newest_event = newest_event
-        self._grown = asyncio.Condition()
-        self.newest = 0
+    def __init__(self, repository: Repository) -> None:
+        self._repository, self._newest = repository, repository.newest_event()
+        self._turn = Turn()
 
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
         while True:
-            newest = self.newest
+            newest: dict[str, int] = {}
             with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
-                newest = await asyncio.to_thread(self._newest_event)
-            if newest > self.newest:
-                async with self._grown:
-                    self.newest = newest
-                    self._grown.notify_all()
+                newest = await asyncio.to_thread(self._repository.newest_events, self._newest)
+            if newest:
+                self._newest = max(newest.values())
+                ended, self._turn = self._turn, Turn()
+                ended.jobs, ended.following = frozenset(newest), self._turn
+                ended.ended.set()
             await asyncio.sleep(PERIOD_S)
 
-    async def beyond(self, event_id: int) -> None:
-        """Wait until some event is newer than this one."""
-        async with self._grown:
-            await self._grown.wait_for(lambda: self.newest > event_id)
+    async def follow(self, job_id: str, after: int) -> AsyncIterator[bytes]:
+        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state."""
+        while True:
+            turn = self._turn
+            chapter = await self._read(turn, job_id, after)
+            if chapter.text:
+                yield chapter.text
+            if chapter.is_last:
+                return
+            after = chapter.last_id
+            while not chapter.is_full:
+                try:
+                    async with asyncio.timeout(PING_S):
+                        await turn.ended.wait()
+                except TimeoutError:
+                    yield KEEPALIVE_COMMENT
+                    continue
+                if job_id in turn.jobs or turn.following is None:
+                    break
+                turn = turn.following
+
+    async def _read(self, turn: Turn, job_id: str, after: int) -> Chapter:
+        """Read what happened up to this turn at least; whoever asks the same in the same turn shares the read."""
+        key = (job_id, after)
+        if key not in turn.reads:
+            turn.reads[key] = asyncio.create_task(asyncio.to_thread(_read, self._repository, job_id, after))
+            turn.reads[key].add_done_callback(lambda _: turn.reads.pop(key))
+        return await asyncio.shield(turn.reads[key])
 
 
-async def follow(repository: Repository, feed: EventFeed, job_id: str, after: int) -> AsyncIterator[JobEvent | JobState]:
-    """A job's events after an id, replayed and then live, and its final state once it has ended and all is told."""
-    log = repository.events_of(job_id)
-    while True:
-        seen = feed.newest
-        state = (await asyncio.to_thread(repository.get, job_id)).state
-        while events := await asyncio.to_thread(log.read, after):
-            for event in events:
-                yield event
-            after = events[-1].id
-        if state.is_final:
-            yield state
-            return
-        await feed.beyond(seen)
+def _read(repository: Repository, job_id: str, after: int) -> Chapter:
+    state = repository.get(job_id).state  # before its events: those of a final state are then among them
+    events = repository.events_of(job_id).read(after, MOST_EVENTS)
+    told = [format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events]
+    is_full = len(events) == MOST_EVENTS
+    if is_last := state.is_final and not is_full:
+        told.append(format_sse_event(event="end", data_str=f'"{state}"'))
+    return Chapter(b"".join(told), events[-1].id if events else after, is_last, is_full)

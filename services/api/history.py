@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 from pydantic import Field
 
-from services.api.events import EventLog, JobEvent
+from services.api.events import EventLog, JobEvent, Told
 from services.core.geometry import Record
 from services.core.stage import StageName
 
 PICTURES = ("render", "photo", "residual")
-_PAGE = 1000
 
 
 class LogLine(Record):
@@ -94,10 +92,10 @@ def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> Preview
 def read_history(log: EventLog, points: int, channel: str | None = None) -> History:
     """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later attempt repeats replaces the earlier one."""
     thinned: dict[str, _Thinned] = {}
-    for event in _events(log, "step"):
-        name = str(event.data.get("channel", ""))
-        if isinstance(event.data.get("step"), int) and channel in {None, name}:
-            thinned.setdefault(name, _Thinned(points)).add(event)
+    for told in log.told("step"):
+        name = str(told.data.get("channel", ""))
+        if isinstance(told.data.get("step"), int) and channel in {None, name}:
+            thinned.setdefault(name, _Thinned(points)).add(told)
     return History(series=[_series(name, one) for name, one in thinned.items()])
 
 
@@ -106,11 +104,11 @@ class _Thinned:
 
     def __init__(self, points: int) -> None:
         self._points, self._stride = points, 1
-        self._kept: dict[int, JobEvent] = {}
-        self._first: JobEvent | None = None
-        self._last: JobEvent | None = None
+        self._kept: dict[int, Told] = {}
+        self._first: Told | None = None
+        self._last: Told | None = None
 
-    def add(self, event: JobEvent) -> None:
+    def add(self, event: Told) -> None:
         """Take in a step."""
         if self._first is None or event.data["step"] <= self._first.data["step"]:
             self._first = event
@@ -122,17 +120,10 @@ class _Thinned:
             self._stride *= 2
             self._kept = {step: kept for step, kept in self._kept.items() if step % self._stride == 0}
 
-    def events(self) -> list[JobEvent]:
+    def events(self) -> list[Told]:
         """What is left, in the order of steps."""
         ends = {event.data["step"]: event for event in (self._first, self._last) if event is not None}
         return [event for _, event in sorted((self._kept | ends).items())]
-
-
-def _events(log: EventLog, kind: str) -> Iterator[JobEvent]:
-    after = 0
-    while events := log.read(after, _PAGE, kind=kind):
-        yield from events
-        after = events[-1].id
 
 
 def _series(channel: str, thinned: _Thinned) -> Series:

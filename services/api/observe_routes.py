@@ -2,18 +2,18 @@
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 
 from services.api.archive import stream_zip
 from services.api.artifacts import artifact_response, list_artifacts, open_artifact
+from services.api.events import EventLog
 from services.api.guard import needs
 from services.api.history import History, LogPage, PreviewPage, read_history, read_log, read_previews
 from services.api.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
 from services.api.problems import refusals
-from services.api.repository import Job
 from services.core.errors import UnknownJobError
 from services.core.stage import StageName
 
@@ -24,46 +24,45 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
 
-    def find_job(job_id: str) -> Job:
-        return jobs.repository.get(job_id)
-
-    Found = Annotated[Job, Depends(find_job)]
+    def events_of(job_id: str) -> EventLog:
+        return jobs.repository.events_of(jobs.repository.get(job_id).id)
 
     @router.get("/jobs/{job_id}/logs", tags=["jobs"], dependencies=[needs("read")])
     def logs(
-        job: Found,
+        job_id: str,
         after: After = 0,
         limit: Annotated[int, Query(ge=1, le=1000)] = 200,
         stage: StageName | None = None,
         attempt: Annotated[int | None, Query(ge=1, lt=2**31)] = None,
     ) -> LogPage:
         """What the job's stages said, oldest first."""
-        return read_log(jobs.repository.events_of(job.id), after, limit, stage, attempt)
+        return read_log(events_of(job_id), after, limit, stage, attempt)
 
     @router.get("/jobs/{job_id}/history", tags=["jobs"], dependencies=[needs("read")])
-    def history(job: Found, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> History:
+    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> History:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
-        return read_history(jobs.repository.events_of(job.id), points, channel)
+        return read_history(events_of(job_id), points, channel)
 
     @router.get("/jobs/{job_id}/previews", tags=["artifacts"], dependencies=[needs("read")])
-    def previews(job: Found, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
+    def previews(job_id: str, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
         """Pictures that the fit has made so far, oldest first."""
-        return read_previews(jobs.repository.events_of(job.id), job.id, after, limit)
+        return read_previews(events_of(job_id), job_id, after, limit)
 
     @router.get("/jobs/{job_id}/previews/{preview_id}/{picture}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
     def preview(
-        job: Found, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request
+        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request
     ) -> Response:
         """One picture; takes Range and If-None-Match."""
-        events = jobs.repository.events_of(job.id).read(preview_id - 1, 1, kind="preview")
+        events = events_of(job_id).read(preview_id - 1, 1, kind="preview")
         path = events[0].data.get(picture) if events and events[0].id == preview_id else None
         if not isinstance(path, str):
             raise UnknownJobError(f"The job has no {picture} of preview {preview_id}; list its previews to see their ids.")
-        return artifact_response(request, open_artifact(jobs.folder(job.id), path))
+        return artifact_response(request, open_artifact(jobs.folder(job_id), path))
 
     @router.get("/jobs/{job_id}/artifacts.zip", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
-    def archive(job: Found) -> Response:
+    def archive(job_id: str) -> Response:
         """All artifacts as one zip file, made while it is sent."""
+        job = jobs.repository.get(job_id)
         root = jobs.folder(job.id)
         names = [artifact.path for artifact in list_artifacts(root)]
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.zip"', "Cache-Control": "no-store"}

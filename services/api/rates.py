@@ -5,44 +5,54 @@ from __future__ import annotations
 import ipaddress
 import math
 import time
-from typing import TYPE_CHECKING
+from collections import deque
 
 from services.core.settings import RateSettings
 
-if TYPE_CHECKING:
-    from limits import RateLimitItem
+
+class MovingWindow:
+    """Grants each key so many hits within any stretch of time."""
+
+    def __init__(self, most: int, seconds: float) -> None:
+        self._most, self._seconds = most, seconds
+        self._hits: dict[str, deque[float]] = {}
+        self._sweep_at = 0.0
+
+    def hit(self, key: str) -> int:
+        """Count a hit and answer 0, or answer how many seconds to wait for the next one that is granted."""
+        now = time.time()
+        if now >= self._sweep_at:
+            self._hits = {one: hits for one, hits in self._hits.items() if hits[-1] > now - self._seconds}
+            self._sweep_at = now + self._seconds
+        hits = self._hits.setdefault(key, deque())
+        while hits and hits[0] <= now - self._seconds:
+            hits.popleft()
+        if len(hits) >= self._most:
+            return max(1, math.ceil(hits[0] + self._seconds - now))
+        hits.append(now)
+        return 0
 
 
 class Rates:
-    """Counts requests; every method answers how many seconds to wait, 0 where the request may go on."""
+    """Counts requests; every method answers how many seconds to wait, 0 where the request may go on. To be called from one thread."""
 
     def __init__(self, settings: RateSettings) -> None:
-        from limits import RateLimitItemPerMinute, RateLimitItemPerSecond
-        from limits.storage import MemoryStorage
-        from limits.strategies import MovingWindowRateLimiter
-
-        self._limiter = MovingWindowRateLimiter(MemoryStorage())
-        self._reads = RateLimitItemPerSecond(settings.reads_per_10_s, 10, "reads")
-        self._writes = RateLimitItemPerSecond(settings.writes_per_10_s, 10, "writes")
-        self._refusals = RateLimitItemPerMinute(settings.refusals_per_minute, 1, "refusals")
-        self._tellings = RateLimitItemPerMinute(1, 1, "tellings")
+        self._reads = MovingWindow(settings.reads_per_10_s, 10.0)
+        self._writes = MovingWindow(settings.writes_per_10_s, 10.0)
+        self._refusals = MovingWindow(settings.refusals_per_minute, 60.0)
+        self._tellings = MovingWindow(1, 60.0)
 
     def count(self, caller: str, *, is_change: bool) -> int:
         """Count a request of a token or an address."""
-        return self._hit(self._writes if is_change else self._reads, caller)
+        return (self._writes if is_change else self._reads).hit(caller)
 
     def count_refusal(self, address: str) -> int:
         """Count a request without a valid token."""
-        return self._hit(self._refusals, address)
+        return self._refusals.hit(address)
 
     def is_worth_telling(self, address: str) -> bool:
         """True once a minute for an address."""
-        return self._hit(self._tellings, address) == 0
-
-    def _hit(self, item: RateLimitItem, key: str) -> int:
-        if self._limiter.hit(item, key):
-            return 0
-        return max(1, math.ceil(self._limiter.get_window_stats(item, key).reset_time - time.time()))
+        return self._tellings.hit(address) == 0
 
 
 def network_of(address: str) -> str:

@@ -303,6 +303,12 @@ class Repository:
         with self.engine.connect() as connection:
             return connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
 
+    def newest_events(self, after: int) -> dict[str, int]:
+        """Jobs with events after an id, and the id of the last one of each."""
+        query = sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > after).group_by(event_table.c.job)
+        with self.engine.connect() as connection:
+            return {row.job: row.newest for row in connection.execute(query)}
+
     def _lease_number(self, connection: sql.Connection, job_id: str) -> int:
         return connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == job_id)) or 0
 

@@ -1,14 +1,13 @@
 """The REST routes below ``/v1``. Annotations are evaluated here, because FastAPI reads them and they name local dependencies."""
 
-from collections.abc import AsyncIterator
+import json
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from fastapi.sse import EventSourceResponse, ServerSentEvent
+from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
 
 from services.api.artifacts import Artifact, artifact_response, list_artifacts, open_artifact
-from services.api.feed import EventFeed, follow
+from services.api.feed import EventFeed, EventStream
 from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
@@ -41,14 +40,10 @@ class Health(Record):
 def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
-
-    def find_job(job_id: str) -> Job:
-        return jobs.repository.get(job_id)
+    schema = json.dumps(JobSpec.model_json_schema())
 
     def detail(job: Job) -> JobDetail:
         return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job), waits_for=jobs.waits_for(job))
-
-    Found = Annotated[Job, Depends(find_job)]
 
     @router.post("/jobs", status_code=201, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
@@ -74,53 +69,49 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("read")])
-    def get(job: Found) -> JobDetail:
+    def get(job_id: str) -> JobDetail:
         """One job with its stages."""
-        return detail(job)
+        return detail(jobs.repository.get(job_id))
 
     @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
-    def cancel(job: Found) -> Job:
+    def cancel(job_id: str) -> Job:
         """Cancel a job. The lights go off first; what it has published is kept."""
-        return jobs.cancel(job.id)
+        return jobs.cancel(job_id)
 
     @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
-    def retry(job: Found) -> Job:
+    def retry(job_id: str) -> Job:
         """Queue a failed or cancelled job again; it resumes from what it had published."""
-        return jobs.retry(job.id)
+        return jobs.retry(job_id)
 
     @router.delete("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
-    def delete(job: Found) -> Deletion:
+    def delete(job_id: str) -> Deletion:
         """Remove everything that is stored of a job that has ended; the answer is the receipt."""
-        return jobs.delete(job.id)
+        return jobs.delete(job_id)
 
     @router.get("/deletions/{job_id}", tags=["jobs"], dependencies=[needs("read")])
     def deletion(job_id: str) -> Deletion:
         """The receipt of a deleted job."""
         return jobs.repository.deletion(job_id)
 
-    @router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, tags=["jobs"], dependencies=[needs("read")])
-    async def events(job: Found, last_event_id: Annotated[int | None, Header()] = None) -> AsyncIterator[ServerSentEvent]:
+    @router.get("/jobs/{job_id}/events", response_class=EventStream, tags=["jobs"], dependencies=[needs("read")])
+    def events(job_id: str, last_event_id: Annotated[int | None, Header()] = None) -> EventStream:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
-        async for event in follow(jobs.repository, feed, job.id, last_event_id or 0):
-            if isinstance(event, JobState):
-                yield ServerSentEvent(event="end", data=event)
-            else:
-                yield ServerSentEvent(id=str(event.id), data=event)
+        return EventStream(feed.follow(jobs.repository.get(job_id).id, last_event_id or 0), headers={"X-Accel-Buffering": "no"})
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
-    def artifacts(job: Found) -> list[Artifact]:
+    def artifacts(job_id: str) -> list[Artifact]:
         """List the job's files."""
-        return list_artifacts(jobs.folder(job.id))
+        return list_artifacts(jobs.folder(jobs.repository.get(job_id).id))
 
     @router.get("/jobs/{job_id}/artifacts/{path:path}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
-    def artifact(job: Found, path: str, request: Request) -> Response:
+    def artifact(job_id: str, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
-        return artifact_response(request, open_artifact(jobs.folder(job.id), path))
+        return artifact_response(request, open_artifact(jobs.folder(jobs.repository.get(job_id).id), path))
 
-    @router.get("/options", tags=["options"], dependencies=[needs("read")])
-    def options() -> dict[str, Any]:
+    @router.get("/options", response_model=dict[str, Any], tags=["options"], dependencies=[needs("read")])
+    async def options() -> Response:
         """JSON schema of a job's options with defaults, units and help."""
-        return JobSpec.model_json_schema()
+        return Response(schema, media_type="application/json")
 
     @router.get("/openapi.json", include_in_schema=False, dependencies=[needs("read")])
     def description(request: Request) -> dict[str, Any]:
@@ -129,7 +120,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return described
 
     @router.get("/health/live", tags=["health"])
-    def live() -> Health:
+    async def live() -> Health:
         """Whether the process answers."""
         return Health(status="live")
 

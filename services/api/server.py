@@ -54,7 +54,8 @@ def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
 
 
 def _listen(settings: ServerSettings) -> socket.socket:
-    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
+    # asyncio sends small answers at once (TCP_NODELAY) only where the protocol is named; else each waits some 40 ms for an acknowledgement
+    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((settings.host, settings.port))

@@ -28,7 +28,9 @@ def build(database: str) -> FastAPI:
 
 def main(database: str) -> None:
     """Serve as ``services.api.server`` does: one worker, the same loop and HTTP implementation, no access log."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
         print(f"http://127.0.0.1:{listener.getsockname()[1]}", flush=True)
         config = uvicorn.Config(build(database), log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
         uvicorn.Server(config).run(sockets=[listener])

@@ -97,7 +97,9 @@ def _figures(answers: Sequence[Answer]) -> Row:
     latencies = [answer.latency_s for answer in answers]
     named = {f"p{100 * q:g}_s": round(float(np.quantile(latencies, q)), 6) for q in QUANTILES}
     wrong = sorted({f"{answer.kind}: {answer.status}" for answer in answers if not answer.is_right})
-    return {"requests": len(answers), "wrong": sum(not answer.is_right for answer in answers), "wrong_kinds": wrong} | named | {"max_s": round(max(latencies), 6)}
+    return (
+        {"requests": len(answers), "wrong": sum(not answer.is_right for answer in answers), "wrong_kinds": wrong} | named | {"max_s": round(max(latencies), 6)}
+    )
 
 
 def _p99(rounds: Sequence[Sequence[Answer]]) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import types
 
-import limits.storage.memory
 import pytest
 
 from services.api import rates
@@ -16,8 +15,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s = 1_800_000_000.0
         fake = types.SimpleNamespace(time=lambda: self.now_s)
-        for module in (limits.storage.memory, rates):
-            monkeypatch.setattr(module, "time", fake)
+        monkeypatch.setattr(rates, "time", fake)
 
 
 @pytest.fixture
