@@ -12,10 +12,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from tests.load import mixed
+from tests.load import day, mixed, streams, submissions
 
 PARTS: dict[str, tuple[Callable[..., Iterable[dict[str, Any]]], dict[str, Any], dict[str, Any]]] = {
     "mixed": (mixed.measure, {"rounds": 12, "round_s": 15.0, "jobs": 1000, "fitted": 10}, {"rounds": 2, "round_s": 4.0, "jobs": 50, "fitted": 2}),
+    "streams": (streams.measure, {"streams": 500, "steps": 400, "period_s": 0.05}, {"streams": 50, "steps": 40, "period_s": 0.02}),
+    "queue": (submissions.measure, {"jobs": 100}, {"jobs": 5}),
+    "day": (day.measure, {"quarters": day.QUARTERS_OF_A_DAY}, {"quarters": 8}),
 }
 """What measures, its size, and its size where it only has to be quick."""
 

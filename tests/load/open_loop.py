@@ -31,9 +31,9 @@ class Answer:
     body: bytes
 
 
-def session(served: Served) -> aiohttp.ClientSession:
-    """As many connections as are needed, kept open."""
-    connector = aiohttp.TCPConnector(limit=0)
+def session(served: Served, connections: int = 256) -> aiohttp.ClientSession:
+    """At most so many kept connections, 0 for any number; a request that finds all of them busy waits, which counts."""
+    connector = aiohttp.TCPConnector(limit=connections)
     return aiohttp.ClientSession(served.address, connector=connector, headers=served.headers, timeout=aiohttp.ClientTimeout(total=None, sock_read=60))
 
 

@@ -1,4 +1,7 @@
-"""Toy stages whose fit goes on at a pace: with solver = adam it waits for ``go`` in the job's folder and takes ``adam_steps`` steps, ``adam_rate`` seconds apart."""
+"""Toy stages whose fit goes on at a pace.
+
+With solver = adam it waits for ``go`` in the job's folder and then takes ``adam_steps`` steps, ``adam_rate`` seconds apart.
+"""
 
 from __future__ import annotations
 
