@@ -58,6 +58,15 @@ def test_an_address_is_told_of_once_a_minute(clock: Clock) -> None:
     assert limited.is_worth_telling("a")
 
 
+def test_those_who_stay_away_are_forgotten(clock: Clock) -> None:
+    window = rates.MovingWindow(2, 10.0)
+    for number in range(100):
+        window.hit(f"address {number}")
+    clock.now_s += 10.01
+    window.hit("a")
+    assert list(window._hits) == ["a"]
+
+
 @pytest.mark.parametrize(
     ("address", "network"),
     [("192.0.2.7", "192.0.2.7"), ("2001:db8::1", "2001:db8::/64"), ("2001:db8::ffff:1", "2001:db8::/64"), ("unknown", "unknown")],

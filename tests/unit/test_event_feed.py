@@ -1,0 +1,114 @@
+"""Streams over a real event table that grows while they listen."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from services.api import feed
+from services.api.database import sqlite_url
+from services.api.feed import EventFeed
+from services.api.lifecycle import Trigger
+from services.api.repository import Lease, Repository
+from services.core.records import JobSpec
+from services.core.stage import StageEvent
+
+STREAMS, STEPS = 40, 60
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Repository]:
+    monkeypatch.setattr(feed, "PERIOD_S", 0.002)
+    repository = Repository(sqlite_url(tmp_path / "jobs.sqlite"))
+    yield repository
+    repository.close()
+
+
+def start(repository: Repository, seed: int = 1) -> Lease:
+    return repository.lease(repository.create(JobSpec(capture=Path("/"), seed=seed), key=None).job.id, "test", 60.0)
+
+
+def work(repository: Repository, lease: Lease) -> None:
+    log = repository.events_of(lease.job.id)
+    for step in range(STEPS):
+        log.append(1, StageEvent(stage="fit", kind="step", message=f"Step {step}."))
+    repository.settle(lease, Trigger.SUCCEED)
+
+
+@asynccontextmanager
+async def running(repository: Repository) -> AsyncIterator[EventFeed]:
+    one = EventFeed(repository)
+    task = asyncio.create_task(one.run())
+    yield one
+    task.cancel()
+
+
+async def listen(events: AsyncIterator[bytes], pause_s: float) -> str:
+    told = b""
+    async for text in events:
+        told += text
+        await asyncio.sleep(pause_s)
+    return told.decode()
+
+
+def ids_of(text: str) -> list[int]:
+    return [int(line.removeprefix("id: ")) for line in text.splitlines() if line.startswith("id: ")]
+
+
+def test_every_stream_is_told_everything_once_and_in_order_however_slow_it_is(repository: Repository) -> None:
+    lease, other = start(repository), start(repository, seed=2)
+
+    async def watch() -> list[str]:
+        async with running(repository) as one, asyncio.TaskGroup() as group:
+            tasks = [group.create_task(listen(one.follow(lease.job.id, 0), 0.001 * (number % 7))) for number in range(STREAMS)]
+            for leased in (other, lease):
+                threading.Thread(target=work, args=(repository, leased)).start()
+        return [task.result() for task in tasks]
+
+    texts = asyncio.run(watch())
+    stored = [event.id for event in repository.events_of(lease.job.id).read()]
+    assert len(stored) == STEPS + 4
+    assert [ids_of(text) for text in texts] == [stored] * STREAMS
+    assert all(text.endswith('event: end\ndata: "SUCCEEDED"\n\n') for text in texts)
+
+
+def test_streams_that_are_equally_far_share_a_read(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    lease, reads, read = start(repository), [], feed._read
+    monkeypatch.setattr(feed, "_read", lambda *arguments: reads.append(arguments) or read(*arguments))
+    work(repository, lease)
+
+    async def watch() -> list[str]:
+        async with running(repository) as one:
+            return await asyncio.gather(*(listen(one.follow(lease.job.id, 0), 0.0) for _ in range(STREAMS)))
+
+    assert len(set(asyncio.run(watch()))) == 1
+    assert len(reads) == 1
+
+
+def test_what_does_not_fit_into_one_read_follows_in_others(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "MOST_EVENTS", 16)
+    lease = start(repository)
+    work(repository, lease)
+
+    async def watch() -> str:
+        async with running(repository) as one:
+            return await listen(one.follow(lease.job.id, 0), 0.0)
+
+    assert len(ids_of(asyncio.run(watch()))) == STEPS + 4 == 4 * 16
+
+
+def test_a_silent_stream_says_that_it_lives(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "PING_S", 0.01)
+    lease = start(repository)
+
+    async def watch() -> bytes:
+        async with running(repository) as one:
+            events = one.follow(lease.job.id, repository.newest_event())
+            return await anext(events) + await anext(events)
+
+    assert asyncio.run(watch()) == b": ping\n\n: ping\n\n"
