@@ -8,11 +8,13 @@ import random
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import aiohttp
 import numpy as np
+import psutil
 
 from services.api.tokens import Scope
 from tests.load.library import Library, fill
@@ -45,14 +47,33 @@ def measure(work: Path, rounds: int, round_s: float, jobs: int, fitted: int, see
         answers: dict[str, list[list[Answer]]] = {name: [] for name in peers}
         for number in range(rounds):
             for name, (served, books) in _turns(peers, number):
-                cpu_s, began_s = served.cpu_s(), time.perf_counter()
+                before = _Clocks.now(served)
                 found = run(_round(name, served, books, round_s, random.Random(f"{seed} {number}"), f"round-{number}"))
-                share = (served.cpu_s() - cpu_s) / (time.perf_counter() - began_s)
                 answers[name].append(found)
-                yield {"benchmark": "load-mixed", "peer": name, "round": number, "cpu_share": round(share, 3)} | _figures(found)
+                yield {"benchmark": "load-mixed", "peer": name, "round": number} | before.until(_Clocks.now(served), len(found)) | _figures(found)
                 run(_drain(served))
     yield from _summary(answers)
     yield from _kinds(answers)
+
+
+@dataclass(frozen=True)
+class _Clocks:
+    """Time that went by, and processor time: the server's, and everybody's but the server's and this program's."""
+
+    wall_s: float
+    server_s: float
+    others_s: float
+
+    @classmethod
+    def now(cls, served: Served) -> Self:
+        own, every, server_s = psutil.Process().cpu_times(), psutil.cpu_times(), served.cpu_s()
+        busy_s = sum(every) - every.idle - every.iowait - every.guest - every.guest_nice
+        return cls(time.perf_counter(), server_s, busy_s - server_s - own.user - own.system)
+
+    def until(self, later: _Clocks, requests: int) -> Row:
+        """Of the server by request, and how many cores others kept busy: where those are about as many as there are, latencies say little."""
+        wall_s, server_s = later.wall_s - self.wall_s, later.server_s - self.server_s
+        return {"cpu_s_per_request": round(server_s / requests, 6), "others_cores": round((later.others_s - self.others_s) / wall_s, 2)}
 
 
 def _turns(peers: Mapping[str, Any], number: int) -> list[tuple[str, Any]]:

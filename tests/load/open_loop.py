@@ -17,6 +17,8 @@ from tests.load.mix import Ask
 from tests.load.processes import Served
 
 T = TypeVar("T")
+PATIENCE_S = 600.0
+"""How long an answer may take: whoever is slow is measured, not cut off."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Answer:
 def session(served: Served, connections: int = 256) -> aiohttp.ClientSession:
     """At most so many kept connections, 0 for any number; a request that finds all of them busy waits, which counts."""
     connector = aiohttp.TCPConnector(limit=connections)
-    return aiohttp.ClientSession(served.address, connector=connector, headers=served.headers, timeout=aiohttp.ClientTimeout(total=None, sock_read=60))
+    return aiohttp.ClientSession(served.address, connector=connector, headers=served.headers, timeout=aiohttp.ClientTimeout(total=None, sock_read=PATIENCE_S))
 
 
 def run(work: Coroutine[Any, Any, T]) -> T:

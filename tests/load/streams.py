@@ -45,12 +45,13 @@ async def _listen(served: Served, capture: str, count: int, steps: int, period_s
             job = (await answer.json())["id"]
         before_bytes, listening = served.memory_bytes()[1], asyncio.Semaphore(0)
         streams = [Stream() for _ in range(count)]
-        tasks = [asyncio.create_task(_follow(http, job, stream, listening)) for stream in streams]
-        for _ in streams:
-            await listening.acquire()
-        open_bytes, cpu_s, began_s = served.memory_bytes()[1], served.cpu_s(), time.perf_counter()
-        (served.data / "jobs" / job / GO).touch()
-        await asyncio.gather(*tasks)
+        async with asyncio.TaskGroup() as following:
+            for stream in streams:
+                following.create_task(_follow(http, job, stream, listening))
+            for _ in streams:
+                await listening.acquire()
+            open_bytes, cpu_s, began_s = served.memory_bytes()[1], served.cpu_s(), time.perf_counter()
+            (served.data / "jobs" / job / GO).touch()
         seconds, cpu_s = time.perf_counter() - began_s, served.cpu_s() - cpu_s
         replayed = Stream()
         await _follow(http, job, replayed, listening)
