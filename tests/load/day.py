@@ -10,7 +10,7 @@ import asyncio
 import json
 import random
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ import aiohttp
 import numpy as np
 
 from services.api.client import Client
-from services.upload_command import upload_folder
 from tests.load.library import Library, fill
 from tests.load.mix import Ask, Mix
 from tests.load.open_loop import Answer, send_one, session
@@ -67,6 +66,7 @@ def growth(curve: Sequence[Row]) -> Row:
         "hours": curve[-1]["hours"],
         "requests": curve[-1]["requests"],
         "wrong": curve[-1]["wrong"],
+        "wrong_kinds": curve[-1]["wrong_kinds"],
         "seconds": curve[-1]["seconds"],
         "rss_start_bytes": curve[0]["rss_bytes"],
         "rss_warm_bytes": judged[0]["rss_bytes"],
@@ -83,13 +83,18 @@ class _Day:
         self._served, self._library, self._work, self._rng = served, library, work, rng
         self._mix = Mix(library, rng, "day")
         self._jobs: deque[str] = deque()
-        self._requests = self._wrong = 0
+        self._requests, self._wrong = 0, Counter[str]()
         self._began_s = time.perf_counter()
 
     def figures(self) -> Row:
         """Of the server by now."""
         rss, pss = self._served.memory_bytes()
-        done = {"requests": self._requests, "wrong": self._wrong, "seconds": round(time.perf_counter() - self._began_s, 1)}
+        done = {
+            "requests": self._requests,
+            "wrong": self._wrong.total(),
+            "wrong_kinds": dict(self._wrong),
+            "seconds": round(time.perf_counter() - self._began_s, 1),
+        }
         process = self._served.process
         held = {"files": process.num_fds(), "threads": process.num_threads()}
         return done | {"rss_bytes": rss, "pss_bytes": pss, "workers_pss_bytes": self._served.workers_bytes()} | held
@@ -131,8 +136,9 @@ class _Day:
     def _upload(self, number: int) -> None:
         folder = write_capture(self._work / f"day-{number}", seed=number + 1)
         with Client(self._served.address) as client:
-            upload_folder(client, folder)
+            client.upload(folder)
 
     def _count(self, answer: Answer) -> None:
         self._requests += 1
-        self._wrong += not answer.is_right
+        if not answer.is_right:
+            self._wrong[f"{answer.kind}: {answer.status}"] += 1

@@ -17,6 +17,8 @@ from tests.load.mix import Ask
 from tests.load.processes import Served
 
 T = TypeVar("T")
+KEPT_S = 2.0
+"""How long an idle connection is kept: less than the servers' 5 s, or a request would meet its closing."""
 PATIENCE_S = 600.0
 """How long an answer may take: whoever is slow is measured, not cut off."""
 
@@ -35,7 +37,7 @@ class Answer:
 
 def session(served: Served, connections: int = 256) -> aiohttp.ClientSession:
     """At most so many kept connections, 0 for any number; a request that finds all of them busy waits, which counts."""
-    connector = aiohttp.TCPConnector(limit=connections)
+    connector = aiohttp.TCPConnector(limit=connections, keepalive_timeout=KEPT_S)
     return aiohttp.ClientSession(served.address, connector=connector, headers=served.headers, timeout=aiohttp.ClientTimeout(total=None, sock_read=PATIENCE_S))
 
 
