@@ -7,10 +7,11 @@ from pydantic import Field
 
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
+from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import refusals
 from services.api.sessions import COOKIE
-from services.api.tokens import Caller, IssuedToken, Scope, Token
+from services.api.tokens import NAME, Caller, IssuedToken, Scope, Token
 from services.core.errors import UnauthenticatedError
 from services.core.geometry import Record
 
@@ -18,8 +19,8 @@ from services.core.geometry import Record
 class TokenRequest(Record):
     """A token to make."""
 
-    name: str = Field(description="who or what uses it")
-    scopes: tuple[Scope, ...] = Field(description="what it may do")
+    name: str = Field(description="who or what uses it", json_schema_extra={"pattern": f"^{NAME}$"})
+    scopes: tuple[Scope, ...] = Field(description="what it may do", json_schema_extra={"minItems": 1})
     expires_days: float | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
 
 
@@ -81,7 +82,9 @@ def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> API
         response.delete_cookie(COOKIE, path="/v1", httponly=True, samesite="strict", secure=secure)
 
     @router.get("/audit", tags=["access"], dependencies=[needs("admin")])
-    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, lt=2**63)] = None, who: str | None = None) -> AuditPage:
+    def page(
+        limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, le=MOST_ID)] = None, who: str | None = None
+    ) -> AuditPage:
         """Who did what, newest first."""
         found = audit.page(limit + 1, before, who)
         return AuditPage(entries=found[:limit], next_before=found[limit - 1].id if len(found) > limit else None)

@@ -30,7 +30,6 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
         run: in place of the stages.
     """
     from fastapi import FastAPI
-    from starlette.middleware.trustedhost import TrustedHostMiddleware
     from starlette.staticfiles import StaticFiles
 
     from services.api import access, problems
@@ -70,8 +69,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
-    names = {name.strip() for name in settings.names.split(",") if name.strip()}
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=sorted({"127.0.0.1", "localhost", "[::1]", settings.host} | names))
-    app.add_middleware(Shield, secure=not settings.is_loopback)
+    names = {"127.0.0.1", "localhost", "::1", settings.host, *settings.names.split(",")} - {""}
+    app.add_middleware(Shield, names=names, secure=not settings.is_loopback)
     observation.watch_requests(app)
     return app

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import mimetypes
+import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from services.core.errors import UnknownJobError
+from services.api.problems import refusals, response_of
+from services.core.errors import RangeError, UnknownJobError
 from services.core.geometry import Record
 from services.core.stage import CANCEL_FLAG
 
@@ -18,6 +21,14 @@ if TYPE_CHECKING:
 
 _INTERNAL_SUFFIXES = (".lease", ".partial", ".sqlite", ".sqlite-wal", ".sqlite-shm")
 _STORES = (".zarr",)
+_RANGE = re.compile(r"(?=.*[0-9])(?P<first>[0-9]{0,30})-(?P<last>[0-9]{0,30})")
+
+ANSWERS = refusals(416) | {
+    200: {"content": {"*/*": {}}},
+    206: {"description": "The bytes that Range names", "content": {"*/*": {}}},
+    304: {"description": "The file is the one that If-None-Match names"},
+}
+"""What the description says of routes that answer with a file."""
 
 REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 """A report opens alone and carries all it needs; it may reach nothing, this server included."""
@@ -46,13 +57,14 @@ def open_artifact(root: Path, name: str) -> Path:
     relative = PurePosixPath(name)
     path = root.joinpath(*relative.parts)
     inside = not relative.is_absolute() and ".." not in relative.parts and "\0" not in name
-    if not inside or not _is_public(relative) or not path.resolve().is_relative_to(root.resolve()) or not path.is_file():
-        raise UnknownJobError(f"The job has no artifact {name!r}; list its artifacts to see their paths.")
-    return path
+    with suppress(OSError):  # a path too long for the disk
+        if inside and _is_public(relative) and path.resolve().is_relative_to(root.resolve()) and path.is_file():
+            return path
+    raise UnknownJobError(f"The job has no artifact {name!r}; list its artifacts to see their paths.")
 
 
 def artifact_response(request: Request, path: Path) -> Response:
-    """The file with an ETag; answers conditional and range requests."""
+    """The file with an ETag; answers conditional and range requests. A Range header that cannot be read is ignored (RFC 9110, 14.2)."""
     from fastapi.responses import FileResponse, Response
 
     stat = path.stat()
@@ -62,7 +74,26 @@ def artifact_response(request: Request, path: Path) -> Response:
         headers["Content-Security-Policy"] = REPORT_POLICY
     if tag in (request.headers.get("if-none-match") or ""):
         return Response(status_code=304, headers=headers)
-    return FileResponse(path, headers=headers, media_type=_media_type(path), stat_result=stat)
+    response = FileResponse(path, headers=headers, media_type=_media_type(path), stat_result=stat)
+    asked = request.headers.get("range")
+    if asked is not None and request.headers.get("if-range", tag) in {tag, response.headers["last-modified"]}:
+        starts = _first_bytes(asked, stat.st_size)
+        if starts is None:
+            request.scope["headers"] = [header for header in request.scope["headers"] if header[0] != b"range"]
+        elif max(starts) >= stat.st_size:
+            problem = RangeError(f"The file has {stat.st_size} bytes, not those that '{asked}' names; ask for others.")
+            return response_of(problem, request.scope["path"], {"Content-Range": f"bytes */{stat.st_size}"})
+    return response
+
+
+def _first_bytes(asked: str, size_bytes: int) -> list[int] | None:
+    """Where each range that a Range header names begins; None if it is malformed or counts in another unit (RFC 9110, 14.1)."""
+    unit, _, ranges = asked.partition("=")
+    found = [_RANGE.fullmatch(part.strip()) for part in ranges.split(",")]
+    parts = [(part["first"], part["last"]) for part in found if part is not None]
+    if unit.strip().lower() != "bytes" or len(parts) < len(found) or any(first and last and int(last) < int(first) for first, last in parts):
+        return None
+    return [int(first) if first else max(0, size_bytes - int(last)) for first, last in parts]
 
 
 def _walk(folder: Path, below: PurePosixPath = PurePosixPath()) -> Iterator[Path]:  # noqa: B008 - immutable

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
+from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import MEDIA_TYPE, Problem, refusals
 from services.api.receiving import in_thread
@@ -47,7 +48,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
     router = APIRouter(lifespan=sweeping)
     under = APIRouter(prefix="/v1/captures", responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
 
-    @under.post("", status_code=201, dependencies=[needs("submit")])
+    @under.post("", status_code=201, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
     def create(manifest: UploadManifest, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> CaptureDetail:
         """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
         creation = captures.create(manifest, idempotency_key)
@@ -56,7 +57,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
         return creation.capture
 
     @under.get("", dependencies=[needs("read")])
-    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=2**31 - 1)] = None) -> CapturePage:
+    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> CapturePage:
         """List captures, newest first."""
         return captures.page(limit, before)
 
@@ -75,7 +76,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
         """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused. Repeating it changes nothing."""
         if faults := captures.commit(capture):
             detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (f" It is one of {len(faults)} such files." if len(faults) > 1 else "")
-            problem = IncompleteCapture.of(HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.url.path, files=faults)
+            problem = IncompleteCapture.of(HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.scope["path"], files=faults)
             return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)
         return captures.get(capture)
 

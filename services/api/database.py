@@ -20,6 +20,8 @@ BUSY_MS = 5000
 """How long a writer waits for another one before it gives up."""
 WRITER_LOCK = 0x64656E74
 """Number of the advisory lock, "dent"."""
+MOST_ID = 2**31 - 1
+"""Largest number of a row: Postgres' INTEGER, to which it takes nothing larger for comparison either."""
 
 PATIENCE_S = 600.0
 """How long whoever works on a job waits for a database that went away."""

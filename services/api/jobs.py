@@ -70,7 +70,7 @@ class Jobs:
         for option, path in (("capture", spec.capture), ("rig.mouth", spec.rig.mouth if spec.rig else None)):
             if path is not None and not path.is_absolute() and not (option == "capture" and is_uploaded(path)):
                 raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
-            if path is not None and path.is_absolute() and not path.exists():
+            if path is not None and path.is_absolute() and not _is_there(path):
                 raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
         with self.captures.keeping(spec.capture):
             self._admission.refuse_too_large(self.captures.locate(spec))
@@ -132,6 +132,16 @@ class Jobs:
                 self.delete(job_id)
             except StoreError as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
+
+
+def _is_there(path: Path) -> bool:
+    # Not what has no name in Unicode, as it could not be stored.
+    try:
+        str(path).encode()
+        path.stat()
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:

@@ -7,7 +7,8 @@ from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 
 from services.api.archive import stream_zip
-from services.api.artifacts import artifact_response, list_artifacts, open_artifact
+from services.api.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
+from services.api.database import MOST_ID
 from services.api.events import EventLog
 from services.api.guard import needs
 from services.api.history import History, LogPage, PreviewPage, read_history, read_log, read_previews
@@ -17,7 +18,7 @@ from services.api.problems import refusals
 from services.core.errors import UnknownJobError
 from services.core.stage import StageName
 
-After = Annotated[int, Query(ge=0, lt=2**63, description="id of the last one that is known already")]
+After = Annotated[int, Query(ge=0, le=MOST_ID, description="id of the last one that is known already")]
 
 
 def build_observe_router(jobs: Jobs) -> APIRouter:
@@ -33,7 +34,7 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         after: After = 0,
         limit: Annotated[int, Query(ge=1, le=1000)] = 200,
         stage: StageName | None = None,
-        attempt: Annotated[int | None, Query(ge=1, lt=2**31)] = None,
+        attempt: Annotated[int | None, Query(ge=1, le=MOST_ID)] = None,
     ) -> LogPage:
         """What the job's stages said, oldest first."""
         return read_log(events_of(job_id), after, limit, stage, attempt)
@@ -48,9 +49,15 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         """Pictures that the fit has made so far, oldest first."""
         return read_previews(events_of(job_id), job_id, after, limit)
 
-    @router.get("/jobs/{job_id}/previews/{preview_id}/{picture}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
+    @router.get(
+        "/jobs/{job_id}/previews/{preview_id}/{picture}",
+        response_class=Response,
+        responses=ANSWERS,
+        tags=["artifacts"],
+        dependencies=[needs("read", audited=True)],
+    )
     def preview(
-        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, lt=2**63)], picture: Literal["render", "photo", "residual"], request: Request
+        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, le=MOST_ID)], picture: Literal["render", "photo", "residual"], request: Request
     ) -> Response:
         """One picture; takes Range and If-None-Match."""
         events = events_of(job_id).read(preview_id - 1, 1, kind="preview")
@@ -59,7 +66,13 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
             raise UnknownJobError(f"The job has no {picture} of preview {preview_id}; list its previews to see their ids.")
         return artifact_response(request, open_artifact(jobs.folder(job_id), path))
 
-    @router.get("/jobs/{job_id}/artifacts.zip", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
+    @router.get(
+        "/jobs/{job_id}/artifacts.zip",
+        response_class=Response,
+        responses={200: {"content": {"application/zip": {}}}},
+        tags=["artifacts"],
+        dependencies=[needs("read", audited=True)],
+    )
     def archive(job_id: str) -> Response:
         """All artifacts as one zip file, made while it is sent."""
         job = jobs.repository.get(job_id)

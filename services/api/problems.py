@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Self
+from urllib.parse import quote
 
 from pydantic import Field
 
@@ -20,6 +21,7 @@ from services.core.errors import (
     LockedError,
     OffsetError,
     PlatformError,
+    RangeError,
     RateError,
     ScopeError,
     TooLargeError,
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
     from fastapi import FastAPI, Request, Response
 
 MEDIA_TYPE = "application/problem+json"
+_PATH_CHARACTERS = "/:@!$&'()*+,;=~"
+"""That a URI's path may hold as they are, besides letters and digits (RFC 3986, 3.3)."""
 CHECKSUM_MISMATCH = 460
 """Of the tus protocol, no registered status."""
 
@@ -51,14 +55,14 @@ class Problem(Record):
     title: str
     status: int
     detail: str = Field(description="one sentence that names the thing and the remedy")
-    instance: str = Field(description="path of the request")
+    instance: str = Field(description="path of the request, percent-encoded")
     code: str = Field(description="stable and machine-readable")
 
     @classmethod
-    def of(cls, status: int, code: str, detail: str, instance: str, **more: object) -> Self:
-        """The document for a status and one of our codes; ``more`` are the members of a subclass."""
+    def of(cls, status: int, code: str, detail: str, path: str, **more: object) -> Self:
+        """The document for a status, one of our codes and a decoded path; ``more`` are the members of a subclass."""
         title = "Checksum Mismatch" if status == CHECKSUM_MISMATCH else HTTPStatus(status).phrase
-        fields = {"detail": redacted(detail), "instance": redacted(instance), "code": code}
+        fields = {"detail": redacted(detail).encode(errors="backslashreplace").decode(), "instance": quote(redacted(path), safe=_PATH_CHARACTERS), "code": code}
         return cls.model_validate({"type": f"urn:dentine:problem:{code}", "title": title, "status": status} | fields | more)
 
 
@@ -77,6 +81,7 @@ _STATUS: dict[type[DentineError], int] = {
     CaptureStateError: HTTPStatus.CONFLICT,
     TooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     OffsetError: HTTPStatus.CONFLICT,
+    RangeError: HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
     ChecksumError: CHECKSUM_MISMATCH,
     LockedError: HTTPStatus.LOCKED,
     ExpiredError: HTTPStatus.GONE,
@@ -101,23 +106,41 @@ def response_of(problem: DentineError, path: str, headers: dict[str, str] | None
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What the description says of routes that may answer so, besides what the gate and a lost database answer everywhere."""
-    return {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in sorted({401, 403, 429, 503, *statuses})}
+    """What the description says of routes that may answer so, besides what the shield, the gate and a lost database answer everywhere."""
+    return {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in sorted({400, 401, 403, 429, 503, *statuses})}
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the application with a problem document."""
+    """Answer every error of the application with a problem document, and describe it so."""
     from fastapi.exceptions import RequestValidationError
     from fastapi.responses import Response
-    from sqlalchemy.exc import DBAPIError
+    from sqlalchemy.exc import DataError, DBAPIError
     from starlette.exceptions import HTTPException
 
+    describe = app.openapi
+
+    def describe_refusals() -> dict[str, Any]:
+        # FastAPI describes every body as of the route's own type.
+        described = describe()
+        for operation in (one for path in described["paths"].values() for one in path.values()):
+            for content in (response.get("content", {}) for response in operation["responses"].values()):
+                for other in [name for name in content if MEDIA_TYPE in content and name != MEDIA_TYPE]:
+                    content[MEDIA_TYPE] = content.pop(other)
+        return described
+
+    app.openapi = describe_refusals  # type: ignore[method-assign]
+
     def answer(request: Request, status: int, code: str, detail: str, headers: Any = None) -> Response:
-        return Response(Problem.of(status, code, detail, request.url.path).model_dump_json(), status, headers, MEDIA_TYPE)
+        return Response(Problem.of(status, code, detail, request.scope["path"]).model_dump_json(), status, headers, MEDIA_TYPE)
 
     @app.exception_handler(DentineError)
     def _dentine(request: Request, problem: DentineError) -> Response:
         return answer(request, status_of(problem), problem.code, problem.message)
+
+    @app.exception_handler(DataError)
+    def _unstorable(request: Request, _problem: DataError) -> Response:
+        detail = "The request holds text or a number that the database does not take, such as the character NUL; leave it out."
+        return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", detail)
 
     @app.exception_handler(DBAPIError)
     def _database(request: Request, _problem: DBAPIError) -> Response:
@@ -130,6 +153,8 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     def _http(request: Request, problem: HTTPException) -> Response:
         status = HTTPStatus(problem.status_code)
+        if status is HTTPStatus.BAD_REQUEST and problem.__cause__ is not None:  # FastAPI's on a body that is no text; of other malformed bodies it says 422
+            return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", "The body cannot be read; send JSON in UTF-8.")
         return answer(request, status, status.phrase.lower().replace(" ", "-"), f"{problem.detail}.", problem.headers)
 
     @app.exception_handler(Exception)

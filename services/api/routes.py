@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
 
-from services.api.artifacts import Artifact, artifact_response, list_artifacts, open_artifact
+from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
+from services.api.database import MOST_ID
 from services.api.feed import EventFeed, EventStream
 from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
@@ -45,7 +46,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     def detail(job: Job) -> JobDetail:
         return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job), waits_for=jobs.waits_for(job))
 
-    @router.post("/jobs", status_code=201, tags=["jobs"], dependencies=[needs("submit")])
+    @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200."""
         creation = jobs.submit(spec, idempotency_key, request.state.request_id)
@@ -56,7 +57,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     @router.get("/jobs", tags=["jobs"], dependencies=[needs("read")])
     def page(
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
-        before: int | None = None,
+        before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None,
         state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
         kind: Literal["tooth", "jaw"] | None = None,
         created_after_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
@@ -94,7 +95,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return jobs.repository.deletion(job_id)
 
     @router.get("/jobs/{job_id}/events", response_class=EventStream, tags=["jobs"], dependencies=[needs("read")])
-    def events(job_id: str, last_event_id: Annotated[int | None, Header()] = None) -> EventStream:
+    def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> EventStream:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         return EventStream(feed.follow(jobs.repository.get(job_id).id, last_event_id or 0), headers={"X-Accel-Buffering": "no"})
 
@@ -103,7 +104,9 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         """List the job's files."""
         return list_artifacts(jobs.folder(jobs.repository.get(job_id).id))
 
-    @router.get("/jobs/{job_id}/artifacts/{path:path}", response_class=Response, tags=["artifacts"], dependencies=[needs("read", audited=True)])
+    @router.get(
+        "/jobs/{job_id}/artifacts/{path:path}", response_class=Response, responses=ANSWERS, tags=["artifacts"], dependencies=[needs("read", audited=True)]
+    )
     def artifact(job_id: str, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
         return artifact_response(request, open_artifact(jobs.folder(jobs.repository.get(job_id).id), path))

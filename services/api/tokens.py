@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
 import sqlalchemy as sql
-from pydantic import Field, SecretStr, field_serializer
+from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
 from services.api.audit import Deed
 from services.api.database import metadata, writing
@@ -31,6 +31,8 @@ from services.core.geometry import Record
 LAST_USE_STEP_S = 3600.0
 """The last use is noted once in this time, so that reading stays reading."""
 DAY_S = 86400.0
+NAME = "[A-Za-z0-9][A-Za-z0-9.-]{0,63}"
+"""Pattern of a token's name."""
 
 token_table = sql.Table(
     "token",
@@ -75,7 +77,7 @@ class Token(Record):
 class IssuedToken(Token):
     """A token on the one occasion when its secret is shown."""
 
-    token: SecretStr = Field(description="send it as 'Authorization: Bearer …'; it is not shown again")
+    token: Annotated[SecretStr, WithJsonSchema({"type": "string"})] = Field(description="send it as 'Authorization: Bearer …'; it is not shown again")
 
     @field_serializer("token", when_used="json")
     def _reveal(self, token: SecretStr) -> str:
@@ -113,7 +115,7 @@ class Tokens:
         Raises:
             InputError: the name is malformed or belongs to a living token, or there is no scope.
         """
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9.-]{0,63}", name) or name == LOCAL.name:
+        if not re.fullmatch(NAME, name) or name == LOCAL.name:
             raise InputError(f"Token name {name!r} does not serve; use up to 64 letters, digits, points and hyphens, and not '{LOCAL.name}'.")
         if not (wanted := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")

@@ -10,13 +10,14 @@ from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
 from services.api import tus
+from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import refusals
 from services.api.receiving import SilenceError, receive
 from services.api.uploads import Upload, Uploads, upload_path
 from services.core.errors import UploadError
 
-FileNumber = Annotated[int, Path(ge=0, le=2**31 - 1, description="number of the file in the capture's manifest, from 0")]
+FileNumber = Annotated[int, Path(ge=0, le=MOST_ID, description="number of the file in the capture's manifest, from 0")]
 
 
 class TusRoute(APIRoute):
@@ -33,7 +34,7 @@ class TusRoute(APIRoute):
         await super().handle(scope, receive, send_named)
 
 
-def require_version(tus_resumable: Annotated[str | None, Header()] = None) -> None:
+def require_version(tus_resumable: Annotated[str | None, Header(json_schema_extra={"const": tus.VERSION})] = None) -> None:
     """Refuse a request in another version of the protocol, or in none."""
     if tus_resumable != tus.VERSION:
         raise HTTPException(412, f"Header Tus-Resumable must be {tus.VERSION}; send it", {"Tus-Version": tus.VERSION})
@@ -68,13 +69,19 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         """How far the file is."""
         return Response(headers=told(uploads.find(capture, number)))
 
-    @router.patch("/{capture}/{number}", status_code=204, dependencies=[*versioned, needs("submit")], response_class=Response)
+    @router.patch(
+        "/{capture}/{number}",
+        status_code=204,
+        dependencies=[*versioned, needs("submit")],
+        response_class=Response,
+        openapi_extra={"requestBody": {"content": {tus.CHUNK_TYPE: {"schema": {"type": "string", "format": "binary"}}}, "required": True}},
+    )
     async def append(
         capture: str,
         number: FileNumber,
         request: Request,
         upload_offset: Annotated[int, Header(ge=0, le=2**53)],
-        content_type: Annotated[str | None, Header()] = None,
+        content_type: Annotated[str | None, Header(json_schema_extra={"const": tus.CHUNK_TYPE})] = None,
         upload_checksum: Annotated[str | None, Header(max_length=200)] = None,
     ) -> Response:
         """Send the next bytes. The answer comes once they are durable, and to the last ones once the file's SHA-256 is verified."""

@@ -3,14 +3,17 @@
 import time
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
+from services.api.database import MOST_ID
 from services.api.deliveries import Deliveries, Delivery
 from services.api.guard import needs
 from services.api.problems import refusals
 from services.api.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
 from services.core.geometry import Record
+
+DeliveryId = Annotated[int, Path(ge=1, le=MOST_ID)]
 
 
 class DeliveryPage(Record):
@@ -57,18 +60,18 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
         return deliveries.test(webhook_id, time.time())
 
     @router.get("/{webhook_id}/deliveries")
-    def log(webhook_id: str, limit: Annotated[int, Query(ge=1, le=100)] = 50, before: Annotated[int | None, Query(ge=0, lt=2**63)] = None) -> DeliveryPage:
+    def log(webhook_id: str, limit: Annotated[int, Query(ge=1, le=100)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> DeliveryPage:
         """The webhook's deliveries with every try, newest first."""
         found = deliveries.page(webhook_id, limit + 1, before)
         return DeliveryPage(deliveries=found[:limit], next_before=found[limit - 1].id if len(found) > limit else None)
 
     @router.get("/{webhook_id}/deliveries/{delivery_id}")
-    def delivery(webhook_id: str, delivery_id: int) -> Delivery:
+    def delivery(webhook_id: str, delivery_id: DeliveryId) -> Delivery:
         """One delivery."""
         return deliveries.get(webhook_id, delivery_id)
 
     @router.post("/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202)
-    def redeliver(webhook_id: str, delivery_id: int) -> Delivery:
+    def redeliver(webhook_id: str, delivery_id: DeliveryId) -> Delivery:
         """Send a message again, under the same id."""
         return deliveries.redeliver(webhook_id, delivery_id, time.time())
 

@@ -15,6 +15,7 @@
     │   ├── JobStateError     the job's state does not allow what was asked
     │   ├── UnknownTokenError no such token
     │   ├── BodyTooLargeError a request's body is over the limit
+    │   ├── RangeError        a file has no such bytes
     │   ├── UnknownCaptureError no such capture or file of it
     │   ├── CaptureStateError the capture's state does not allow what was asked
     │   │   └── IncompleteCaptureError files are missing, corrupt or refused
@@ -152,6 +153,12 @@ class BodyTooLargeError(InputError):
     """A request's body is longer than the server reads."""
 
     code = "body-too-large"
+
+
+class RangeError(InputError):
+    """A file does not have the bytes that were asked for."""
+
+    code = "range-unsatisfiable"
 
 
 class AccessError(DentineError):

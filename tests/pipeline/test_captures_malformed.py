@@ -56,8 +56,3 @@ def test_malformed_manifests_are_refused(client: httpx.Client, manifest: Any) ->
 )
 def test_malformed_uploads_are_refused(client: httpx.Client, method: str, place: str, headers: dict[str, str]) -> None:
     assert_refused(client.request(method, f"/v1/uploads{place}", headers=headers, content=b"x" if method == "PATCH" else None))
-
-
-@pytest.mark.parametrize("query", ["limit=0", "limit=501", "before=x", f"before={2**70}"])
-def test_malformed_queries_are_refused(client: httpx.Client, query: str) -> None:
-    assert_refused(client.get(f"/v1/captures?{query}"))
