@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo gallery figures test test-all faults lint bench dashboard setup
+.PHONY: demo gallery figures test test-all faults contracts lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -24,6 +24,11 @@ test-all: ## the slow ones too: fits of the real incisor, long slab tables
 faults: ## kill -9 of every part of the service at every point of a job, a quarter of an hour; needs Postgres
 	@deploy/setup.sh
 	@$(BIN)/python -m tests.faults.kill_matrix --out faults.json
+
+contracts: ## ten thousand requests generated from the API's description, on SQLite and on Postgres, some minutes each
+	@deploy/setup.sh
+	@$(BIN)/python -m tests.contracts.generated_requests --json contracts-sqlite.json
+	@$(BIN)/python -m tests.contracts.generated_requests --database postgres --json contracts-postgres.json
 
 lint: setup
 	@$(BIN)/ruff check .

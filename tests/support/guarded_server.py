@@ -24,9 +24,9 @@ def make_deed() -> Deed:
     return Deed("test", "command line", "local")
 
 
-def make_token(data: Path, name: str, *scopes: Scope) -> str:
+def make_token(data: Path, name: str, *scopes: Scope, database: str | None = None) -> str:
     """A new token on a data folder, as ``dentine token create`` makes it."""
-    engine = open_database(ServerSettings(data=data).database_url)
+    engine = open_database(database or ServerSettings(data=data).database_url)
     try:
         upgrade(engine)
         return Tokens(engine).create(name, scopes, None, make_deed()).token.get_secret_value()

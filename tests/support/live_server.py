@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import httpx
 import uvicorn
@@ -46,9 +46,9 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
 
 
 @contextmanager
-def toy_server(data: Path, log: IO[str] | None = None) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+def toy_server(data: Path, log: IO[str] | None = None, **settings: Any) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
     """The server with toy stages as a process of its own, ended by SIGTERM unless the block ended it; ``log`` takes its standard error."""
-    command = [sys.executable, "-m", "tests.support.toy_server", json.dumps({"data": str(data), "port": 0})]
+    command = [sys.executable, "-m", "tests.support.toy_server", json.dumps({"data": str(data), "port": 0} | settings)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=Path(__file__).parents[2]) as process:
         try:
             assert process.stdout is not None

@@ -1,0 +1,125 @@
+"""What generated requests can name so that they get past the lookup: ids that exist, and headers and bodies that fit together.
+
+The description says of an id only that it is text, so a generated one is never anybody's.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from schemathesis import Case, Response
+from schemathesis.core.parameters import ParameterLocation
+
+from services.api.presets import list_presets
+from services.api.tus import CHUNK_TYPE, format_metadata
+from tests.contracts.witnesses import Witnesses
+from tests.support.uploading import CAMERA, TUS, checksum, manifest_of
+
+MOST = 200
+"""Newest things that are named again."""
+SPARED = 3
+"""Newest things of a kind that are not deleted yet."""
+HOLD = "hold-fit"
+"""Lets a toy job wait in its fit."""
+NOWHERE = "http://127.0.0.1:9/"
+"""Where nobody listens."""
+_ID_OF = {"/v1/jobs": "job_id", "/v1/captures": "capture", "/v1/tokens": "token_id", "/v1/webhooks": "webhook_id"}
+_FILE = "capture.json"
+
+
+def content_of(choice: int) -> bytes:
+    """The one file of a small capture, of which there are many."""
+    light = {"name": "l0", "position_mm": [0, 0, -50], "intensity": [1.0]}
+    description = {"units": "mm", "channels": ["green"], "cameras": [CAMERA], "lights": [light]}
+    return json.dumps(description).encode() + b" " * (choice % 5000)
+
+
+class Living:
+    """Parameters of paths that exist on the server. Those of the witnesses are not deleted."""
+
+    def __init__(self, witnesses: Witnesses, data: Path) -> None:
+        self._jobs, self._job_count = data / "jobs", 0
+        job, capture = {"job_id": witnesses.job["id"]}, {"capture": witnesses.capture["id"]}
+        self._kept: list[dict[str, Any]] = [job, capture, *(job | {"path": path} for path in witnesses.artifacts)]
+        self._kept += [{"name": preset.name} for preset in list_presets()]
+        self._made: list[dict[str, Any]] = []
+        self._deleted: list[dict[str, Any]] = []
+        self._contents: dict[str, bytes] = {}
+        self._source = witnesses.capture["path"]
+
+    def place(self, case: Case, choice: int) -> None:
+        """Let a case name something that exists, unless its path is what is wrong with it."""
+        known = self._deleted if case.path.startswith("/v1/deletions") else self._kept + self._made
+        there = [one for one in known if set(one) <= set(case.path_parameters)]
+        if case.method.upper() == "DELETE":
+            there = [one for one in there if one not in self._kept][:-SPARED]
+        if choice % 4:
+            most = max(map(len, there), default=0)
+            there = [one for one in there if len(one) == most]
+        if there and not _is_wrong(case, ParameterLocation.PATH):
+            case.path_parameters = case.path_parameters | there[choice % len(there)]
+
+    def fit(self, case: Case, choice: int) -> None:
+        """Let a case that is right by the description be right for the server too."""
+        match f"{case.method.upper()} {case.path}":
+            case "POST /v1/jobs":
+                case.body = {name: value for name, value in case.body.items() if name not in {"rig", "held", "samples_per_pixel", "max_samples_per_pixel"}}
+                case.body |= {"capture": self._source if choice % 3 else f"/{case.body.get('capture')}", "workers": 1}
+                case.headers.pop("idempotency-key", None)
+            case "POST /v1/captures":
+                case.body = manifest_of({_FILE: content_of(choice)})
+            case "POST /v1/webhooks" | "PATCH /v1/webhooks/{webhook_id}":
+                case.body = case.body | {"url": NOWHERE}
+            case "POST /v1/uploads" if self._contents:
+                capture, content = list(self._contents.items())[choice % len(self._contents)]
+                case.headers.update(TUS | {"upload-length": str(len(content)), "upload-metadata": format_metadata({"capture": capture, "path": _FILE})})
+            case "PATCH /v1/uploads/{capture}/{number}":
+                content = self._contents.get(case.path_parameters["capture"], b"{}")
+                part = content if choice % 2 else content[: choice % len(content)]
+                case.headers.update(TUS | {"upload-offset": "0", "content-type": CHUNK_TYPE, "upload-checksum": checksum(part)})
+                case.body, case.media_type = part, CHUNK_TYPE
+            case route if "/v1/uploads" in route:
+                case.headers.update(TUS)
+
+    def learn(self, case: Case, response: Response) -> None:
+        """Remember what a request has made."""
+        if response.status_code not in {200, 201, 202, 204}:
+            return
+        if case.method.upper() == "DELETE":
+            self._made = [one for one in self._made if not case.path_parameters.items() <= one.items()]
+            self._deleted = [*self._deleted[-MOST:], case.path_parameters]
+            if "number" not in case.path_parameters:
+                self._contents.pop(case.path_parameters.get("capture", ""), None)
+        if case.method.upper() != "POST":
+            return
+        if name := _ID_OF.get(case.path):
+            made = response.json()["id"]
+            self._made.append({name: made})
+            if name == "job_id":
+                self._steer(made)
+            if name == "capture":
+                self._made.append({"capture": made, "number": 0})
+                self._contents[made] = content_of(response.json()["bytes"] - len(content_of(0)))
+        elif case.path == "/v1/webhooks/{webhook_id}/test":
+            self._made.append(case.path_parameters | {"delivery_id": response.json()["id"]})
+        self._made = self._made[-MOST:]
+
+    def release(self) -> None:
+        """Let the jobs go on that wait."""
+        for hold in self._jobs.glob(f"*/{HOLD}"):
+            hold.unlink()
+
+    def _steer(self, job: str) -> None:
+        # Some jobs fail, and some wait and let others queue, so that there is something to retry and to cancel.
+        self._job_count += 1
+        flag = HOLD if self._job_count % 8 == 5 else "bad-input" if self._job_count % 3 == 1 else None
+        if flag is not None:
+            (self._jobs / job).mkdir(parents=True, exist_ok=True)
+            (self._jobs / job / flag).touch()
+
+
+def _is_wrong(case: Case, location: ParameterLocation) -> bool:
+    component = case.meta.components.get(location) if case.meta else None
+    return component is not None and component.mode.is_negative

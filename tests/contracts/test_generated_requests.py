@@ -1,0 +1,14 @@
+"""Some hundred requests generated from the description of the API; ``make contracts`` sends ten thousand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.contracts.generated_requests import survey
+
+
+def test_generated_requests_do_no_harm(tmp_path: Path) -> None:
+    outcome = survey(tmp_path, 300, 1)
+    assert outcome.faults == []
+    assert outcome.cases >= 300
+    assert all(answers.get("2xx") and answers.get("4xx") for answers in outcome.classes.values()), "some class of operations was not reached"

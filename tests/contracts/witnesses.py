@@ -1,0 +1,70 @@
+"""A capture and a job that were there before the generated requests, and are compared with themselves afterwards."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from tests.support.uploading import announce, contents_of, send, write_capture
+
+PATIENCE_S = 600.0
+"""A bound for jobs that wait for others."""
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """All that the server tells of one capture and one job, and what lies on its disk of the capture."""
+
+    capture: dict[str, Any]
+    contents: dict[str, bytes]
+    job: dict[str, Any]
+    artifacts: dict[str, str]
+    events: str
+
+    @classmethod
+    def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> Witnesses:
+        """What is there now."""
+        paths = [file["path"] for file in client.get(f"/v1/jobs/{job}/artifacts").raise_for_status().json()]
+        return cls(
+            client.get(f"/v1/captures/{capture}").raise_for_status().json(),
+            contents_of(data / "captures" / capture),
+            client.get(f"/v1/jobs/{job}").raise_for_status().json(),
+            {path: hashlib.sha256(client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content).hexdigest() for path in paths},
+            client.get(f"/v1/jobs/{job}/events").raise_for_status().text,
+        )
+
+    def losses(self, client: httpx.Client, data: Path) -> list[str]:
+        """What is gone or different now."""
+        try:
+            now = Witnesses.of(client, data, self.capture["id"], self.job["id"])
+        except httpx.HTTPError as problem:
+            return [f"the witnesses cannot be read: {problem}"]
+        return [
+            f"{name} of the witnesses changed" for name in ("capture", "contents", "job", "artifacts", "events") if getattr(now, name) != getattr(self, name)
+        ]
+
+
+def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> Witnesses:
+    """Upload a capture and run a job on it."""
+    contents = contents_of(write_capture(folder))
+    capture = announce(client, contents)["id"]
+    for path, content in contents.items():
+        send(client, capture, path, content).raise_for_status()
+    client.post(f"/v1/captures/{capture}/commit").raise_for_status()
+    return Witnesses.of(client, data, capture, finish_job(client, f"captures/{capture}"))
+
+
+def finish_job(client: httpx.Client, capture: str) -> str:
+    """Submit a job and wait for its success; returns its id."""
+    job: str = client.post("/v1/jobs", json={"capture": capture, "workers": 1}).raise_for_status().json()["id"]
+    deadline = time.monotonic() + PATIENCE_S
+    while (state := client.get(f"/v1/jobs/{job}").raise_for_status().json()["state"]) != "SUCCEEDED":
+        assert state in {"QUEUED", "RUNNING"}, state
+        assert time.monotonic() < deadline, "the job does not end"
+        time.sleep(0.05)
+    return job
