@@ -301,7 +301,7 @@ def _client(server: str | None) -> Any:
 def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
     from services.api.progress import ProgressView
 
-    with ProgressView() as view:
+    with ProgressView(lambda: client.get(job_id)["remaining"]) as view:
         for event in client.events(job_id):
             view(event)
     job = client.get(job_id)

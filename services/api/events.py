@@ -143,8 +143,8 @@ class EventLog:
     def __init__(self, engine: sql.Engine, job: str, lease: int = 0, request_id: str | None = None) -> None:
         self._engine, self.job, self._lease, self._request_id = engine, job, lease, request_id
 
-    def begin_stage(self, stage: StageName, known: int = 0) -> int:
-        """Record that the stage starts and return its attempt: one more than any before, in this table or ``known`` otherwise.
+    def begin_stage(self, stage: StageName, known: int = 0, machine: str | None = None) -> int:
+        """Record that the stage starts, on which class of machine, and return its attempt: one more than any before, in this table or ``known`` otherwise.
 
         Raises:
             FencedError: somebody else runs the job by now.
@@ -155,6 +155,7 @@ class EventLog:
                 raise FencedError(f"The job was taken over under lease {newest}; lease {self._lease} may not start stage {stage}.")
             attempt = 1 + max(known, self._newest_attempt(connection, stage))
             origin = {} if self._request_id is None else {"job": self.job, "request_id": self._request_id}
+            origin |= {} if machine is None else {"machine": machine}
             insert_event(connection, self.job, attempt, StageEvent(stage=stage, kind="started", data=origin))
         return attempt
 
@@ -188,6 +189,21 @@ class EventLog:
             data = from_json("[" + ",".join(row.data for row in rows) + "]")
             yield from map(Told, (row.time_s for row in rows), data)
             after = rows[-1].id if len(rows) == PAGE else None
+
+    def every(self, **only: str | int | None) -> Iterator[JobEvent]:
+        """All of the job's events, oldest first, a page at a time; ``only`` as in ``read``."""
+        after = 0
+        while events := self.read(after, PAGE, **only):
+            yield from events
+            after = events[-1].id
+
+    def reached_s(self, stage: StageName, attempt: int, done: float) -> float | None:
+        """When an attempt had done this fraction of its stage, Unix time; None before."""
+        columns = event_table.c
+        of_attempt = (columns.job == self.job) & (columns.stage == stage) & (columns.attempt == attempt)
+        enough = (columns.done >= done) if done > 0 else sql.true()
+        with self._engine.connect() as connection:
+            return connection.scalar(sql.select(sql.func.min(columns.time_s)).where(of_attempt, enough))
 
     def latest(self) -> list[JobEvent]:
         """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""

@@ -13,9 +13,11 @@ from services.api.captures import Captures, is_uploaded
 from services.api.erasure import erase, forget_listing
 from services.api.events import JobEvent
 from services.api.lifecycle import Instruction, Trigger
+from services.api.machine_class import machine_class
 from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
+from services.api.time_ranges import TimeRange, TimeRanges
 from services.core.errors import SettingsError, StoreError
 from services.core.geometry import Record
 from services.core.records import JobSpec
@@ -44,7 +46,9 @@ class Jobs:
         self.repository = Repository(settings.database_url)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
-        self._runner = Runner(self.repository, self.folder, self.captures.locate, run, self._admission, self._tidy)
+        machine = machine_class() if settings.scheduler is None else None
+        self._time_ranges = TimeRanges(self.repository, self.captures.locate, self.waits_for, machine)
+        self._runner = Runner(self.repository, self.folder, self.captures.locate, run, self._admission, self._tidy, self._time_ranges.learn)
         self._is_alone = settings.database is None
 
     def start(self) -> None:
@@ -110,6 +114,10 @@ class Jobs:
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, None if nothing keeps it."""
         return self._admission.reason(job.id)
+
+    def time_range(self, job: Job) -> TimeRange | None:
+        """How long until a job ends; None if it neither runs nor waits."""
+        return self._time_ranges.of(job)
 
     def progress(self, job: Job) -> list[StageProgress]:
         """How far each stage is, from the event table."""

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
+from services.api.machine_class import machine_class
 from services.api.workers import Workers
 from services.core.errors import DiskFullError, InputError, JobCancelledError, SchedulerLostError, WorkerLostError
 from services.core.records import AssetManifest, JobSpec
@@ -146,8 +147,8 @@ class StageTask:
             return self.stage
         with self.events.open() as log:
             lease = self.root / f"{folder}.lease"
-            known = int(lease.read_text()) if lease.exists() else 0
-            attempt = patiently(lambda: log.begin_stage(self.stage, known))
+            known, machine = int(lease.read_text()) if lease.exists() else 0, machine_class()
+            attempt = patiently(lambda: log.begin_stage(self.stage, known, machine))
             told: set[str] = set()
 
             def tell(event: StageEvent) -> None:

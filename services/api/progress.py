@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from services.api.events import JobEvent
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+ASK_AGAIN_S = 5.0
+"""How often the range of the time that remains is asked for; where lines are printed, a twelfth as often."""
+
 
 class ProgressView:
-    """A context manager that is called with every event; ``events`` counts them."""
+    """A context manager that is called with every event; ``events`` counts them.
 
-    def __init__(self) -> None:
+    Args:
+        remaining: tells how long until the job ends, as a job's ``remaining`` in the API.
+    """
+
+    def __init__(self, remaining: Callable[[], dict[str, Any] | None] | None = None) -> None:
         self.events = 0
+        self._remaining, self._asked_s, self._told = remaining, 0.0, ""
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._tenths: dict[str, int] = {}
@@ -31,6 +41,7 @@ class ProgressView:
                 BarColumn(),
                 TextColumn("{task.percentage:3.0f} %"),
                 TimeElapsedColumn(),
+                TextColumn("{task.fields[left]}"),
                 TextColumn("{task.fields[note]}"),
             )
             self._bars = Progress(*columns, console=Console(stderr=True))
@@ -49,18 +60,36 @@ class ProgressView:
         elif self._worth_a_line(event):
             share = f" {100 * event.done:3.0f} %" if event.done is not None else ""
             print(f"{event.stage or 'job'}{share}: {_note(event) or event.kind}", file=sys.stderr, flush=True)
+        if self._remaining is not None and self._is_time_to_ask(event):
+            self._tell(describe(self._remaining()), event)
+
+    def _is_time_to_ask(self, event: JobEvent) -> bool:
+        now_s, pause_s = time.monotonic(), ASK_AGAIN_S if self._bars is not None else 12 * ASK_AGAIN_S
+        if event.kind not in {"state", "started"} and now_s < self._asked_s + pause_s:
+            return False
+        self._asked_s = now_s
+        return True
+
+    def _tell(self, text: str, event: JobEvent) -> None:
+        if self._bars is not None:
+            for stage, task in self._tasks.items():
+                self._bars.update(task, left=text if stage == event.stage else "")
+        elif text and text != self._told:
+            print(f"job: {text}", file=sys.stderr, flush=True)
+        self._told = text
 
     def _draw(self, bars: Progress, event: JobEvent) -> None:
         if event.stage is None:
             return
         if event.stage not in self._tasks:
-            self._tasks[event.stage] = bars.add_task(event.stage, total=1.0, note="")
+            self._tasks[event.stage] = bars.add_task(event.stage, total=1.0, note="", left="")
         task = self._tasks[event.stage]
         bars.update(task, completed=event.done)
         if note := _note(event):
             bars.update(task, note=note)
         if event.kind == "finished":
             bars.stop_task(task)
+            bars.update(task, left="")
 
     def _worth_a_line(self, event: JobEvent) -> bool:
         """Every event but previews, and progress only when it enters another tenth."""
@@ -75,3 +104,23 @@ class ProgressView:
 def _note(event: JobEvent) -> str:
     held_out = event.data.get("held_out_error") if event.kind == "step" else None
     return f"{event.message.rstrip('.')}; held-out error {100 * held_out:.1f} %." if isinstance(held_out, float) else event.message
+
+
+def describe(remaining: dict[str, Any] | None) -> str:
+    """What is known of the time that remains, in a few words; empty once the job has ended."""
+    if remaining is None:
+        return ""
+    if remaining["low_s"] is None or remaining["high_s"] is None:
+        return f"no time range: {remaining['reason']}"
+    return f"ends in {range_text(remaining['low_s'], remaining['high_s'])} (80 % range from {remaining['past_jobs']} past jobs)"
+
+
+def range_text(low_s: float, high_s: float) -> str:
+    """Two durations with as many digits as mean something."""
+    (low, low_unit), (high, high_unit) = _duration(low_s), _duration(high_s)
+    return f"{low} to {high} {high_unit}" if low_unit == high_unit else f"{low} {low_unit} to {high} {high_unit}"
+
+
+def _duration(seconds: float) -> tuple[str, str]:
+    value, unit = (seconds, "s") if seconds < 90 else (seconds / 60, "min") if seconds < 5400 else (seconds / 3600, "h")
+    return f"{value:.1f}" if value < 9.95 and unit != "s" else f"{value:.0f}", unit

@@ -19,6 +19,7 @@ from services.api.database import metadata, open_database, writing
 from services.api.events import EventAddress, EventLog, event_table, insert_event, lease_table
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
+from services.api.past_runs import PastRuns, past_run_table
 from services.core.errors import DentineError, FencedError, JobStateError, UnknownJobError
 from services.core.geometry import Record
 from services.core.records import JobSpec
@@ -142,6 +143,7 @@ class Repository:
         self._url, self._clock = url, clock
         self.engine = open_database(url)
         upgrade(self.engine)
+        self.past_runs = PastRuns(self.engine)
 
     def close(self) -> None:
         """Close every connection."""
@@ -183,6 +185,12 @@ class Repository:
             query = query.where(*only.conditions())
         if before is not None:
             query = query.where(job_table.c.number < before)
+        with self.engine.connect() as connection:
+            return [_job(row) for row in connection.execute(query).mappings()]
+
+    def unfinished(self) -> list[Job]:
+        """Jobs that run or wait, those that have waited longest first."""
+        query = sql.select(job_table).where(job_table.c.state.in_([JobState.RUNNING, JobState.QUEUED])).order_by(job_table.c.number)
         with self.engine.connect() as connection:
             return [_job(row) for row in connection.execute(query).mappings()]
 
@@ -267,8 +275,8 @@ class Repository:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
             receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
             connection.execute(deletion_table.insert().values(receipt.model_dump()))
-            for table, column in ((event_table, event_table.c.job), (lease_table, lease_table.c.job), (job_table, job_table.c.id)):
-                connection.execute(table.delete().where(column == job_id))
+            for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):
+                connection.execute(column.table.delete().where(column == job_id))
             return receipt
 
     def deletion(self, job_id: str) -> Deletion:

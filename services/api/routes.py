@@ -14,6 +14,7 @@ from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import refusals
 from services.api.repository import Deletion, Job, JobFilter
+from services.api.time_ranges import TimeRange
 from services.core.geometry import Record
 from services.core.records import JobSpec
 
@@ -30,6 +31,7 @@ class JobDetail(Job):
 
     stages: list[StageProgress]
     waits_for: str | None = Field(description="why a queued job does not start; null if nothing keeps it")
+    remaining: TimeRange | None = Field(description="how long until it ends, waiting in the queue included; null unless it waits or runs")
 
 
 class Health(Record):
@@ -44,7 +46,8 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
     schema = json.dumps(JobSpec.model_json_schema())
 
     def detail(job: Job) -> JobDetail:
-        return JobDetail(**{name: getattr(job, name) for name in Job.model_fields}, stages=jobs.progress(job), waits_for=jobs.waits_for(job))
+        fields = {name: getattr(job, name) for name in Job.model_fields}
+        return JobDetail(**fields, stages=jobs.progress(job), waits_for=jobs.waits_for(job), remaining=jobs.time_range(job))
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:

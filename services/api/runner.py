@@ -36,6 +36,8 @@ class Runner:
     Args:
         folder: of a job by its id.
         locate: a job's options with the folder of an uploaded capture.
+        on_round: called every so often.
+        on_success: called with a job that has succeeded.
     """
 
     def __init__(
@@ -46,8 +48,10 @@ class Runner:
         run: RunJob,
         admission: Admission,
         on_round: Callable[[], None],
+        on_success: Callable[[Job], None],
     ) -> None:
-        self._repository, self._folder, self._locate, self._run, self._admission, self._on_round = repository, folder, locate, run, admission, on_round
+        self._repository, self._folder, self._locate, self._run, self._admission = repository, folder, locate, run, admission
+        self._on_round, self._on_success = on_round, on_success
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing = threading.Event(), threading.Event()
         self._current: Lease | None = None
@@ -154,6 +158,8 @@ class Runner:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
         logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
+        if transition.state is JobState.SUCCEEDED:
+            self._on_success(job)
 
     def _stage(self, job: Job) -> StageName | None:
         latest = self._repository.events_of(job.id).latest()

@@ -26,6 +26,8 @@ from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from tests.browser.contrast import contrast_failures
 from tests.support.live_server import serving
+from tests.support.past_runs import remember_runs
+from tests.support.uploading import write_capture
 
 pytestmark = pytest.mark.browser
 
@@ -126,6 +128,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     page.goto("/")
     expect(page.locator(".job .badge")).to_have_text("running")
     expect(page.locator(".stages li", has_text="prepare").locator(".state")).to_have_text("finished")
+    expect(page.locator(".remaining")).to_have_text("No time range: The size of its capture cannot be read, so it cannot be compared with other jobs.")
     for step in range(STEPS - 1):
         job.steps.release()
         expect(page.locator(".chart figcaption")).to_contain_text(f"{step + 1} steps.")
@@ -221,3 +224,17 @@ def test_a_queued_job_says_what_it_waits_for(page: Page, job: ScriptedJob, monke
     job.steps.release(STEPS)
     expect_state(page, number, "SUCCEEDED")
     expect(page.locator(".job header + p + p")).to_be_hidden()
+
+
+def test_a_running_job_says_when_it_ends(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
+    capture = str(write_capture(tmp_path / "mine"))
+    remember_runs(tmp_path / "data", capture, (900.0, 950.0, 1000.0, 1050.0, 1100.0))
+    running = str(page.request.post("/v1/jobs", data={"capture": capture}).json()["id"])
+    page.goto(f"/#/{running}")
+    expect(page.locator(".remaining")).to_have_text(re.compile(r"Ends in \d+ to \d+ min: 80 % range from 5 past jobs\."))
+    assert contrast_failures(page) == []
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/remaining.png", full_page=True)
+    job.steps.release(STEPS)
+    expect(page.locator(".job .badge")).to_have_text("succeeded")
+    expect(page.locator(".remaining")).to_be_hidden()

@@ -14,6 +14,7 @@ import pytest
 from services.api.app import create_app
 from services.api.guard import needs
 from services.api.logs import configure_logs, log_context
+from services.api.machine_class import machine_class
 from services.core.settings import ServerSettings
 from tests.support.live_server import serving, toy_server
 
@@ -55,7 +56,7 @@ def test_one_id_leads_from_the_answer_to_the_worker(tmp_path: Path) -> None:
     assert [(line["method"], line["route"], line["status"], line["client"]) for line in submitted] == [("POST", "/v1/jobs", 201, "127.0.0.1")]
     assert submitted[0]["duration_s"] > 0
     started = [json.loads(line.removeprefix("data: ")) for line in events.splitlines() if '"kind":"started"' in line]
-    assert [event["data"] for event in started] == [{"job": job["id"], "request_id": "visit-7.a"}] * 3
+    assert [event["data"] for event in started] == [{"job": job["id"], "request_id": "visit-7.a", "machine": machine_class()}] * 3
 
 
 @pytest.mark.parametrize("asked", ["", "a b", "x" * 65, "-a", 'a"b', "<b>"])

@@ -20,10 +20,20 @@ export interface Stage {
   message: string;
 }
 
+/** How long until a job ends; without limits where `reason` says why. */
+export interface TimeRange {
+  low_s: number | null;
+  high_s: number | null;
+  past_jobs: number;
+  reason: string | null;
+}
+
 export interface JobDetail extends Job {
   stages: Stage[];
   /** Why a queued job does not start. */
   waits_for: string | null;
+  /** Null unless the job waits or runs. */
+  remaining: TimeRange | null;
 }
 
 export interface JobEvent {

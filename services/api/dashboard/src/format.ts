@@ -1,6 +1,6 @@
 /** Numbers for people: an uncertain number shows as many digits as its standard error allows. */
 
-import type { Estimate } from "./api";
+import type { Estimate, TimeRange } from "./api";
 
 const UNITS: Record<string, string> = { "1": "", "1/mm": "mm⁻¹", "per mm": "mm⁻¹", "mm^-1": "mm⁻¹" };
 
@@ -30,6 +30,20 @@ export function bytes(count: number): string {
 
 export function when(seconds: number): string {
   return new Date(1000 * seconds).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
+}
+
+/** What is known of the time until a job ends. */
+export function remaining(range: TimeRange): string {
+  if (range.low_s === null || range.high_s === null) return `No time range: ${range.reason ?? ""}`;
+  const [low, lowUnit] = duration(range.low_s);
+  const [high, highUnit] = duration(range.high_s);
+  return `Ends in ${low}${lowUnit === highUnit ? "" : ` ${lowUnit}`} to ${high} ${highUnit}: 80 % range from ${range.past_jobs} past jobs.`;
+}
+
+function duration(seconds: number): [string, string] {
+  if (seconds < 90) return [seconds.toFixed(0), "s"];
+  const [value, unit] = seconds < 5400 ? [seconds / 60, "min"] : [seconds / 3600, "h"];
+  return [value.toFixed(value < 9.95 ? 1 : 0), unit];
 }
 
 /** Two digits of the standard error. */

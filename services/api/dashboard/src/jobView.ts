@@ -3,18 +3,19 @@
 import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobDetail, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
-import { bytes, when } from "./format";
+import { bytes, remaining, when } from "./format";
 import { LossChart } from "./lossChart";
 import { ParameterTable } from "./parameterTable";
 import { StageList } from "./stageList";
 
 const FINAL: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
-const WAITING_MS = 5000;
+const ASK_AGAIN_MS = 5000;
 
 export class JobView {
   readonly root = element("article", { class: "job" });
   private readonly state = element("span", { class: "badge", role: "status" });
   private readonly waits = element("p", { class: "soft", role: "status" });
+  private readonly remaining = element("p", { class: "soft remaining" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly action = element("button", { type: "button" });
@@ -52,7 +53,7 @@ export class JobView {
       this.waits,
       this.failure,
       this.refusal,
-      section("Stages", this.stages.root),
+      section("Stages", this.stages.root, this.remaining),
       section("Fit", this.chart.root),
       section("Render and photograph", this.comparison.root),
       section("Parameters", this.parameters.root),
@@ -102,12 +103,24 @@ export class JobView {
     await this.showFiles();
   }
 
-  /** What a queued job waits for is no event, so it is asked for again. */
+  /** What a queued job waits for, and how long a job will take, are no events, so they are asked for again. */
   private showWaiting(job: JobDetail): void {
     this.waits.hidden = job.waits_for === null;
     this.waits.textContent = job.waits_for ?? "";
+    this.remaining.hidden = job.remaining === null || job.waits_for !== null;
+    this.remaining.textContent = job.remaining ? remaining(job.remaining) : "";
     window.clearTimeout(this.timer);
-    if (job.state === "QUEUED") this.timer = window.setTimeout(() => void this.refreshState(), WAITING_MS);
+    if (job.state === "QUEUED" || job.state === "RUNNING") this.askLater();
+  }
+
+  private askLater(): void {
+    if (!this.root.isConnected) return;
+    this.timer = window.setTimeout(() => {
+      this.refreshState().catch((problem) => {
+        if (problem instanceof Unauthenticated) throw problem;
+        this.askLater();
+      });
+    }, ASK_AGAIN_MS);
   }
 
   private showState(job: Job): void {

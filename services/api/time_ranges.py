@@ -1,0 +1,173 @@
+"""How long until a job ends: an 80 % range learned from past jobs that did the same on the same class of machine, or a reason why there is none."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+from pydantic import Field
+
+from services.api.events import EventLog, JobEvent
+from services.api.forecast import LEAST, Observation, foresee
+from services.api.job_size import method_of, size_of
+from services.api.lifecycle import JobState
+from services.api.past_runs import TENTHS, PastRun, tenth_of
+from services.api.pipeline import stages_of
+from services.api.repository import Job, Repository
+from services.core.geometry import Record
+from services.core.records import JobSpec
+from services.core.stage import StageName
+
+SIZE_SLOPE = 0.5
+"""Expected growth of a duration's logarithm with that of each size: between none and proportion."""
+
+SHORTEST_S = 1e-3
+WIDEST = 100.0
+"""Ratio of a range's limits beyond which it says nothing."""
+
+
+class TimeRange(Record):
+    """How long until a job ends; both limits are null where nothing honest can be said."""
+
+    low_s: float | None = Field(default=None, description="from now; in 80 of 100 cases the job ends between the two limits")
+    high_s: float | None = Field(default=None, description="from now")
+    past_jobs: int = Field(default=0, description="how many past jobs it is learned from")
+    reason: str | None = Field(default=None, description="why there is no range")
+
+    def after(self, earlier: Self) -> Self:
+        """The range of what begins when something else has ended. Limits are added, as on a busy machine all jobs are late together."""
+        if self.low_s is None or self.high_s is None or earlier.low_s is None or earlier.high_s is None:
+            return self
+        fewer = min(self.past_jobs, earlier.past_jobs)
+        return self.model_copy(update={"low_s": self.low_s + earlier.low_s, "high_s": self.high_s + earlier.high_s, "past_jobs": fewer})
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a job is: which tenth of which stage it has reached last."""
+
+    stage: StageName | None = None
+    """None before the first one."""
+    tenth: int = 0
+    since_s: float = 0.0
+    """How long ago."""
+    took_s: float | None = None
+    """How long the run had taken until then; None where past runs do not compare."""
+
+
+def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastRun]) -> TimeRange:
+    """Range of what remains from a position, from past runs.
+
+    Args:
+        job_size: the features of its size.
+    """
+    compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
+    pairs = [_split(run, position) for run in compared]
+    # What was needed so far tells of what is left by as much as it was a part of the whole.
+    weight = 0.0 if position.took_s is None or not pairs else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
+    past = [Observation((*run.size.features, weight * math.log(took_s)), left_s) for run, (took_s, left_s) in zip(compared, pairs, strict=True)]
+    pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
+    outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
+    if outlook is None:
+        what = f"{len(past)} jobs like this one have succeeded on such a machine, and {LEAST} are needed to tell a time."
+        return TimeRange(past_jobs=len(past), reason=what)
+    left = outlook.remaining_s(position.since_s)
+    if left is None:
+        return TimeRange(past_jobs=len(past), reason=f"It takes longer than {len(past)} jobs like it let expect.")
+    if left[1] + position.since_s > WIDEST * (left[0] + position.since_s):
+        return TimeRange(past_jobs=len(past), reason=f"The {len(past)} past jobs differ too much from each other, or from this one, to tell a time.")
+    return TimeRange(low_s=left[0], high_s=left[1], past_jobs=len(past))
+
+
+def _split(run: PastRun, position: Position) -> tuple[float, float]:
+    """How long a run had taken until a position, and took from there."""
+    reached_s = 0.0 if position.stage is None else run.course.reached_s[position.stage][position.tenth]
+    return max(reached_s, SHORTEST_S), max(run.course.total_s - reached_s, SHORTEST_S)
+
+
+class TimeRanges:
+    """Ranges over one server's jobs, which run one after the other.
+
+    Args:
+        locate: a job's options with the folder of an uploaded capture.
+        waits_for: why a queued job does not start.
+        machine: class of the machine that runs jobs; None where that is not known before they do.
+    """
+
+    def __init__(self, repository: Repository, locate: Callable[[JobSpec], JobSpec], waits_for: Callable[[Job], str | None], machine: str | None) -> None:
+        self._repository, self._locate, self._waits_for, self._machine = repository, locate, waits_for, machine
+
+    def learn(self, job: Job) -> None:
+        """Remember how a job went that has succeeded."""
+        if (size := size_of(self._locate(job.spec))) is not None:
+            self._repository.past_runs.record(job.id, method_of(job.spec), size)
+
+    def of(self, job: Job) -> TimeRange | None:
+        """How long until a job ends; None if it neither runs nor waits."""
+        if job.state is JobState.RUNNING:
+            return self._own(job)
+        if job.state is not JobState.QUEUED:
+            return None
+        unfinished = self._repository.unfinished()
+        ahead = [one for one in unfinished if one.state is JobState.RUNNING or one.number < job.number]
+        if sum(one.state is JobState.RUNNING for one in ahead) > 1:
+            return TimeRange(reason="Several servers run jobs at once, so the place in the queue does not tell a time.")
+        total = self._own(job)
+        for one in ahead:
+            if total.low_s is None:
+                break
+            earlier = self._own(one)
+            if earlier.reason is not None:
+                return TimeRange(reason=f"Job {one.number} comes first: {earlier.reason}")
+            total = total.after(earlier)
+        return total
+
+    def _own(self, job: Job) -> TimeRange:
+        # Without the jobs before it.
+        if (waits_for := self._waits_for(job)) is not None:
+            return TimeRange(reason=waits_for)
+        log = self._repository.events_of(job.id)
+        position = _position(job, log)
+        if position is None:
+            return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
+        size = size_of(self._locate(job.spec))
+        if size is None:
+            return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
+        machine = self._machine_of(log)
+        runs = [] if machine is None else self._repository.past_runs.alike(method_of(job.spec), machine)
+        return time_range(size.features, position, runs)
+
+    def _machine_of(self, log: EventLog) -> str | None:
+        started = log.read(kind="started")
+        return (started[-1].data.get("machine") if started else self._machine) or self._repository.past_runs.newest_machine()
+
+
+def _position(job: Job, log: EventLog) -> Position | None:
+    """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is left."""
+    latest, stages = log.latest(), stages_of(job.spec)
+    if job.state is JobState.QUEUED:
+        if not latest:
+            return Position()
+        return Position(_following(stages, latest[-1])) if latest[-1].kind == "finished" else None
+    if not latest:
+        return Position(since_s=time.time() - job.changed_s)
+    last, tenth, reached_s = latest[-1], 0, latest[-1].time_s
+    if last.stage is None or (last.kind != "finished" and last.attempt > 1):
+        return None
+    if last.kind == "finished":
+        stage = _following(stages, last)
+        tenth = TENTHS - 1 if stage == last.stage else 0
+    else:
+        stage, tenth = last.stage, tenth_of(last.done or 0.0)
+        reached_s = log.reached_s(stage, last.attempt, tenth / TENTHS) or reached_s
+    is_whole = all(event.attempt == 1 and event.time_s >= job.changed_s for event in latest)
+    is_compared = is_whole and (stage, tenth) != (stages[0], 0)  # until then nothing was done that tells a pace
+    return Position(stage, tenth, max(time.time() - max(reached_s, job.changed_s), 0.0), reached_s - job.changed_s if is_compared else None)
+
+
+def _following(stages: tuple[StageName, ...], event: JobEvent) -> StageName:
+    """The stage after the one of an event, which itself is the last one's."""
+    return stages[min(stages.index(event.stage) + 1, len(stages) - 1)] if event.stage in stages else stages[0]

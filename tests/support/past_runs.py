@@ -1,0 +1,27 @@
+"""A history of jobs that nobody ran, so that a test knows what a server must expect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from services.api.database import open_database, sqlite_url, writing
+from services.api.job_size import method_of, size_of
+from services.api.machine_class import machine_class
+from services.api.past_runs import Course, past_run_table
+from services.core.records import JobSpec
+from services.core.settings import DATABASE_FILE
+
+
+def remember_runs(data: Path, capture: str, totals_s: Iterable[float]) -> None:
+    """As if jobs of this capture had taken so long, nearly all of it in the second half of the fit."""
+    spec, engine = JobSpec(capture=Path(capture)), open_database(sqlite_url(data / DATABASE_FILE))
+    size = size_of(spec)
+    assert size is not None
+    with writing(engine) as connection:
+        for number, total_s in enumerate(totals_s):
+            reached_s = {"prepare": [0.05] * 10, "fit": [0.1] * 6 + [total_s] * 4, "export": [total_s] * 10}
+            course = Course.model_validate({"machine": machine_class(), "reached_s": reached_s, "total_s": total_s})
+            row = {"job": f"past-{number}", "ended_s": float(number), "method": method_of(spec), "machine": machine_class()}
+            connection.execute(past_run_table.insert().values(row | {"size": size.model_dump_json(), "course": course.model_dump_json()}))
+    engine.dispose()

@@ -1,0 +1,148 @@
+"""What is learned from a job's events, and what a position in a job is compared with."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.api.events import JobEvent
+from services.api.job_size import JobSize, method_of, size_of
+from services.api.machine_class import machine_class
+from services.api.past_runs import Course, PastRun, course_of, tenth_of
+from services.api.time_ranges import Position, TimeRange, time_range
+from services.core.records import JobSpec, RigSpec
+from tests.support.uploading import write_capture
+
+SIZE = JobSize(pixels=1000, samples=64, steps=12)
+CLASS = "Some processor, 2 cores, 8 GiB"
+
+
+def event(time_s: float, kind: str, stage: str | None = None, done: float | None = None, attempt: int = 1, **data: Any) -> JobEvent:
+    values = {"id": 1, "job": "j", "time_s": time_s, "attempt": attempt if stage else 0, "stage": stage, "kind": kind, "message": "", "done": done}
+    return JobEvent.model_validate(values | {"data": data})
+
+
+def run_of_a_job() -> list[JobEvent]:
+    return [
+        event(90, "state", state="QUEUED", trigger="queue"),
+        event(100, "state", state="RUNNING", trigger="start"),
+        event(101, "started", "prepare", machine=CLASS),
+        event(105, "finished", "prepare", 1.0),
+        event(106, "started", "fit", machine=CLASS),
+        event(110, "step", "fit", 0.1),
+        event(130, "step", "fit", 0.5),
+        event(131, "log", "fit"),
+        event(132, "step", "fit", 0.3),
+        event(150, "finished", "fit", 1.0),
+        event(151, "state", state="SUCCEEDED", trigger="succeed"),
+    ]
+
+
+def test_a_course_tells_when_each_tenth_was_reached() -> None:
+    course = course_of(run_of_a_job())
+    assert course is not None
+    assert (course.machine, course.total_s) == (CLASS, 51.0)
+    assert course.reached_s == {"prepare": (1.0, *[5.0] * 9), "fit": (6.0, 10.0, *[30.0] * 4, *[50.0] * 4)}
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        lambda events: events[:-1],
+        lambda events: [*events[:-1], event(151, "state", state="QUEUED", trigger="lose"), event(152, "state", state="RUNNING", trigger="start"), events[-1]],
+        lambda events: [event(107, "started", "fit", attempt=2, machine=CLASS) if one.kind == "started" and one.stage == "fit" else one for one in events],
+        lambda events: [one for one in events if one.kind != "started"],
+        lambda events: [event(102, "finished", "fit", 1.0) if one.kind == "finished" and one.stage == "fit" else one for one in events],
+        lambda events: [one for one in events if not (one.kind == "finished" and one.stage == "fit")],
+    ],
+    ids=["not ended", "lost meanwhile", "second attempt", "unknown machine", "clock stepped back", "stage never finished"],
+)
+def test_nothing_is_learned_from_a_broken_run(spoiled: Any) -> None:
+    assert course_of(run_of_a_job()) is not None
+    assert course_of(spoiled(run_of_a_job())) is None
+
+
+def test_tenths_end_with_the_stage() -> None:
+    assert [tenth_of(done) for done in (0.0, 0.09, 0.1, 0.3, 0.999, 1.0)] == [0, 0, 1, 3, 9, 9]
+
+
+def past(factor: float) -> PastRun:
+    """A run that takes 10 s to prepare and 100 s to fit, evenly, all times a factor."""
+    reached = {"prepare": (1.0, *[10.0] * 9), "fit": tuple(10.0 + 10.0 * k for k in range(10))}
+    scaled = {stage: tuple(factor * one for one in times) for stage, times in reached.items()}
+    return PastRun(size=SIZE, course=Course.model_validate({"machine": CLASS, "reached_s": scaled, "total_s": 110 * factor}))
+
+
+RUNS = [past(factor) for factor in (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2)]
+
+
+def limits(position: Position) -> tuple[float, float]:
+    told = time_range(SIZE.features, position, RUNS)
+    assert told.low_s is not None
+    assert told.high_s is not None
+    assert told.past_jobs == len(RUNS)
+    return told.low_s, told.high_s
+
+
+def test_what_remains_shrinks_with_the_position() -> None:
+    for position, truth in ((Position(), 110), (Position("fit"), 100), (Position("fit", 5), 50), (Position("fit", 9), 10)):
+        low, high = limits(position)
+        assert low < truth < high < 2 * truth
+
+
+def test_a_job_that_was_slow_so_far_stays_slow() -> None:
+    even, slow = (limits(Position("fit", 5, took_s=took_s)) for took_s in (60.0, 120.0))
+    assert slow[0] > even[1]
+    assert math.log(slow[1] / slow[0]) > math.log(even[1] / even[0])
+
+
+def test_time_without_news_is_taken_into_account() -> None:
+    before, after = (limits(Position("fit", 5, since_s=since_s)) for since_s in (0.0, 45.0))
+    assert after[0] < before[0]
+    assert after[1] + 45 > before[1]
+    assert time_range(SIZE.features, Position("fit", 5, since_s=5000.0), RUNS).low_s is None
+
+
+def test_without_enough_or_alike_runs_there_is_a_reason_and_no_range() -> None:
+    few = time_range(SIZE.features, Position(), RUNS[:3])
+    assert (few.low_s, few.high_s, few.past_jobs) == (None, None, 3)
+    assert few.reason == "3 jobs like this one have succeeded on such a machine, and 5 are needed to tell a time."
+    wild = time_range(SIZE.features, Position(), [past(10.0**k) for k in range(6)])
+    assert wild.low_s is None
+    assert "differ too much" in (wild.reason or "")
+
+
+def test_ranges_follow_each_other() -> None:
+    first, second = TimeRange(low_s=1, high_s=3, past_jobs=9), TimeRange(low_s=10, high_s=20, past_jobs=7)
+    assert second.after(first) == TimeRange(low_s=11, high_s=23, past_jobs=7)
+
+
+def test_size_is_read_from_the_description_of_the_capture(tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "mine", images=3)
+    whole = size_of(JobSpec(capture=capture, samples_per_pixel=32, max_steps=5))
+    assert whole == JobSize(pixels=3 * 48, samples=32, steps=5)
+    assert size_of(JobSpec(capture=capture, pixel_step=2, solver="adam", adam_steps=70)) == JobSize(pixels=36, samples=64, steps=70)
+    assert size_of(JobSpec(rig=RigSpec(mouth=capture))) == JobSize(pixels=3 * 48, samples=64, steps=12)
+    (capture / "capture.json").write_text("[" * 100_000)
+    assert size_of(JobSpec(capture=capture)) is None
+    assert size_of(JobSpec(capture=tmp_path / "nowhere")) is None
+
+
+def test_options_that_change_what_is_done_make_another_method() -> None:
+    job = JobSpec(capture=Path("/a"))
+    assert method_of(job) == method_of(JobSpec(capture=Path("/b"), seed=7, samples_per_pixel=8))
+    for option, value in (("workers", 4), ("stains", True), ("kind", "jaw"), ("device", "cuda")):
+        assert method_of(job) != method_of(job.model_copy(update={option: value}))
+
+
+def test_the_class_of_a_machine_names_what_makes_it_fast(tmp_path: Path) -> None:
+    (tmp_path / "cpuinfo").write_text("processor\t: 0\nmodel name\t: Fast 9000\nflags\t\t: fpu\n")
+    device = tmp_path / "driver" / "nvidia" / "gpus" / "0000:01:00.0"
+    device.mkdir(parents=True)
+    (device / "information").write_text("Model: \t\t H100\nIRQ: 12\n")
+    assert machine_class(tmp_path).startswith("Fast 9000, ")
+    assert machine_class(tmp_path).endswith(" GiB, H100")
+    assert machine_class(tmp_path / "nowhere").startswith("unknown processor, ")
