@@ -16,11 +16,8 @@ if TYPE_CHECKING:
 
 def upload_folder(client: Client, folder: Path, subject: str | None = None) -> UploadResult:
     """Upload a folder with its progress on standard error."""
-    from stamina.instrumentation import set_on_retry_hooks
-
     from services.api.upload_progress import UploadView
 
-    set_on_retry_hooks(())  # a retry is no news; the bar stands still meanwhile
     with UploadView() as view:
         uploaded = client.upload(folder, view, subject)
     if uploaded.left_out:

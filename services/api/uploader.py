@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import random
 import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
 from pydantic import Field
 
 from services.api.capture_paths import path_fault, require_paths
 from services.api.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
+from services.api.exchange import Ask, Flow, Pause, Work, answer, error_in
 from services.core.errors import CaptureInputError, PlatformError, UploadError
 from services.core.geometry import Record
 
@@ -26,6 +29,8 @@ PATIENCE_S = 300.0
 """How long a chunk is tried again while the server does not answer."""
 VERIFYING_S = 900.0
 """How long the server may take to answer, as after the last chunk it reads the whole file."""
+LEAST_WAIT_S, MOST_WAIT_S = 0.2, 5.0
+"""Between two tries; twice as long each time."""
 _PASSING = frozenset({408, 423, 429, 460, 502, 503, 504})
 
 
@@ -57,16 +62,14 @@ class PassingError(Exception):
 
 
 class Uploader:
-    """One upload over one connection."""
+    """One upload, as a flow of requests."""
 
-    def __init__(
-        self, http: httpx.Client, ask: Callable[..., dict[str, Any]], progress: Callable[[UploadProgress], None] | None = None, patience_s: float = PATIENCE_S
-    ) -> None:
-        self._http, self._ask, self._progress, self._patience_s = http, ask, progress, patience_s
+    def __init__(self, server: str, progress: Callable[[UploadProgress], None] | None = None, patience_s: float = PATIENCE_S) -> None:
+        self._server, self._progress, self._patience_s = server, progress, patience_s
         self._sent_bytes = self._done_bytes = self._total_bytes = 0
         self._chunk_bytes = CHUNK_BYTES
 
-    def upload(self, folder: Path, subject: str | None = None) -> UploadResult:
+    def upload(self, folder: Path, subject: str | None = None) -> Flow[UploadResult]:
         """Upload a folder and commit it.
 
         Raises:
@@ -74,15 +77,17 @@ class Uploader:
         """
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
             raise UploadError(f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no name.")
-        files, left_out = _scan(folder)
+        files, left_out = yield Work(lambda: _scan(folder))
         self._total_bytes = sum((folder / path).stat().st_size for path in files)
-        manifest = UploadManifest(files=tuple(self._hashed(folder, path) for path in files), subject=subject)
-        capture = CaptureDetail.model_validate(self._ask("POST", "/captures", json=manifest.model_dump()))
+        hashed = yield Work(lambda: tuple(self._hashed(folder, path) for path in files))
+        manifest = UploadManifest(files=hashed, subject=subject)
+        told = yield from answer(self._server, Ask("POST", "/captures", {"json": manifest.model_dump()}))
+        capture = CaptureDetail.model_validate(told)
         self._done_bytes = self._total_bytes - capture.missing_bytes
         for file in capture.files:
             if not file.is_known:
-                self._send(folder / file.path, capture.id, file)
-        self._patiently(lambda: self._answer("POST", f"/captures/{capture.id}/commit"))
+                yield from self._send(folder / file.path, capture.id, file)
+        yield from self._patiently(lambda: self._answer("POST", f"/captures/{capture.id}/commit"))
         return UploadResult(id=capture.id, path=capture.path, bytes=capture.bytes, sent_bytes=self._sent_bytes, left_out=left_out)
 
     def _hashed(self, folder: Path, path: str) -> ManifestFile:
@@ -97,49 +102,48 @@ class Uploader:
             raise CaptureInputError(f"File {folder / path} is empty; leave it out or export it again.")
         return ManifestFile(path=path, bytes=size, sha256=content.hexdigest())
 
-    def _send(self, source: Path, capture: str, file: CaptureFile) -> None:
+    def _send(self, source: Path, capture: str, file: CaptureFile) -> Flow[None]:
         from services.api.tus import VERSION, format_metadata
 
         url = file.upload.removeprefix("/v1")
         metadata = {"Upload-Length": str(file.bytes), "Upload-Metadata": format_metadata({"capture": capture, "path": file.path})}
-        created = self._patiently(lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata))
+        created = yield from self._patiently(lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata))
         base, offset = self._done_bytes - file.received_bytes, int(created.headers["Upload-Offset"])
         with source.open("rb") as stream:
 
-            def step() -> int:
+            def step() -> Flow[int]:
                 """The next offset after one more chunk; a failed one asks the server for its own first."""
                 nonlocal offset
                 start, offset = offset, -1
                 if start < 0:
-                    start = int(self._answer("HEAD", url, headers={"Tus-Resumable": VERSION}).headers["Upload-Offset"])
-                stream.seek(start)
-                chunk = stream.read(min(self._chunk_bytes, file.bytes - start))
+                    asked = yield from self._answer("HEAD", url, headers={"Tus-Resumable": VERSION})
+                    start = int(asked.headers["Upload-Offset"])
+                chunk, checksum = yield Work(lambda: _read_chunk(stream, start, min(self._chunk_bytes, file.bytes - start)))
                 if start < file.bytes and not chunk:
                     raise CaptureInputError(f"File {source} became shorter while it was uploaded; upload the folder again.")
-                offset = self._append(url, start, chunk)
+                offset = yield from self._append(url, start, chunk, checksum)
                 return offset
 
-            while self._patiently(step) < file.bytes:
+            while (yield from self._patiently(step)) < file.bytes:
                 self._done_bytes = base + offset
                 self._tell("sending", file.path)
         self._done_bytes = base + file.bytes
         self._tell("sending", file.path)
 
-    def _append(self, url: str, offset: int, chunk: bytes) -> int:
-        from services.api.tus import CHUNK_TYPE, VERSION, Checksum, format_checksum
+    def _append(self, url: str, offset: int, chunk: bytes, checksum: str) -> Flow[int]:
+        from services.api.tus import CHUNK_TYPE, VERSION
 
-        checksum = format_checksum(Checksum("sha256", hashlib.sha256(chunk).digest()))
         headers = {"Tus-Resumable": VERSION, "Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE, "Upload-Checksum": checksum}
         self._sent_bytes += len(chunk)
         try:
-            answer = self._answer("PATCH", url, content=chunk, headers=headers)
+            appended = yield from self._answer("PATCH", url, content=chunk, headers=headers)
         except PassingError:
             self._chunk_bytes = max(self._chunk_bytes // 2, LEAST_CHUNK_BYTES)
             raise
         self._chunk_bytes = min(2 * self._chunk_bytes, CHUNK_BYTES)
-        return int(answer.headers["Upload-Offset"])
+        return int(appended.headers["Upload-Offset"])
 
-    def _answer(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def _answer(self, method: str, path: str, **options: Any) -> Flow[httpx.Response]:
         """Ask once.
 
         Raises:
@@ -147,37 +151,43 @@ class Uploader:
         """
         import httpx
 
-        from services.api.client import error_in
-
         try:
-            response = self._http.request(method, path, timeout=httpx.Timeout(10.0, read=VERIFYING_S, write=60.0), **options)
+            response: httpx.Response = yield Ask(method, path, options | {"timeout": httpx.Timeout(10.0, read=VERIFYING_S, write=60.0)})
         except httpx.TransportError as problem:
-            raise PassingError(f"Server {self._http.base_url} does not answer ({problem})") from problem
+            raise PassingError(f"Server {self._server} does not answer ({problem})") from problem
         if not response.is_error:
             return response
         problem_code = "" if method == "HEAD" else response.text
         if response.status_code in _PASSING or '"code":"upload-offset"' in problem_code:
             wait = response.headers.get("Retry-After", "")
-            raise PassingError(f"Server {self._http.base_url} answers {response.status_code}", float(wait) if wait.isdigit() else None)
+            raise PassingError(f"Server {self._server} answers {response.status_code}", float(wait) if wait.isdigit() else None)
         raise error_in(response)
 
-    def _patiently(self, step: Callable[[], R]) -> R:
-        import stamina
-
-        def is_passing(problem: Exception) -> bool | float:
-            return isinstance(problem, PassingError) and (problem.wait_s or True)
-
-        try:
-            for attempt in stamina.retry_context(on=is_passing, attempts=None, timeout=self._patience_s, wait_initial=0.2, wait_max=5.0, wait_jitter=0.2):
-                with attempt:
-                    return step()
-        except PassingError as problem:
-            raise PlatformError(f"{problem}; start it again and repeat this command, what was sent is kept.") from problem
-        raise AssertionError("a retry ends by returning or raising")
+    def _patiently(self, step: Callable[[], Flow[R]]) -> Flow[R]:
+        """Take a step again while what keeps it may pass, at growing intervals."""
+        give_up_s, wait_s = time.monotonic() + self._patience_s, LEAST_WAIT_S
+        while True:
+            try:
+                return (yield from step())
+            except PassingError as problem:
+                pause_s = problem.wait_s or wait_s * random.uniform(0.8, 1.2)
+                if time.monotonic() + pause_s > give_up_s:
+                    raise PlatformError(f"{problem}; start it again and repeat this command, what was sent is kept.") from problem
+            yield Pause(pause_s)
+            wait_s = min(2 * wait_s, MOST_WAIT_S)
 
     def _tell(self, phase: Literal["hashing", "sending"], path: str) -> None:
         if self._progress is not None:
             self._progress(UploadProgress(phase=phase, path=path, done_bytes=self._done_bytes, total_bytes=self._total_bytes))
+
+
+def _read_chunk(stream: BinaryIO, start: int, size: int) -> tuple[bytes, str]:
+    """Some bytes of a file, and their checksum as a header tells it."""
+    from services.api.tus import Checksum, format_checksum
+
+    stream.seek(start)
+    chunk = stream.read(size)
+    return chunk, format_checksum(Checksum("sha256", hashlib.sha256(chunk).digest()))
 
 
 def _scan(folder: Path) -> tuple[list[str], tuple[str, ...]]:

@@ -81,7 +81,7 @@ def test_a_server_that_never_comes_back_is_a_sentence(server: httpx.Client, fold
     cuts = [3 * 2**20 + number for number in range(1000)]
     told = "repeat this command, what was sent is kept"
     with cutting(server.base_url.port, cuts) as proxy, Client(proxy.address) as client, pytest.raises(PlatformError, match=told):
-        Uploader(client._http, client._ask, patience_s=1.0).upload(folder)
+        client.run(Uploader(proxy.address, patience_s=1.0).upload(folder))
 
 
 def test_a_folder_that_is_no_capture_is_refused_before_anything_is_sent(server: httpx.Client, tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_a_file_that_changes_meanwhile_is_refused_by_name(server: httpx.Client, 
 
 
 def test_an_error_of_the_tree_is_found_by_its_code() -> None:
-    from services.api.client import error_in
+    from services.api.exchange import error_in
 
     answer = httpx.Response(507, json={"detail": "The disk is full.", "code": "disk-full"})
     assert type(error_in(answer)) is DiskFullError

@@ -1,4 +1,4 @@
-"""A TCP proxy on loopback that cuts the connection after given numbers of bytes from the client."""
+"""A TCP proxy on loopback that cuts the connection after given numbers of bytes from the client or from the server."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ BLOCK_BYTES = 2**16
 
 
 class CuttingProxy:
-    """Forwards to one port; ``cuts_bytes`` count over all connections together. ``sent_bytes`` is what clients have sent through it."""
+    """Forwards to one port; cuts count bytes over all connections together."""
 
-    def __init__(self, port: int, cuts_bytes: Sequence[int]) -> None:
-        self._target, self._cuts = port, sorted(cuts_bytes, reverse=True)
+    def __init__(self, port: int, cuts_bytes: Sequence[int], answer_cuts_bytes: Sequence[int]) -> None:
+        self._target, self._sent, self._answered = port, _Meter(cuts_bytes), _Meter(answer_cuts_bytes)
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self._guard, self._open = threading.Lock(), set[socket.socket]()
-        self.sent_bytes = self.cut_count = 0
+        self._open = set[socket.socket]()
         self.address = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def accept(self) -> None:
@@ -27,8 +26,8 @@ class CuttingProxy:
                 near, _ = self._listener.accept()
                 far = socket.create_connection(("127.0.0.1", self._target))
                 self._open |= {near, far}
-                threading.Thread(target=self._forward, args=(near, far), daemon=True).start()
-                threading.Thread(target=self._return, args=(far, near), daemon=True).start()
+                threading.Thread(target=_pump, args=(near, far, self._sent), daemon=True).start()
+                threading.Thread(target=_pump, args=(far, near, self._answered), daemon=True).start()
 
     def close(self) -> None:
         """Cut everything."""
@@ -37,34 +36,50 @@ class CuttingProxy:
         for connection in self._open:
             _cut(connection)
 
-    def _forward(self, near: socket.socket, far: socket.socket) -> None:
-        with suppress(OSError):
-            while block := near.recv(BLOCK_BYTES):
-                with self._guard:
-                    self.sent_bytes += len(block)
-                    is_cut = bool(self._cuts) and self.sent_bytes >= self._cuts[-1]
-                    if is_cut:
-                        beyond = self.sent_bytes - self._cuts.pop()
-                        self.cut_count += 1
-                        block = block[: len(block) - beyond]
-                far.sendall(block)
-                if is_cut:
-                    break
-        _cut(near)
-        _cut(far)
+    @property
+    def sent_bytes(self) -> int:
+        """What clients have sent through it."""
+        return self._sent.passed_bytes
 
-    def _return(self, far: socket.socket, near: socket.socket) -> None:
-        with suppress(OSError):
-            while block := far.recv(BLOCK_BYTES):
-                near.sendall(block)
-        _cut(near)
-        _cut(far)
+    @property
+    def cut_count(self) -> int:
+        """Cuts so far."""
+        return self._sent.cut_count + self._answered.cut_count
+
+
+class _Meter:
+    """Counts what passes in one direction, and says where to cut it."""
+
+    def __init__(self, cuts_bytes: Sequence[int]) -> None:
+        self._cuts, self._guard, self.passed_bytes = sorted(cuts_bytes, reverse=True), threading.Lock(), 0
+        self.cut_count = 0
+
+    def passing(self, block: bytes) -> tuple[bytes, bool]:
+        """What may still pass of a block, and whether the connection is cut after it."""
+        with self._guard:
+            self.passed_bytes += len(block)
+            if not self._cuts or self.passed_bytes < self._cuts[-1]:
+                return block, False
+            beyond = self.passed_bytes - self._cuts.pop()
+            self.cut_count += 1
+            return block[: max(len(block) - beyond, 0)], True
+
+
+def _pump(source: socket.socket, sink: socket.socket, meter: _Meter) -> None:
+    with suppress(OSError):
+        while block := source.recv(BLOCK_BYTES):
+            block, is_cut = meter.passing(block)
+            sink.sendall(block)
+            if is_cut:
+                break
+    _cut(source)
+    _cut(sink)
 
 
 @contextmanager
-def cutting(port: int, cuts_bytes: Sequence[int]) -> Iterator[CuttingProxy]:
-    """A proxy for the time of the block."""
-    proxy = CuttingProxy(port, cuts_bytes)
+def cutting(port: int, cuts_bytes: Sequence[int] = (), answer_cuts_bytes: Sequence[int] = ()) -> Iterator[CuttingProxy]:
+    """A proxy for the time of the block; cuts after so many bytes from clients, and after so many from the server."""
+    proxy = CuttingProxy(port, cuts_bytes, answer_cuts_bytes)
     thread = threading.Thread(target=proxy.accept)
     thread.start()
     try:
