@@ -46,9 +46,18 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
 
 
 @contextmanager
-def toy_server(data: Path, log: IO[str] | None = None, **settings: Any) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-    """The server with toy stages as a process of its own, ended by SIGTERM unless the block ended it; ``log`` takes its standard error."""
-    command = [sys.executable, "-m", "tests.support.toy_server", json.dumps({"data": str(data), "port": 0} | settings)]
+def toy_server(
+    data: Path, log: IO[str] | None = None, stages: str = "tests.support.toy_stages", **settings: Any
+) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+    """The server with a module's stages as a process of its own, ended by SIGTERM unless the block ended it; ``log`` takes its standard error."""
+    chosen = json.dumps({"data": str(data), "port": 0} | settings)
+    with running_server([sys.executable, "-m", "tests.support.toy_server", chosen, stages], log) as running:
+        yield running
+
+
+@contextmanager
+def running_server(command: list[str], log: IO[str] | None = None) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+    """A server as a process of its own, which tells its address in its first line."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=Path(__file__).parents[2]) as process:
         try:
             assert process.stdout is not None

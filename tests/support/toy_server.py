@@ -1,4 +1,7 @@
-"""``python -m tests.support.toy_server SETTINGS``: the real server with toy stages, so that a test can kill it. Leases are short, as tests wait for them."""
+"""``python -m tests.support.toy_server SETTINGS [MODULE]``: the real server with toy stages, or those of another module, so that a test can kill it.
+
+Leases are short, as tests wait for them.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,12 @@ from pathlib import Path
 from unittest.mock import patch
 
 from services.api.events import EventAddress
-from services.api.pipeline import run_job
+from services.api.pipeline import DOORS, run_job
 from services.api.server import serve
 from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
-from tests.support.toy_stages import DOORS
 
 LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 
@@ -29,15 +31,15 @@ def serve_doors(settings: ServerSettings, doors: Mapping[StageName, str]) -> Non
         serve(settings, run_toys)
 
 
-def main(settings: ServerSettings) -> None:
-    """Serve with toy stages and short leases."""
+def main(settings: ServerSettings, stages: str = "tests.support.toy_stages") -> None:
+    """Serve with a module's stages and short leases."""
     with (
         patch("services.api.runner.LEASE_S", LEASE_S),
         patch("services.api.runner.ROUND_S", ROUND_S),
         patch("services.api.admission.RETRY_S", RETRY_S),
     ):
-        serve_doors(settings, DOORS)
+        serve_doors(settings, {stage: f"{stages}:{stage}" for stage in DOORS})
 
 
 if __name__ == "__main__":
-    main(ServerSettings.model_validate_json(sys.argv[1]))
+    main(ServerSettings.model_validate_json(sys.argv[1]), *sys.argv[2:])
