@@ -99,7 +99,7 @@ class Exchange:
 
 
 def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
-    """The JSON that a request is answered with.
+    """The JSON that a request is answered with. One that changes nothing is made once more if its connection breaks, as servers close idle ones.
 
     Raises:
         PlatformError: no server answers. DentineError: the one that the answer tells of.
@@ -107,7 +107,12 @@ def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
     import httpx
 
     try:
-        response = yield ask
+        try:
+            response = yield ask
+        except (httpx.ReadError, httpx.RemoteProtocolError):
+            if ask.method != "GET":
+                raise
+            response = yield ask
     except httpx.HTTPError as problem:
         raise PlatformError(f"Server {server} does not answer ({problem}); start it with dentine serve or give --server.") from problem
     if response.is_error:

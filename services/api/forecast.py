@@ -13,6 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
 
 SHARE = 0.8
 """Of all cases that a range is to hold."""
@@ -24,6 +27,9 @@ SLOPE_VARIANCE = 25.0
 """Of each slope, over that of the noise: at a noise of 10 %, slopes within 0.5 of what was expected."""
 NOISE = 0.1
 """Relative noise that is added with the weight of one observation, so that a few equal durations do not make a range of no width."""
+
+PERSISTENCE = 0.5
+"""Expected share of the last case's surprise in the next one: a machine that others use too stays as busy for a while."""
 
 
 @dataclass(frozen=True)
@@ -60,20 +66,38 @@ def foresee(past: Sequence[Observation], features: Sequence[float], slopes: Sequ
     """Outlook of a case with these features; None with fewer than ``LEAST`` observations.
 
     Args:
+        past: oldest first, as what was unexpected of one case is expected to go on in part in the next.
         slopes: expected ones, by how much log T grows with each feature.
     """
     if len(past) < LEAST:
         return None
     x, y = np.array([one.features for one in past]), np.log([one.seconds for one in past])
-    expected, n = np.array(slopes), len(past)
-    x_mean, y_mean = x.mean(axis=0), y.mean()
+    surprises = _regress(x, y, slopes).residuals
+    before = np.concatenate([[0.0], surprises[:-1]])
+    fit = _regress(np.column_stack([x, before]), y, (*slopes, PERSISTENCE))
+    step = np.array([*features, surprises[-1]]) - fit.x_mean
+    variance = fit.squares / (len(past) - 1) * (1 + 1 / len(past) + step @ np.linalg.solve(fit.information, step))
+    return Outlook(float(fit.y_mean + step @ fit.slope), math.sqrt(float(variance)), len(past) - 1)
+
+
+@dataclass(frozen=True)
+class _Regression:
+    x_mean: Array
+    y_mean: float
+    information: Array
+    slope: Array
+    residuals: Array
+    squares: float
+
+
+def _regress(x: Array, y: Array, slopes: Sequence[float]) -> _Regression:
+    expected, x_mean, y_mean = np.array(slopes), x.mean(axis=0), float(y.mean())
     x, y = x - x_mean, y - y_mean
     information = x.T @ x + np.eye(len(expected)) / SLOPE_VARIANCE
     slope = np.linalg.solve(information, x.T @ y + expected / SLOPE_VARIANCE)
-    squares = NOISE**2 + np.sum((y - x @ slope) ** 2) + np.sum((slope - expected) ** 2) / SLOPE_VARIANCE
-    step = np.array(features) - x_mean
-    variance = squares / (n - 1) * (1 + 1 / n + step @ np.linalg.solve(information, step))
-    return Outlook(float(y_mean + step @ slope), math.sqrt(float(variance)), n - 1)
+    residuals: Array = y - x @ slope
+    squares = NOISE**2 + np.sum(residuals**2) + np.sum((slope - expected) ** 2) / SLOPE_VARIANCE
+    return _Regression(x_mean, y_mean, information, slope, residuals, float(squares))
 
 
 def survival(t: float, degrees: int) -> float:

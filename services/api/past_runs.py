@@ -99,11 +99,11 @@ class PastRuns:
                 connection.execute(past_run_table.insert().values(row | {"ended_s": ended_s}))
 
     def alike(self, method: str, machine: str) -> list[PastRun]:
-        """The newest runs of jobs that did the same on the same class of machine."""
+        """The newest runs of jobs that did the same on the same class of machine, oldest first."""
         alike = (past_run_table.c.method == method) & (past_run_table.c.machine == machine)
         query = sql.select(past_run_table).where(alike).order_by(past_run_table.c.ended_s.desc()).limit(NEWEST)
         with self._engine.connect() as connection:
-            return [_run(row) for row in connection.execute(query).mappings()]
+            return [_run(row) for row in reversed(connection.execute(query).mappings().all())]
 
     def newest_machine(self) -> str | None:
         """Class of the machine on which a job succeeded last."""

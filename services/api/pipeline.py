@@ -29,7 +29,7 @@ from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.machine_class import machine_class
 from services.api.workers import Workers
-from services.core.errors import DiskFullError, InputError, JobCancelledError, SchedulerLostError, WorkerLostError
+from services.core.errors import DiskFullError, InputError, JobCancelledError, PlatformError, SchedulerLostError, WorkerLostError
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, write_record
@@ -54,6 +54,8 @@ DOORS: Mapping[StageName, str] = MappingProxyType(
 )
 """``module:function`` of each stage; imported by the worker, never here."""
 _PUBLISHED_AS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
+_EXTRAS = {"capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
+"""What to install where a stage runs."""
 
 
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
@@ -161,7 +163,7 @@ class StageTask:
                 context = LocalContext(self.root, attempt, tell)
                 context.raise_if_cancelled()
                 module, function = self.door.split(":")
-                with _telling_a_full_disk(self.root):
+                with _telling_a_full_disk(self.root), _telling_a_missing_package(self.stage):
                     getattr(importlib.import_module(module), function)(self.spec, context)
                 if "finished" not in told:
                     tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
@@ -185,6 +187,18 @@ def _telling_a_full_disk(root: Path) -> Iterator[None]:
             raise
         what = f"The disk was full at {problem.filename or root}; free some space, the job goes on from what it had published."
         raise DiskFullError(what, {"free_disk_bytes": shutil.disk_usage(root).free}) from problem
+
+
+@contextmanager
+def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as problem:
+        if (problem.name or "services").partition(".")[0] == "services":
+            raise
+        extra = _EXTRAS[stage]
+        what = f"Stage {stage} needs {problem.name}, which its workers do not have; install dentine[{extra}] where they run, then retry the job."
+        raise PlatformError(what) from problem
 
 
 class _Watch:

@@ -63,6 +63,7 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
 
     Args:
         job_size: the features of its size.
+        runs: oldest first.
     """
     compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
     pairs = [_split(run, position) for run in compared]
@@ -155,7 +156,7 @@ def _position(job: Job, log: EventLog) -> Position | None:
     if not latest:
         return Position(since_s=time.time() - job.changed_s)
     last, tenth, reached_s = latest[-1], 0, latest[-1].time_s
-    if last.stage is None or (last.kind != "finished" and last.attempt > 1):
+    if last.stage is None or (last.kind != "finished" and (last.attempt > 1 or last.time_s < job.changed_s)):
         return None
     if last.kind == "finished":
         stage = _following(stages, last)

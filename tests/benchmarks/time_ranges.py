@@ -40,11 +40,11 @@ def write_phantoms(folder: Path) -> list[Path]:
     return captures
 
 
-def draw_job(chance: random.Random, captures: list[Path]) -> JobSpec:
+def draw_job(chance: random.Random, captures: list[Path], samples: tuple[int, ...]) -> JobSpec:
     """A small job: the same thing done to another size."""
     options: dict[str, Any] = {"boundary": "matched", "dentin": "known", "max_steps": 1, "search_candidates": 100, "advise": False, "workers": 1}
-    samples = chance.choice((4, 6, 8, 12, 16))
-    return JobSpec(capture=chance.choice(captures), samples_per_pixel=samples, max_samples_per_pixel=samples, seed=chance.randrange(2**31), **options)
+    drawn = chance.choice(samples)
+    return JobSpec(capture=chance.choice(captures), samples_per_pixel=drawn, max_samples_per_pixel=drawn, seed=chance.randrange(2**31), **options)
 
 
 def run_job(client: Client, job: str, told: dict[str, Any]) -> dict[str, Any]:
@@ -71,11 +71,11 @@ def ask(client: Client, job: str) -> dict[str, Any]:
     return {"low_s": None, "high_s": None, **(remaining or {}), "asked_s": asked_s}
 
 
-def measure(client: Client, captures: list[Path], jobs: int, seed: int) -> list[dict[str, Any]]:
+def measure(client: Client, captures: list[Path], samples: tuple[int, ...], jobs: int, seed: int) -> list[dict[str, Any]]:
     """Jobs in small groups."""
     chance, rows = random.Random(seed), list[dict[str, Any]]()
     while len(rows) < jobs:
-        group = [client.submit(draw_job(chance, captures))["id"] for _ in range(min(chance.choice((1, 1, 1, 2, 3)), jobs - len(rows)))]
+        group = [client.submit(draw_job(chance, captures, samples))["id"] for _ in range(min(chance.choice((1, 1, 1, 2, 3)), jobs - len(rows)))]
         told = [ask(client, job) for job in group]
         for place, (job, range_) in enumerate(zip(group, told, strict=True)):
             rows.append(run_job(client, job, range_) | {"jobs_before": place, "load": os.getloadavg()[0]})
@@ -116,13 +116,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "server.log").open("w") as log:
         work = Path(folder)
         if options.stages == "real":
-            captures = write_phantoms(work)
+            captures, samples = write_phantoms(work), (4, 6, 8, 12, 16)
             server = running_server([*DENTINE, "serve", "--port", "0", "--data", str(work / "data")], log)
         else:
-            captures = [write_capture(work / "mine")]
+            captures, samples = [write_capture(work / "mine")], (8, 16, 32, 64, 128)
             server = toy_server(work / "data", log, "tests.support.drawn_stages")
         with server as (http, _), Client(str(http.base_url)) as client:
-            rows = measure(client, captures, options.jobs, options.seed)
+            rows = measure(client, captures, samples, options.jobs, options.seed)
     result = {"stages": options.stages, **summary(rows), "rows": rows}
     print(json.dumps({name: value for name, value in result.items() if name != "rows"}, indent=1))
     if options.json is not None:

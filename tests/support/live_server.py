@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -56,9 +56,11 @@ def toy_server(
 
 
 @contextmanager
-def running_server(command: list[str], log: IO[str] | None = None) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+def running_server(
+    command: list[str], log: IO[str] | None = None, cwd: Path = Path(__file__).parents[2], environment: Mapping[str, str] | None = None
+) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
     """A server as a process of its own, which tells its address in its first line."""
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=Path(__file__).parents[2]) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=cwd, env=environment) as process:
         try:
             assert process.stdout is not None
             with connect(process.stdout.readline().strip()) as client:
@@ -66,4 +68,4 @@ def running_server(command: list[str], log: IO[str] | None = None) -> Iterator[t
         finally:
             if process.poll() is None:
                 process.terminate()
-                assert process.wait(30) == 0
+                assert process.wait(300) == 0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -16,6 +16,7 @@ SECONDS = st.floats(0.01, 1e6)
 LOGARITHMS = st.floats(-5, 15)
 PAST = st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), min_size=LEAST, max_size=20)
 SLOPES = (0.5, 0.5)
+some = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def range_of(past: list[Observation], features: tuple[float, ...] = (0.0, 0.0), elapsed_s: float = 0.0, share: float = SHARE) -> tuple[float, float]:
@@ -32,6 +33,7 @@ def test_the_tail_is_that_of_students_t(degrees: int, t: float) -> None:
     assert survival(t, degrees) == pytest.approx(stats.t.sf(t, degrees), abs=1e-12)
 
 
+@some
 @given(PAST, LOGARITHMS, LOGARITHMS)
 def test_a_range_is_ordered_finite_and_grows_with_its_share(past: list[Observation], x: float, y: float) -> None:
     low, high = range_of(past, (x, y))
@@ -41,19 +43,24 @@ def test_a_range_is_ordered_finite_and_grows_with_its_share(past: list[Observati
     assert wider_high >= high
 
 
+@some
 @given(PAST, st.floats(0.01, 100))
 def test_slower_machines_take_longer_in_proportion(past: list[Observation], factor: float) -> None:
     slower = [Observation(one.features, factor * one.seconds) for one in past]
     assert range_of(slower) == pytest.approx([factor * limit for limit in range_of(past)], rel=1e-6)
 
 
-@given(PAST, st.randoms(use_true_random=False))
-def test_the_order_of_past_cases_does_not_matter(past: list[Observation], chance: object) -> None:
-    shuffled = list(past)
-    chance.shuffle(shuffled)  # type: ignore[attr-defined]
-    assert range_of(shuffled) == pytest.approx(range_of(past), rel=1e-6)
+def test_what_was_unexpected_of_the_last_case_goes_on_in_part() -> None:
+    chance = np.random.default_rng(5)
+    usual = [Observation((0.0, 0.0), float(10 * math.exp(0.1 * chance.standard_normal()))) for _ in range(12)]
+    slow = [Observation((0.0, 0.0), 8 * one.seconds) for one in usual[:3]]
+    before, after = range_of(usual), range_of([*usual, *slow])
+    assert before[1] < 20
+    assert after[0] < 80 < after[1]
+    assert range_of([*slow, *usual])[1] < after[1]
 
 
+@some
 @given(PAST, st.floats(0.0, 1.0))
 def test_what_has_lasted_does_not_end_earlier(past: list[Observation], share: float) -> None:
     low, high = range_of(past)
@@ -63,6 +70,7 @@ def test_what_has_lasted_does_not_end_earlier(past: list[Observation], share: fl
     assert later_high + elapsed_s >= high * (1 - 1e-9)
 
 
+@some
 @given(st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), max_size=LEAST - 1))
 def test_a_few_cases_tell_nothing(past: list[Observation]) -> None:
     assert foresee(past, (0.0, 0.0), SLOPES) is None
@@ -86,7 +94,7 @@ def test_a_job_unlike_the_others_gets_a_wider_range() -> None:
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_ranges_hold_the_truth_as_often_as_they_say(count: int, noise: float) -> None:
     """Durations with a fixed part and one in proportion to the size, which is not quite what the model says."""
-    chance, held, cases = np.random.default_rng(7), 0, 400
+    chance, held, cases = np.random.default_rng(7), 0, 250
     for _ in range(cases):
         x = chance.normal(0.0, 1.0, count + 1)
         seconds = (0.5 + np.exp(x)) * np.exp(noise * chance.standard_normal(count + 1))

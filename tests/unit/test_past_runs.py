@@ -8,12 +8,17 @@ from typing import Any
 
 import pytest
 
+from services.api.database import sqlite_url
 from services.api.events import JobEvent
 from services.api.job_size import JobSize, method_of, size_of
 from services.api.machine_class import machine_class
 from services.api.past_runs import Course, PastRun, course_of, tenth_of
-from services.api.time_ranges import Position, TimeRange, time_range
+from services.api.repository import Repository
+from services.api.time_ranges import Position, TimeRange, TimeRanges, time_range
 from services.core.records import JobSpec, RigSpec
+from services.core.settings import DATABASE_FILE
+from services.core.stage import StageEvent
+from tests.support.past_runs import remember_runs
 from tests.support.uploading import write_capture
 
 SIZE = JobSize(pixels=1000, samples=64, steps=12)
@@ -146,3 +151,31 @@ def test_the_class_of_a_machine_names_what_makes_it_fast(tmp_path: Path) -> None
     assert machine_class(tmp_path).startswith("Fast 9000, ")
     assert machine_class(tmp_path).endswith(" GiB, H100")
     assert machine_class(tmp_path / "nowhere").startswith("unknown processor, ")
+
+
+def test_an_interrupted_stage_has_no_range_and_the_next_one_has(tmp_path: Path) -> None:
+    capture = str(write_capture(tmp_path / "mine"))
+    repository = Repository(sqlite_url(tmp_path / DATABASE_FILE))
+    remember_runs(tmp_path, capture, (900.0, 950.0, 1000.0, 1050.0, 1100.0))
+    ranges = TimeRanges(repository, lambda spec: spec, lambda _: None, machine_class())
+    job = repository.create(JobSpec(capture=Path(capture)), None).job
+
+    def told() -> TimeRange:
+        found = ranges.of(repository.get(job.id))
+        assert found is not None
+        return found
+
+    assert told().low_s is not None
+    for attempt in (1, 2):
+        lease = repository.lease(job.id, "me", 60)
+        assert (told().low_s is None) == (attempt == 2)
+        with repository.address_of(lease).open() as log:
+            assert log.begin_stage("prepare", machine=machine_class()) == attempt
+            assert (told().low_s is None) == (attempt == 2)
+            if attempt == 2:
+                log.append(attempt, StageEvent(stage="prepare", kind="finished", done=1.0))
+        if attempt == 1:
+            repository.lose()
+            assert told().reason == "It was interrupted; the next stage will tell a time again."
+    assert told().low_s is not None
+    repository.close()

@@ -1,0 +1,89 @@
+"""``dentine[api]`` alone is a server: installed into an empty environment, it starts, answers, and says the truth of a job that its workers run elsewhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from services.api.app import STATIC
+from services.core.meshfiles import write_mesh
+from tests.support.live_server import running_server
+from tests.support.small_mouth import revolved
+from tests.support.small_system import free_port
+from tests.support.uploading import write_capture
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+ROOT = Path(__file__).parents[2]
+ABSENT = ("mitsuba", "drjit", "cv2", "pymodbus", "scipy", "rtree", "manifold3d", "xatlas", "PIL", "matplotlib", "psycopg")
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual environment with ``.[api]``, installed from a copy of the tree as the dashboard's image does."""
+    folder = tmp_path_factory.mktemp("installed")
+    tree = folder / "tree"
+    shutil.copytree(ROOT / "services", tree / "services", ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tree)
+    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+    subprocess.run([str(folder / "venv/bin/pip"), "install", "--quiet", f"{tree}[api]"], check=True, cwd=folder)
+    return folder / "venv"
+
+
+@contextmanager
+def served(environment: Path, data: Path, **settings: str) -> Iterator[httpx.Client]:
+    """The installed server, which sees nothing of this tree."""
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [str(environment / "bin/dentine"), "serve", "--port", "0", "--data", str(data)]
+    with running_server(command, cwd=data.parent, environment=inherited | settings) as (client, _):
+        yield client
+
+
+def test_what_renders_captures_and_speaks_to_domes_is_absent(environment: Path) -> None:
+    code = f"import importlib.util, json; print(json.dumps([name for name in {ABSENT!r} if importlib.util.find_spec(name)]))"
+    answer = subprocess.run([str(environment / "bin/python"), "-I", "-c", code], check=True, capture_output=True, text=True)
+    assert json.loads(answer.stdout) == []
+
+
+def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path) -> None:
+    with served(environment, tmp_path / "data") as client:
+        assert client.get("/v1/health/live").json() == {"status": "live"}
+        assert client.get("/v1/health/ready").status_code == 200
+        assert "<title>dentine</title>" in client.get("/").text
+        assert client.get("/app.js").status_code == (200 if (STATIC / "app.js").exists() else 404)
+        assert "/v1/jobs" in client.get("/v1/openapi.json").json()["paths"]
+
+
+def test_a_stage_whose_packages_are_absent_says_so(environment: Path, tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "mine")
+    write_mesh(capture / "teeth" / "11" / "outer.ply", revolved((2.0, 3.0)))
+    with served(environment, tmp_path / "data") as client:
+        job = client.post("/v1/jobs", json={"capture": str(capture), "workers": 1}).json()["id"]
+        client.get(f"/v1/jobs/{job}/events", timeout=300)
+        detail = client.get(f"/v1/jobs/{job}").json()
+    assert detail["state"] == "FAILED"
+    assert detail["failure"]["code"] == "platform"
+    assert re.fullmatch(r"Stage prepare needs \w+, which its workers do not have; install dentine\[preprocess\] .*", detail["failure"]["message"])
+
+
+def test_a_job_waits_for_a_scheduler_elsewhere(environment: Path, tmp_path: Path) -> None:
+    scheduler = f"tcp://127.0.0.1:{free_port()}"
+    with served(environment, tmp_path / "data", DENTINE__SERVER__SCHEDULER=scheduler) as client:
+        job = client.post("/v1/jobs", json={"capture": str(write_capture(tmp_path / "mine")), "workers": 1}).json()["id"]
+        while (detail := client.get(f"/v1/jobs/{job}").json())["waits_for"] is None:
+            assert detail["state"] in {"QUEUED", "RUNNING"}
+            time.sleep(0.2)
+        assert detail["waits_for"].startswith(f"Waits for workers: The scheduler {scheduler} does not answer")
+        assert detail["remaining"]["reason"] == detail["waits_for"]
+        assert client.get("/v1/health/ready").status_code == 503
