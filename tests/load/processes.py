@@ -14,6 +14,8 @@ from typing import Any
 import psutil
 
 ROOT = Path(__file__).parents[2]
+PATIENCE_S = 300.0
+"""A bound for a machine that is busy with something else."""
 
 
 @dataclass(frozen=True)
@@ -69,4 +71,7 @@ def _running(command: list[str], data: Path, headers: dict[str, str]) -> Iterato
             yield Served(process.stdout.readline().strip(), psutil.Process(process.pid), data, headers)
         finally:
             process.terminate()
-            process.wait(60)
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
