@@ -34,6 +34,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
 
     from services.api import access, problems
     from services.api.captures_routes import build_captures_router
+    from services.api.dome import Dome
+    from services.api.dome_routes import build_dome_router
     from services.api.feed import EventFeed
     from services.api.observation import Observation
     from services.api.routes import build_router
@@ -45,12 +47,19 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         run_job(spec, folder, events=events, cluster=workers, is_logged=True)
 
-    jobs = Jobs(settings, run or run_on_workers)
+    def run_in_turn(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+        if spec.rig is not None:
+            dome.make_way()
+        (run or run_on_workers)(spec, folder, events)
+
+    jobs = Jobs(settings, run_in_turn)
+    dome = Dome(settings.dome, jobs)
     feed = EventFeed(jobs.repository)
     observation = Observation(jobs, settings)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        dome.start()
         jobs.start()
         tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
         try:
@@ -59,6 +68,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.to_thread(dome.close)
             await asyncio.to_thread(jobs.close)
             await asyncio.to_thread(workers.close)
 
@@ -66,6 +76,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     problems.install(app)
     app.include_router(build_router(jobs, feed))
     app.include_router(build_captures_router(jobs.captures))
+    app.include_router(build_dome_router(dome))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")

@@ -12,10 +12,10 @@ from services.api.admission import Admission, Machine
 from services.api.captures import Captures, is_uploaded
 from services.api.erasure import erase, forget_listing
 from services.api.events import JobEvent
-from services.api.lifecycle import Instruction, Trigger
+from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.machine_class import machine_class
 from services.api.pipeline import request_cancel, stages_of
-from services.api.repository import Creation, Deletion, Job, Repository
+from services.api.repository import Creation, Deletion, Job, JobFilter, Repository
 from services.api.runner import RunJob, Runner
 from services.api.time_ranges import TimeRange, TimeRanges
 from services.core.errors import SettingsError, StoreError
@@ -23,8 +23,11 @@ from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
+from services.core.store import is_published
 
 DAY_S = 86400.0
+MOST_RUNNING = 1000
+"""More jobs are not run at once: each is one thread of a server."""
 
 
 class StageProgress(Record):
@@ -71,11 +74,10 @@ class Jobs:
             SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
             JobStateError: the key belongs to another job.
         """
-        for option, path in (("capture", spec.capture), ("rig.mouth", spec.rig.mouth if spec.rig else None)):
-            if path is not None and not path.is_absolute() and not (option == "capture" and is_uploaded(path)):
-                raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
-            if path is not None and path.is_absolute() and not _is_there(path):
-                raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
+        if spec.capture is not None and not is_uploaded(spec.capture):
+            require_server_path("capture", spec.capture)
+        if spec.rig is not None:
+            require_server_path("rig.mouth", spec.rig.mouth)
         with self.captures.keeping(spec.capture):
             self._admission.refuse_too_large(self.captures.locate(spec))
             creation = self.repository.create(spec, key, request_id)
@@ -111,6 +113,11 @@ class Jobs:
         forget_listing(self.folder(job_id))
         return receipt
 
+    def capturing(self) -> list[Job]:
+        """Jobs under way, of any server of the database, whose capture is not published yet."""
+        running = self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING)))
+        return [job for job in running if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
+
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, None if nothing keeps it."""
         return self._admission.reason(job.id)
@@ -140,6 +147,18 @@ class Jobs:
                 self.delete(job_id)
             except StoreError as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
+
+
+def require_server_path(option: str, path: Path) -> None:
+    """Refuse a path that means nothing on the server.
+
+    Raises:
+        SettingsError: it is relative or absent.
+    """
+    if not path.is_absolute():
+        raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
+    if not _is_there(path):
+        raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
 
 
 def _is_there(path: Path) -> bool:

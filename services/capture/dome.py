@@ -6,24 +6,10 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol, Self
 
+from services.core.dome import DomeStatus
 from services.core.errors import ExposureLimitError
 
 Rgb = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class DomeStatus:
-    """A snapshot for people: preflight, dashboard."""
-
-    firmware: str
-    light_count: int
-    interlock_closed: bool
-    emergency_stop: bool
-    supply_on: bool
-    faults: tuple[str, ...]
-    lit: tuple[int, ...]
-    temperature_degc: tuple[float, ...]
-    current_ma: tuple[int, ...]
 
 
 class Dome(Protocol):

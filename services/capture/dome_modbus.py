@@ -4,6 +4,7 @@
 * The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when a light
   has been on for its strobe time (a hung one).
 * Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
+* ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the watchdog anew.
 """
 
 from __future__ import annotations
@@ -22,14 +23,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.capture import registers as reg
-from services.capture.dome import DomeStatus, ExposureBudget, Rgb
+from services.capture.dome import ExposureBudget, Rgb
 from services.capture.keepalive import KeepAlive
 from services.capture.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
-from services.core.errors import InterlockError, ReadbackError, RigError
+from services.core.dome import DomeStatus
+from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError, RigUnreachableError
 
 REPLY_TIMEOUT_S = 0.5
 HANG_MARGIN_S = 2.0
 DARK_ATTEMPTS = 3
+
+
+def all_off(host: str, port: int) -> DomeStatus:
+    """Switch every light off, whoever drives the dome, and keep the supply open until a driver arms the watchdog anew.
+
+    Raises:
+        RigError: darkness could not be confirmed.
+    """
+    link = ModbusLink(host, port, REPLY_TIMEOUT_S)
+    problem: Exception | None = None
+    try:
+        for _ in range(DARK_ATTEMPTS):
+            try:
+                link.write(reg.ALL_OFF, [1])
+                link.write(reg.KEEPALIVE, [1, reg.STOPPED_MS])
+                status = _read_status(link)
+            except LinkError as failure:
+                link.close()
+                problem = failure
+                continue
+            if not status.lit:
+                return status
+            problem = LinkError(f"light {status.lit[0]} still emits")
+    finally:
+        link.close()
+    raise _kind(problem)(f"The dome at {host}:{port} is not confirmed dark ({problem}); press its emergency stop or cut its power.") from problem
 
 
 class DomeObserver:
@@ -51,16 +79,26 @@ class DomeObserver:
         """Latched faults."""
         return reg.FaultBit(self._read(reg.FAULTS)[0])
 
+    def status(self) -> DomeStatus:
+        """The controller's state."""
+        try:
+            return _read_status(self._link)
+        except LinkError as problem:
+            raise self._blind(problem) from problem
+
     def close(self) -> None:
         """Drop the connection."""
         self._link.close()
+
+    def _blind(self, problem: LinkError) -> RigError:
+        self._link.close()
+        return _kind(problem)(f"The dome cannot be observed: {problem}; check its power and network.")
 
     def _read(self, register: reg.Register, count: int | None = None) -> list[int]:
         try:
             return self._link.read(register, count)
         except LinkError as problem:
-            self._link.close()
-            raise RigError(f"The dome cannot be observed: {problem}; check its power and network.") from problem
+            raise self._blind(problem) from problem
 
 
 class ModbusDome:
@@ -175,20 +213,7 @@ class ModbusDome:
     def status(self) -> DomeStatus:
         """Read the controller's state."""
         with self._dark_on_error():
-            firmware = self._link.read(reg.FIRMWARE)[0]
-            closed, pressed, supply = self._link.read(reg.INTERLOCK_CLOSED, 3)
-            banks = -(-self._light_count // reg.LIGHTS_PER_BANK)
-            return DomeStatus(
-                firmware=f"{firmware >> 8}.{firmware & 0xFF}",
-                light_count=self._light_count,
-                interlock_closed=bool(closed),
-                emergency_stop=bool(pressed),
-                supply_on=bool(supply),
-                faults=_names(reg.FaultBit(self._link.read(reg.FAULTS)[0])),
-                lit=tuple(int(i) for i in np.flatnonzero(self._rgb(reg.OUTPUTS).any(axis=1))),
-                temperature_degc=tuple(tenths / 10 for tenths in self._link.read(reg.BANK_TEMPERATURE, banks)),
-                current_ma=tuple(self._link.read(reg.BANK_CURRENT, banks)),
-            )
+            return _read_status(self._link)
 
     @contextmanager
     def _dark_on_error(self) -> Iterator[None]:
@@ -198,12 +223,13 @@ class ModbusDome:
             with suppress(RigError):
                 self.dark()
             if isinstance(problem, LinkError):
-                # An open interlock is why a controller refuses; say that rather than the code.
+                # ALL OFF or an open interlock is why a controller refuses; say that rather than the code.
                 if isinstance(problem, RefusedError):
                     with suppress(LinkError):
+                        self._require_armed()
                         self._require_safe()
                         self._require_no_fault()
-                raise RigError(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
+                raise _kind(problem)(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
             raise
 
     def _confirmed(self) -> Rgb:
@@ -216,6 +242,7 @@ class ModbusDome:
             held = self._rgb(register)
             wrong = np.flatnonzero((held != wanted).any(axis=1))
             if len(wrong):
+                self._require_armed()
                 light = int(wrong[0])
                 raise ReadbackError(
                     f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
@@ -241,9 +268,14 @@ class ModbusDome:
         if not closed:
             raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
 
+    def _require_armed(self) -> None:
+        if self._link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS:
+            raise RigStoppedError(f"ALL OFF was pressed for the dome at {self.address} and it stays dark; start again when the subject is ready.")
+
     def _require_no_fault(self) -> None:
         faults = reg.FaultBit(self._link.read(reg.FAULTS)[0])
         if faults:
+            self._require_armed()
             raise RigError(f"The dome at {self.address} reports {' and '.join(_names(faults))}; remove the cause and run again.")
 
     def _rgb(self, register: reg.Register) -> NDArray[np.int64]:
@@ -278,6 +310,31 @@ class ModbusDome:
         for number in self._previous_handlers:
             signal.signal(number, signal.SIG_DFL)
         self._previous_handlers.clear()
+
+
+def _read_status(link: ModbusLink) -> DomeStatus:
+    if link.read(reg.IDENTITY)[0] != reg.IDENTITY_VALUE:
+        raise LinkError(f"the device at {link.address} is no dome controller")
+    firmware, lights = link.read(reg.FIRMWARE)[0], min(link.read(reg.LIGHT_COUNT)[0], reg.MAX_LIGHTS)
+    closed, pressed, supply = link.read(reg.INTERLOCK_CLOSED, 3)
+    banks = -(-lights // reg.LIGHTS_PER_BANK)
+    outputs = np.asarray(link.read(reg.OUTPUTS, 3 * lights)).reshape(-1, 3)
+    return DomeStatus(
+        firmware=f"{firmware >> 8}.{firmware & 0xFF}",
+        light_count=lights,
+        interlock_closed=bool(closed),
+        emergency_stop=bool(pressed),
+        supply_on=bool(supply),
+        stopped=link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS,
+        faults=_names(reg.FaultBit(link.read(reg.FAULTS)[0])),
+        lit=tuple(int(light) for light in np.flatnonzero(outputs.any(axis=1))),
+        temperature_degc=tuple(tenths / 10 for tenths in link.read(reg.BANK_TEMPERATURE, banks)),
+        current_ma=tuple(link.read(reg.BANK_CURRENT, banks)),
+    )
+
+
+def _kind(problem: Exception | None) -> type[RigError]:
+    return RigUnreachableError if isinstance(problem, NoReplyError) else RigError
 
 
 def _names(faults: reg.FaultBit) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ IDENTITY_VALUE = 0xDE17
 FIRMWARE_MAJOR = 1
 NO_LIGHT = 0xFFFF
 ALL_LIGHTS = 0xFFFE
+STOPPED_MS = 0
 
 
 class FaultBit(IntFlag):
@@ -93,7 +94,9 @@ EXPOSURE_TRIGGER = Register("exposure_trigger", "coil", 1, 1, "1", "write 1: pul
 FAULT_RESET = Register("fault_reset", "coil", 2, 1, "1", "write 1: clear latched faults whose cause is gone; levels stay 0; reads 0")
 
 KEEPALIVE = Register("keepalive", "holding", 0, 1, "1", "any write feeds the watchdog; nothing else does")
-WATCHDOG_MS = Register("watchdog_ms", "holding", 1, 1, "ms", "go dark when not fed for this long")
+WATCHDOG_MS = Register(
+    "watchdog_ms", "holding", 1, 1, "ms", f"go dark when not fed for this long; {STOPPED_MS} keeps the supply open whatever is fed (ALL OFF)"
+)
 STROBE_MS = Register("strobe_ms", "holding", 16, 1, "ms", "a level goes dark by itself this long after it was written; 0 for no limit")
 ACTIVE_LIGHT = Register(
     "active_light", "holding", 17, 1, "1", f"fast path: on write this light takes active_level and all others 0; {ALL_LIGHTS} all, {NO_LIGHT} none"

@@ -12,6 +12,8 @@
     │   ├── UnknownPresetError no such set of options
     │   ├── UnknownWebhookError no such webhook or delivery
     │   ├── WebhookAddressError a webhook may not go there
+    │   ├── UnknownDomeError  this server has no dome
+    │   ├── DomeBusyError     a capture or a preflight has the dome
     │   ├── JobStateError     the job's state does not allow what was asked
     │   ├── UnknownTokenError no such token
     │   ├── BodyTooLargeError a request's body is over the limit
@@ -37,6 +39,8 @@
     ├── PlatformError         the machine lacks something: a library, a device
     │   └── SchedulerLostError the workers' scheduler does not answer; the job waits for it
     ├── RigError              the dome or a camera misbehaves; lights are dark when it is raised
+    │   ├── RigUnreachableError the controller does not answer; its watchdog makes it dark
+    │   ├── RigStoppedError   somebody pressed ALL OFF
     │   ├── InterlockError    e-stop or interlock open
     │   ├── ExposureLimitError photobiological limit, refused before anything is sent
     │   └── ReadbackError     the controller does not hold what was written
@@ -141,6 +145,18 @@ class JobStateError(InputError):
     """The job's state, or an earlier submission, does not allow what was asked."""
 
     code = "job-state"
+
+
+class UnknownDomeError(InputError):
+    """The server has no dome to work by hand."""
+
+    code = "dome-unknown"
+
+
+class DomeBusyError(InputError):
+    """A capture or a preflight has the dome."""
+
+    code = "dome-busy"
 
 
 class UnknownTokenError(InputError):
@@ -289,6 +305,18 @@ class RigError(DentineError):
 
     code = "rig-fault"
     exit_status = 5
+
+
+class RigUnreachableError(RigError):
+    """The dome's controller does not answer. What it was last told may hold until its watchdog runs out."""
+
+    code = "rig-unreachable"
+
+
+class RigStoppedError(RigError):
+    """Somebody pressed ALL OFF; the dome stays dark until it is started anew."""
+
+    code = "rig-stopped"
 
 
 class InterlockError(RigError):

@@ -39,6 +39,15 @@ class UploadLimits(Record):
     keep_free_bytes: int = Field(default=2**30, ge=0, description="free disk that open captures, fully received, must leave")
 
 
+class DomeSettings(Record):
+    """The dome that a server works by hand. Captures take theirs from the job."""
+
+    address: str | None = Field(default=None, description="host:port of the Modbus controller, or 'simulated' for one of the server's own; default is none")
+    watchdog_s: float = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
+    light_exposure_limit_s: float = Field(default=10.0, gt=0, description="most level x on-time of one light, from the rig's photobiological assessment")
+    total_exposure_limit_s: float = Field(default=100.0, gt=0, description="most level x on-time of all lights together")
+
+
 class ServerSettings(Record):
     """The API server."""
 
@@ -55,6 +64,7 @@ class ServerSettings(Record):
     session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
     body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
     rates: RateSettings = RateSettings()
+    dome: DomeSettings = DomeSettings()
     uploads: UploadLimits = UploadLimits()
 
     @property

@@ -18,7 +18,7 @@ from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import DomeObserver, ModbusDome
 from services.capture.registers import FaultKind
 from services.capture.simulator import order_fault, serve_dome, simulated_dome
-from services.core.errors import InterlockError, ReadbackError, RigError
+from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError
 
 WATCHDOG_S = 1.0
 ALWAYS = 60_000
@@ -65,7 +65,7 @@ def require_dark_within_watchdog(observer: DomeObserver, since_s: float) -> None
     ("kind", "argument", "times", "on", "error", "words"),
     [
         (FaultKind.DROP_REQUEST, 0, 1, reg.ACTIVE_LIGHT, ReadbackError, "Light 2 holds"),
-        (FaultKind.DROP_REPLY, 0, ALWAYS, reg.LEVELS, RigError, "does not answer for levels"),
+        (FaultKind.DROP_REPLY, 0, ALWAYS, reg.LEVELS, RigUnreachableError, "does not answer for levels"),
         (FaultKind.DELAY, 700, 1, reg.ACTIVE_LIGHT, ReadbackError, "Light 2 holds"),
         (FaultKind.EXCEPTION, 4, 1, reg.ACTIVE_LIGHT, RigError, "Modbus exception 4"),
         (FaultKind.WRONG_REPLY, 0, 1, reg.LEVELS, ReadbackError, "Light 7 holds"),

@@ -36,12 +36,18 @@ KNOWN_SCOPES = {
     "GET /v1/audit": Scope.ADMIN,
     "POST /v1/session": Scope.READ,
     "GET /v1/openapi.json": Scope.READ,
+    "GET /v1/dome": Scope.OPERATE_DOME,
+    "POST /v1/dome/off": Scope.OPERATE_DOME,
+    "PUT /v1/dome/light": Scope.OPERATE_DOME,
+    "DELETE /v1/dome/light": Scope.OPERATE_DOME,
+    "POST /v1/dome/preflight": Scope.OPERATE_DOME,
 }
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
-    with guarded(tmp_path_factory.mktemp("data"), write_report) as server:
+    # More refusals than a test of every route makes; their limit has tests of its own.
+    with guarded(tmp_path_factory.mktemp("data"), write_report, rates=RateSettings(refusals_per_minute=1000)) as server:
         yield server
 
 

@@ -1,0 +1,27 @@
+"""Where a dome is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from services.core.errors import SettingsError
+
+
+@contextmanager
+def dome_address(address: str, lights: int, watchdog_s: float) -> Iterator[tuple[str, int]]:
+    """Host and port of a dome; 'simulated' starts one for the time of the block.
+
+    Raises:
+        SettingsError: neither 'simulated' nor host:port.
+    """
+    if address == "simulated":
+        from services.capture.simulator import simulated_dome
+
+        with simulated_dome(lights, watchdog_s) as place:
+            yield place
+        return
+    host, separator, port = address.rpartition(":")
+    if not (separator and host and port.isdigit()):
+        raise SettingsError(f"rig.dome '{address}' is neither 'simulated' nor host:port; correct it.")
+    yield host, int(port)

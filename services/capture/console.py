@@ -1,0 +1,172 @@
+"""The dome by hand: a process that a server starts and tells over its pipes what to do.
+
+::
+
+    python -m services.capture.console '{"address": "host:port", ...}'    DomeCommand lines in, DomeAnswer lines out
+
+Commands run side by side, so that ALL OFF and the status wait for nobody; one at a time drives the dome. The process ends with its standard input, that is
+with whoever started it, kill -9 included, and leaves the dome dark. A light that it holds goes dark by itself when its time is over, which is kept here and by
+the controller's strobe, and within the watchdog period if this process is killed.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+import time
+from contextlib import ExitStack, suppress
+
+from services.capture.address import dome_address
+from services.capture.dome import ExposureBudget
+from services.capture.dome_modbus import DomeObserver, ModbusDome, all_off
+from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
+from services.core.errors import DentineError, DomeBusyError, RigError, SettingsError
+from services.core.settings import DomeSettings
+
+TICK_S = 0.1
+PATIENCE_S = 1.0
+"""How long a command waits for another one that drives the dome."""
+DOSE_S = 1e4
+"""Light adds up over this time (IEC 62471), so that a limit is for all lights by hand since the dome was last left dark for so long."""
+SIMULATED_LIGHTS = 155
+
+
+class Console:
+    """Works one dome; ``close`` leaves it dark."""
+
+    def __init__(self, host: str, port: int, settings: DomeSettings) -> None:
+        self._host, self._port, self._settings = host, port, settings
+        self._driving, self._ending = threading.Lock(), threading.Event()
+        self._held = ExitStack()
+        self._dome: ModbusDome | None = None
+        self._budget, self._until_s = ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s), 0.0
+        self._keeper = threading.Thread(target=self._keep, name="light keeper")
+        self._keeper.start()
+
+    def answer(self, command: DomeCommand) -> DomeAnswer:
+        """Carry out a command; errors become part of the answer."""
+        try:
+            return self._carry_out(command)
+        except DentineError as problem:
+            return DomeAnswer(number=command.number, code=problem.code, message=problem.message)
+        except Exception as problem:
+            return DomeAnswer(number=command.number, code=DentineError.code, message=f"The dome's console broke with {type(problem).__name__}: {problem}.")
+
+    def close(self) -> None:
+        """End dark, also in mid-preflight."""
+        self._ending.set()
+        if not self._driving.acquire(timeout=PATIENCE_S):
+            with suppress(RigError):
+                all_off(self._host, self._port)
+            self._driving.acquire()
+        with suppress(RigError):
+            self._leave()
+        self._driving.release()
+        self._keeper.join()
+
+    def _carry_out(self, command: DomeCommand) -> DomeAnswer:
+        findings: tuple[str, ...] = ()
+        if command.do == "off":
+            status = all_off(self._host, self._port)
+            if self._driving.acquire(timeout=PATIENCE_S):
+                self._let_go()
+            return DomeAnswer(number=command.number, status=status)
+        if command.do != "status":
+            if not self._driving.acquire(timeout=PATIENCE_S):
+                raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
+            try:
+                if command.do == "light":
+                    self._light(command)
+                else:
+                    self._leave()
+                if command.do == "preflight":
+                    findings = self._preflight(command)
+            finally:
+                self._driving.release()
+        return DomeAnswer(number=command.number, status=self._status(), findings=findings)
+
+    def _let_go(self) -> None:
+        try:
+            with suppress(RigError):
+                self._leave()
+        finally:
+            self._driving.release()
+
+    def _light(self, command: DomeCommand) -> None:
+        try:
+            if self._dome is None:
+                if time.monotonic() > self._until_s + DOSE_S:
+                    self._budget.spent_s.clear()
+                self._dome = self._held.enter_context(ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s))
+            _require_light(command.light, self._dome.light_count)
+            self._dome.light(command.light, command.level, command.on_s)
+        except BaseException:
+            with suppress(RigError):
+                self._leave()
+            raise
+        self._until_s = time.monotonic() + command.on_s
+
+    def _preflight(self, command: DomeCommand) -> tuple[str, ...]:
+        from services.capture.preflight import preflight
+        from services.capture.rig import PlannedRig
+
+        if command.rig is None:
+            raise SettingsError("A preflight needs a rig; give its mouth folder.")
+        planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}"}))
+        with planned.in_use() as (dome, cameras):
+            return preflight(planned.plan, dome, cameras, planned.spec)
+
+    def _status(self) -> DomeStatus:
+        observer = DomeObserver(self._host, self._port)
+        try:
+            return observer.status()
+        finally:
+            observer.close()
+
+    def _keep(self) -> None:
+        # Darkens a light whose time is over, or that no longer is as it was set.
+        while not self._ending.wait(TICK_S):
+            with self._driving:
+                if self._dome is None:
+                    continue
+                try:
+                    self._dome.confirm()
+                    if time.monotonic() > self._until_s:
+                        self._leave()
+                except RigError as problem:
+                    print(problem.message, file=sys.stderr)
+                    with suppress(RigError):
+                        self._leave()
+
+    def _leave(self) -> None:
+        held, self._held, self._dome = self._held, ExitStack(), None
+        held.close()
+
+
+def _require_light(light: int, count: int) -> None:
+    if not 0 <= light < count:
+        raise SettingsError(f"Light {light} does not exist, the dome has lights 0 to {count - 1}; choose one of them.")
+
+
+def _main() -> None:
+    settings = DomeSettings.model_validate(json.loads(sys.argv[1]))
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
+    speaking = threading.Lock()
+    with ExitStack() as stack:
+        host, port = stack.enter_context(dome_address(settings.address or "", SIMULATED_LIGHTS, settings.watchdog_s))
+        console = Console(host, port, settings)
+        stack.callback(console.close)
+
+        def obey(line: str) -> None:
+            told = console.answer(DomeCommand.model_validate_json(line)).model_dump_json()
+            with speaking, suppress(BrokenPipeError):
+                print(told, flush=True)
+
+        for line in sys.stdin:
+            threading.Thread(target=obey, args=(line,), daemon=True).start()
+
+
+if __name__ == "__main__":
+    _main()

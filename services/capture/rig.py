@@ -1,0 +1,82 @@
+"""A rig ready to be used: what its files say, the frames planned for it, and its dome and cameras while they are open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.capture.address import dome_address
+from services.capture.camera import Cameras
+from services.capture.dome import ExposureBudget
+from services.capture.dome_modbus import ModbusDome
+from services.capture.motion import SubjectMotion
+from services.capture.plan import PlannedFrame, plan_capture
+from services.capture.simulated_cameras import PlaybackCameras, SimulatedCameras
+from services.capture.stills import Stills
+from services.core.errors import CaptureInputError, RigError
+from services.core.records import FolderCapture, RigSpec
+from services.core.store import read_record
+
+
+@dataclass(frozen=True)
+class PlannedRig:
+    """A rig whose input was checked; nothing is lit yet."""
+
+    spec: RigSpec
+    description: FolderCapture
+    plan: tuple[PlannedFrame, ...]
+    stills: Stills
+
+    @classmethod
+    def read(cls, spec: RigSpec) -> PlannedRig:
+        """Read the rig's calibration and plan its frames.
+
+        Raises:
+            CaptureInputError: the mouth folder. SettingsError, ExposureLimitError: the plan cannot be.
+        """
+        description = _read_description(spec.mouth / "capture.json")
+        return cls(spec, description, plan_capture(spec, len(description.lights)), Stills(spec.mouth, description))
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names, by the dome's indices."""
+        return tuple(light.name for light in self.description.lights)
+
+    @contextmanager
+    def in_use(self) -> Iterator[tuple[ModbusDome, Cameras]]:
+        """Dome and cameras, connected; dark at the end.
+
+        Raises:
+            RigError: the dome does not answer, or has too few lights. SettingsError: its address cannot be.
+        """
+        spec = self.spec
+        with dome_address(spec.dome, len(self.lights), spec.watchdog_s) as (host, port):
+            budget = ExposureBudget(spec.light_exposure_limit_s, spec.total_exposure_limit_s)
+            with ModbusDome(host, port, budget, spec.watchdog_s) as dome:
+                if dome.light_count < len(self.lights):
+                    listing = f"{spec.mouth / 'capture.json'} lists {len(self.lights)}"
+                    raise RigError(f"The dome at {dome.address} has {dome.light_count} lights and {listing}; correct rig.dome.")
+                with self._cameras(host, port) as cameras:
+                    yield dome, cameras
+
+    def _cameras(self, host: str, port: int) -> PlaybackCameras | SimulatedCameras:
+        spec, plan = self.spec, self.plan
+        level = next(frame.level for frame in plan if frame.kind == "light")
+        if spec.cameras == "playback":
+            return PlaybackCameras(self.stills, spec, level, plan)
+        motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
+        return SimulatedCameras(self.stills, spec, level, motion, host, port)
+
+
+def _read_description(path: Path) -> FolderCapture:
+    description = read_record(path, FolderCapture)
+    parts = {"camera": [c.name for c in description.cameras], "light": [light.name for light in description.lights], "channel": list(description.channels)}
+    for part, names in parts.items():
+        if not names:
+            raise CaptureInputError(f"{path} lists no {part}; describe the rig in it.")
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise CaptureInputError(f"{path} lists {part} '{twice}' twice; give each its own name.")
+    return description
