@@ -33,6 +33,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     from starlette.staticfiles import StaticFiles
 
     from services.api import access, problems
+    from services.api.calibration_routes import build_calibrations_router
     from services.api.captures_routes import build_captures_router
     from services.api.dome import Dome
     from services.api.dome_routes import build_dome_router
@@ -76,6 +77,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     problems.install(app)
     app.include_router(build_router(jobs, feed))
     app.include_router(build_captures_router(jobs.captures))
+    app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
     app.include_router(build_dome_router(dome))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)

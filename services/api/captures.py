@@ -25,6 +25,7 @@ from services.api.capture_records import CaptureDetail, CaptureFile, CapturePage
 from services.api.capture_table import CaptureTable, FileRow
 from services.api.claims import Claims
 from services.api.uploads import Uploads, upload_path
+from services.core.calibration import read_description
 from services.core.errors import (
     CaptureStateError,
     CorruptUploadError,
@@ -34,7 +35,7 @@ from services.core.errors import (
     TooLargeError,
     UnknownCaptureError,
 )
-from services.core.records import JobSpec
+from services.core.records import FolderCapture, JobSpec
 from services.core.settings import UploadLimits
 
 FOLDER = "captures"
@@ -102,6 +103,16 @@ class Captures:
         files = tuple(self._shown(row) for row in self._table.files(capture))
         missing = sum(file.bytes - file.received_bytes for file in files)
         return CaptureDetail(**found.model_dump(), path=f"{FOLDER}/{capture}", missing_bytes=missing, files=files)
+
+    def description(self, capture: str) -> FolderCapture:
+        """What a committed capture says of its cameras and lights.
+
+        Raises:
+            UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError: it says nothing.
+        """
+        if (state := self._table.get(capture).state) is not CaptureState.COMMITTED:
+            raise CaptureStateError(f"Capture {capture} is {state}; commit it first with POST /v1/captures/{capture}/commit.")
+        return read_description(self._data / FOLDER / capture)
 
     def page(self, limit: int, before: int | None = None) -> CapturePage:
         """Newest captures first."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import Field
 
 from services.api.admission import Admission, Machine
+from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
 from services.api.erasure import erase, forget_listing
 from services.api.events import JobEvent
@@ -48,10 +49,11 @@ class Jobs:
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(settings.database_url)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
+        self.calibrations = Calibrations(self._data)
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
         machine = machine_class() if settings.scheduler is None else None
-        self._time_ranges = TimeRanges(self.repository, self.captures.locate, self.waits_for, machine)
-        self._runner = Runner(self.repository, self.folder, self.captures.locate, run, self._admission, self._tidy, self._time_ranges.learn)
+        self._time_ranges = TimeRanges(self.repository, self.locate, self.waits_for, machine)
+        self._runner = Runner(self.repository, self.folder, self.locate, run, self._admission, self._tidy, self._time_ranges.learn)
         self._is_alone = settings.database is None
 
     def start(self) -> None:
@@ -67,6 +69,10 @@ class Jobs:
         """Where a job's stages and results lie."""
         return self._data / "jobs" / job_id
 
+    def locate(self, spec: JobSpec) -> JobSpec:
+        """A job's options with the files of what the server stores for it."""
+        return self.calibrations.locate(self.captures.locate(spec))
+
     def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None) -> Creation:
         """Queue a job.
 
@@ -78,8 +84,12 @@ class Jobs:
             require_server_path("capture", spec.capture)
         if spec.rig is not None:
             require_server_path("rig.mouth", spec.rig.mouth)
+        if spec.calibration is not None and is_stored(spec.calibration):
+            self.calibrations.require(spec.calibration)
+        elif spec.calibration is not None:
+            require_server_path("calibration", spec.calibration)
         with self.captures.keeping(spec.capture):
-            self._admission.refuse_too_large(self.captures.locate(spec))
+            self._admission.refuse_too_large(self.locate(spec))
             creation = self.repository.create(spec, key, request_id)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from services.core.errors import (
     BodyTooLargeError,
+    CalibrationTakenError,
     CaptureStateError,
     ChecksumError,
     DentineError,
@@ -32,6 +33,7 @@ from services.core.errors import (
     ScopeError,
     TooLargeError,
     UnauthenticatedError,
+    UnknownCalibrationError,
     UnknownCaptureError,
     UnknownDomeError,
     UnknownJobError,
@@ -79,6 +81,8 @@ _STATUS: dict[type[DentineError], int] = {
     UnknownTokenError: HTTPStatus.NOT_FOUND,
     UnknownWebhookError: HTTPStatus.NOT_FOUND,
     UnknownDomeError: HTTPStatus.NOT_FOUND,
+    UnknownCalibrationError: HTTPStatus.NOT_FOUND,
+    CalibrationTakenError: HTTPStatus.CONFLICT,
     DomeBusyError: HTTPStatus.CONFLICT,
     JobStateError: HTTPStatus.CONFLICT,
     JobTooLargeError: HTTPStatus.INSUFFICIENT_STORAGE,

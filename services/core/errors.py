@@ -12,6 +12,8 @@
     │   ├── UnknownPresetError no such set of options
     │   ├── UnknownWebhookError no such webhook or delivery
     │   ├── WebhookAddressError a webhook may not go there
+    │   ├── UnknownCalibrationError no such calibration
+    │   ├── CalibrationTakenError a calibration's name means another content
     │   ├── UnknownDomeError  this server has no dome
     │   ├── DomeBusyError     a capture or a preflight has the dome
     │   ├── JobStateError     the job's state does not allow what was asked
@@ -145,6 +147,18 @@ class JobStateError(InputError):
     """The job's state, or an earlier submission, does not allow what was asked."""
 
     code = "job-state"
+
+
+class UnknownCalibrationError(InputError):
+    """There is no such calibration."""
+
+    code = "calibration-unknown"
+
+
+class CalibrationTakenError(InputError):
+    """The name of a calibration means another content already."""
+
+    code = "calibration-taken"
 
 
 class UnknownDomeError(InputError):

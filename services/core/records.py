@@ -89,6 +89,7 @@ class JobSpec(Record):
     kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with gums and the wall of the mouth")
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
+    calibration: Path | None = Field(default=None, description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(

@@ -148,6 +148,8 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
         raise SettingsError(f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it.") from problem
     if spec.capture is not None:
         spec = spec.model_copy(update={"capture": (base / spec.capture).resolve()})
+    if spec.calibration is not None:
+        spec = spec.model_copy(update={"calibration": (base / spec.calibration).resolve()})
     if spec.rig is not None:
         spec = spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": (base / spec.rig.mouth).resolve()})})
     return spec

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
 from services.preprocess.projection import Footprint
-from services.preprocess.source import LightImage, require_consistent
+from services.preprocess.source import LightImage
 
 # Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
 NOT_FINITE_LIMIT = 0.5

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
 from services.core.store import reading
 from services.preprocess.motion import ViewMotion, jaws
 from services.preprocess.projection import Footprint
 from services.preprocess.radiometry import Merge, Radiometry
-from services.preprocess.source import Image, LightImage, require_consistent
+from services.preprocess.source import Image, LightImage
 from services.preprocess.stabilise import warp
 
 # Below this, resampling would blur more than it aligns

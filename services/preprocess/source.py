@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import CaptureInputError
 from services.core.records import FolderCapture
 from services.preprocess.projection import Footprint
 
@@ -70,24 +69,3 @@ class Source(Protocol):
         Raises:
             CaptureInputError: names the file or frame, camera and light.
         """
-
-
-def require_consistent(description: FolderCapture, origin: str) -> None:
-    """Refuse a description whose names or channels contradict each other.
-
-    Raises:
-        CaptureInputError: names the first contradiction.
-    """
-    for what, names in (("camera", [c.name for c in description.cameras]), ("light", [light.name for light in description.lights])):
-        if not names:
-            raise CaptureInputError(f"{origin} lists no {what}; add at least one.")
-        repeated = {name for name in names if names.count(name) > 1}
-        if repeated:
-            raise CaptureInputError(f"{origin} lists {what} {min(repeated)} twice; give each its own name.")
-    if not description.channels:
-        raise CaptureInputError(f"{origin} lists no channel; name each colour channel of the images.")
-    for light in description.lights:
-        if len(light.intensity) != len(description.channels):
-            raise CaptureInputError(
-                f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)} channels; give one per channel."
-            )

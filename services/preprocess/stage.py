@@ -6,11 +6,12 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from services.core.calibration import published_capture, recalibrated
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import teeth_folder
 from services.core.records import CaptureManifest, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import StageContext, StageEvent
-from services.core.store import MANIFEST, StageWriter, create_array, open_stage, write_record
+from services.core.store import StageWriter, create_array, open_stage, write_record
 
 if TYPE_CHECKING:
     import zarr
@@ -156,17 +157,16 @@ def _open_source(spec: JobSpec, root: Path) -> Source:
     from services.preprocess.folder import FolderSource
     from services.preprocess.rig import RigSource
 
-    job, stage = root, "capture"
-    if spec.capture is not None:
-        if (spec.capture / "capture.json").is_file() or not spec.capture.is_dir():
-            return FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)
-        if (spec.capture / MANIFEST).is_file():
-            job, stage = spec.capture.parent, spec.capture.name
-        elif (spec.capture / "capture" / MANIFEST).is_file():
-            job = spec.capture
-        else:
-            raise CaptureInputError(f"{spec.capture} holds neither capture.json nor a published capture; check option 'capture'.")
-    return RigSource(*open_stage(job, stage, CaptureManifest))
+    published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
+    if published is not None:
+        source: FolderSource | RigSource = RigSource(*open_stage(*published, CaptureManifest))
+    else:
+        assert spec.capture is not None
+        source = FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)
+    if spec.calibration is not None:
+        source.description = recalibrated(source.description, spec.calibration)
+        source.notes += (f"Cameras and lights are those of calibration {spec.calibration.stem}, not the capture's own.",)
+    return source
 
 
 def _held_out(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...]:

@@ -1,0 +1,141 @@
+"""Calibrations by name. A name, once put, never means another content; jobs refer to the content.
+
+::
+
+    calibrations/<id>.json             the content; its id is the SHA-256 of these bytes
+    calibrations/names/<name>.json     which content a name means
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field
+
+from services.core.calibration import Calibration, require_consistent
+from services.core.errors import CalibrationTakenError, SettingsError, UnknownCalibrationError
+from services.core.geometry import Record
+from services.core.records import JobSpec
+from services.core.store import read_record, write_atomic, write_record
+
+FOLDER = "calibrations"
+"""Below the data folder; a job names a calibration as ``calibrations/<id>``."""
+NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}"
+_ID = re.compile(r"[0-9a-f]{64}")
+
+
+class NamedCalibration(Record):
+    """A calibration as it is listed."""
+
+    name: str
+    id: str = Field(description="SHA-256 of its content: the same for the same cameras, lights and channels")
+    created_s: float = Field(description="Unix time")
+
+    @property
+    def path(self) -> str:
+        """What a job gives as its option 'calibration'."""
+        return f"{FOLDER}/{self.id}"
+
+
+class CalibrationDetail(NamedCalibration):
+    """A calibration and what it says."""
+
+    option: str = Field(description="give this as a job's option 'calibration'")
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class CalibrationCreation:
+    """What a put led to."""
+
+    detail: CalibrationDetail
+    is_new: bool
+
+
+class Calibrations:
+    """Use-cases over one data folder, which servers may share."""
+
+    def __init__(self, data: Path, now_s: Callable[[], float] = time.time) -> None:
+        self._data, self._folder, self._now_s = data, data / FOLDER, now_s
+        self._names = self._folder / "names"
+
+    def put(self, name: str, calibration: Calibration) -> CalibrationCreation:
+        """Store a calibration under a name. Putting the same again changes nothing.
+
+        Raises:
+            CaptureInputError: names or channels contradict each other. CalibrationTakenError: the name means another content.
+        """
+        require_consistent(calibration, f"Calibration {name}")
+        content = (calibration.model_dump_json(indent=1) + "\n").encode()
+        entry = NamedCalibration(name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s())
+        self._names.mkdir(parents=True, exist_ok=True)
+        if not self._content(entry.id).exists():
+            write_atomic(self._content(entry.id), content)
+        is_new = self._take_name(entry)
+        known = entry if is_new else read_record(self._names / f"{name}.json", NamedCalibration)
+        if known.id != entry.id:
+            raise CalibrationTakenError(f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date.")
+        return CalibrationCreation(_detail(known, calibration), is_new)
+
+    def list(self) -> list[NamedCalibration]:
+        """All of them, newest first."""
+        entries = [read_record(path, NamedCalibration) for path in self._names.glob("*.json")]
+        return sorted(entries, key=lambda entry: (-entry.created_s, entry.name))
+
+    def get(self, name: str) -> CalibrationDetail:
+        """One calibration, by its name.
+
+        Raises:
+            UnknownCalibrationError: there is none of this name.
+        """
+        path = self._names / f"{name}.json"
+        if re.fullmatch(NAME, name) is None or not path.is_file():
+            raise UnknownCalibrationError(f"There is no calibration {name}; list the calibrations to see their names.")
+        entry = read_record(path, NamedCalibration)
+        return _detail(entry, read_record(self._content(entry.id), Calibration))
+
+    def require(self, path: Path) -> None:
+        """Refuse the option of a job that names a calibration that is not here.
+
+        Raises:
+            SettingsError: there is none of this id.
+        """
+        if _ID.fullmatch(path.name) is None or not self._content(path.name).is_file():
+            raise SettingsError(f"Option 'calibration': there is no {path}; give the 'option' of GET /v1/calibrations/NAME.")
+
+    def locate(self, spec: JobSpec) -> JobSpec:
+        """The job with a stored calibration's file instead of its id."""
+        if spec.calibration is None or not is_stored(spec.calibration):
+            return spec
+        return spec.model_copy(update={"calibration": self._content(spec.calibration.name)})
+
+    def _content(self, calibration_id: str) -> Path:
+        return self._folder / f"{calibration_id}.json"
+
+    def _take_name(self, entry: NamedCalibration) -> bool:
+        # A hard link is made once, whichever server is first.
+        written = self._folder / f".{secrets.token_hex(8)}"
+        write_record(written, entry)
+        try:
+            os.link(written, self._names / f"{entry.name}.json")
+        except FileExistsError:
+            return False
+        finally:
+            written.unlink()
+        return True
+
+
+def is_stored(path: Path) -> bool:
+    """Whether a job names a calibration as a stored one, ``calibrations/<id>``."""
+    return len(path.parts) == 2 and path.parts[0] == FOLDER
+
+
+def _detail(entry: NamedCalibration, calibration: Calibration) -> CalibrationDetail:
+    return CalibrationDetail(**entry.model_dump(), option=entry.path, calibration=calibration)

@@ -1,0 +1,147 @@
+"""Calibrations by name over the API, and what the preparation makes of one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from services.api.app import create_app
+from services.api.events import EventAddress
+from services.core.errors import CaptureInputError
+from services.core.records import JobSpec, PreparedManifest
+from services.core.settings import ServerSettings
+from services.core.stage import LocalContext
+from services.core.store import open_stage
+from services.preprocess import stage
+from tests.support.live_server import serving
+from tests.support.mouth import write_mouth
+from tests.support.uploading import announce, contents_of, send
+
+
+def prepare(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+    """A job's preparation, without a worker around it."""
+    with events.open() as log:
+        attempt = log.begin_stage("prepare")
+        stage.run(spec, LocalContext(folder, attempt, lambda event: log.append(attempt, event)))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def client(data: Path) -> Iterator[httpx.Client]:
+    with serving(create_app(ServerSettings(data=data), prepare)) as client:
+        yield client
+
+
+@pytest.fixture
+def mouth(tmp_path: Path) -> Path:
+    write_mouth(tmp_path / "mouth", lights=2, sizes=((24, 18),), channels=("green",))
+    return tmp_path / "mouth"
+
+
+@pytest.fixture
+def calibration(mouth: Path) -> dict[str, Any]:
+    """What the mouth's own file says, the light l1 moved."""
+    tree: dict[str, Any] = json.loads((mouth / "capture.json").read_text())
+    del tree["images"]
+    tree["lights"][1]["position_mm"] = [40.0, 0.0, -900.0]
+    return tree
+
+
+def renamed(tree: dict[str, Any], part: str, change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    copy: dict[str, Any] = json.loads(json.dumps(tree))
+    change(copy[part][-1])
+    return copy
+
+
+def test_a_name_means_one_content_for_ever(client: httpx.Client, calibration: dict[str, Any]) -> None:
+    first = client.put("/v1/calibrations/rig-1.2026", json=calibration)
+    assert (first.status_code, first.headers["location"]) == (201, "/v1/calibrations/rig-1.2026")
+    # Another order of keys and another way to write a number are the same content.
+    otherwise = json.dumps(calibration, sort_keys=True).replace("40.0", "4e1")
+    again = client.put("/v1/calibrations/rig-1.2026", content=otherwise, headers={"Content-Type": "application/json"})
+    assert (again.status_code, again.json()) == (200, first.json())
+    assert client.put("/v1/calibrations/same", json=calibration).json()["id"] == first.json()["id"]
+    other = client.put("/v1/calibrations/rig-1.2026", json=renamed(calibration, "lights", lambda light: light.update(position_mm=[0, 0, -900])))
+    assert (other.status_code, other.json()["code"]) == (409, "calibration-taken")
+    assert client.get("/v1/calibrations/rig-1.2026").json() == first.json()
+    assert [entry["name"] for entry in client.get("/v1/calibrations").json()] == ["same", "rig-1.2026"]
+    shown = client.get("/v1/calibrations/same").json()
+    assert (shown["option"], shown["calibration"]["lights"][1]["position_mm"]) == (f"calibrations/{shown['id']}", [40.0, 0.0, -900.0])
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "named"),
+    [
+        ("lights", lambda light: light.update(name="l0"), "lists light l0 twice"),
+        ("lights", lambda light: light.update(intensity=[1.0, 1.0]), "light l1 has 2 intensities for 1 channels"),
+        ("cameras", lambda camera: camera.update(camera_from_world=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 100], [0, 0, 0, 1]]), "must be a rotation"),
+        ("cameras", lambda camera: camera.update(size=[0, 10]), "cameras.0.size.0"),
+        ("cameras", lambda camera: camera.update(lens="50 mm"), "lens"),
+    ],
+)
+def test_what_no_stage_would_take_is_refused_when_it_is_put(client: httpx.Client, calibration: dict[str, Any], part: str, change: Any, named: str) -> None:
+    answer = client.put("/v1/calibrations/wrong", json=renamed(calibration, part, change))
+    assert answer.status_code == 422
+    assert named in answer.json()["detail"]
+    assert client.get("/v1/calibrations/wrong").json()["code"] == "calibration-unknown"
+
+
+@pytest.mark.parametrize("name", ["..", "a" * 61, ".hidden", "a%2fb", "ä"])
+def test_a_name_is_no_path(client: httpx.Client, calibration: dict[str, Any], name: str) -> None:
+    assert client.put(f"/v1/calibrations/{name}", json=calibration).status_code in {404, 405, 422}
+
+
+def test_a_job_is_prepared_with_the_calibration_that_it_names(client: httpx.Client, data: Path, mouth: Path, calibration: dict[str, Any]) -> None:
+    # A calibration of the whole rig has lights that this capture does not, in an order of its own.
+    calibration["lights"] = [{"name": "l7", "position_mm": [0, 0, -950], "intensity": [1e6]}, *calibration["lights"][::-1]]
+    option = client.put("/v1/calibrations/whole-rig", json=calibration).json()["option"]
+    job = client.post("/v1/jobs", json={"capture": str(mouth), "calibration": option}).json()["id"]
+    assert '"SUCCEEDED"' in client.get(f"/v1/jobs/{job}/events").text
+    manifest = open_stage(data / "jobs" / job, "prepared", PreparedManifest)[1]
+    assert [(light.name, light.position_mm[2]) for light in manifest.lights] == [("l0", -1000.0), ("l1", -900.0)]
+    assert f"Cameras and lights are those of calibration {option.partition('/')[2]}" in manifest.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda tree: tree["lights"].pop(), "lacks light l1"),
+        (lambda tree: tree["cameras"][0].update(name="c9"), "lacks camera c0"),
+        (lambda tree: tree["cameras"][0].update(size=[18, 24]), "18 x 24 pixels of camera c0, but the capture's are 24 x 18"),
+        (lambda tree: tree.update(channels=["red"]), "is for channels red, but the capture has green"),
+    ],
+)
+def test_a_calibration_of_another_rig_is_refused(tmp_path: Path, mouth: Path, calibration: dict[str, Any], change: Any, named: str) -> None:
+    change(calibration)
+    (tmp_path / "other.json").write_text(json.dumps(calibration))
+    with pytest.raises(CaptureInputError, match=named):
+        stage.run(JobSpec(capture=mouth, calibration=tmp_path / "other.json"), LocalContext(tmp_path / "job"))
+
+
+@pytest.mark.parametrize("option", ["calibrations/none", "calibrations/" + 64 * "0", "relative.json", "/no/such.json"])
+def test_a_job_with_no_such_calibration_is_refused(client: httpx.Client, mouth: Path, option: str) -> None:
+    answer = client.post("/v1/jobs", json={"capture": str(mouth), "calibration": option})
+    assert (answer.status_code, answer.json()["code"]) == (422, "bad-settings")
+    assert "Option 'calibration'" in answer.json()["detail"]
+
+
+def test_a_capture_shows_the_calibration_that_it_brings_along(client: httpx.Client, mouth: Path) -> None:
+    contents = contents_of(mouth)
+    capture = announce(client, contents)["id"]
+    assert client.get(f"/v1/captures/{capture}/calibration").json()["code"] == "capture-state"
+    for path, content in contents.items():
+        send(client, capture, path, content)
+    client.post(f"/v1/captures/{capture}/commit").raise_for_status()
+    described = json.loads((mouth / "capture.json").read_text())
+    del described["images"]
+    assert client.get(f"/v1/captures/{capture}/calibration").json() == described
+    assert client.get("/v1/captures/none/calibration").json()["code"] == "capture-unknown"
