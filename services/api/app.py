@@ -38,6 +38,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     from services.api.dome import Dome
     from services.api.dome_routes import build_dome_router
     from services.api.feed import EventFeed
+    from services.api.mask_routes import build_masks_router
+    from services.api.masks import Masks
     from services.api.observation import Observation
     from services.api.routes import build_router
     from services.api.shield import Shield
@@ -78,6 +80,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     app.include_router(build_router(jobs, feed))
     app.include_router(build_captures_router(jobs.captures))
     app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
+    app.include_router(build_masks_router(jobs, Masks(jobs)))
     app.include_router(build_dome_router(dome))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)

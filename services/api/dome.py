@@ -13,7 +13,7 @@ from pydantic import Field
 from services.api.dome_process import DomeProcess
 from services.api.jobs import Jobs, require_server_path
 from services.core.dome import DomeAnswer, DomeStatus
-from services.core.errors import DentineError, DomeBusyError, JobStateError, RigUnreachableError, SettingsError, UnknownDomeError
+from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError, UnknownDomeError
 from services.core.geometry import Record
 from services.core.records import RigSpec, Unit
 from services.core.settings import DomeSettings
@@ -46,7 +46,7 @@ class AllOff(Record):
     """What ALL OFF did."""
 
     status: DomeStatus = Field(description="of the dome, confirmed dark")
-    stopped: tuple[str, ...] = Field(description="jobs whose capture was told to stop")
+    stopped: tuple[str, ...] = Field(description="jobs that captured, or waited for it, and were cancelled")
 
 
 class PreflightResult(Record):
@@ -86,8 +86,8 @@ class Dome:
     def all_off(self) -> AllOff:
         """Switch every light off and stop every capture; waits for nobody who has the dome.
 
-        The dome refuses light from then on. Captures are told as well, as one that was about to start would arm the dome anew; then the dome is stopped
-        again, for one that has done so meanwhile.
+        The dome refuses light from then on. Captures are cancelled as well, queued ones too, as whichever begins next would arm the dome anew; then the
+        dome is stopped again, for one that has done so meanwhile.
 
         Raises:
             UnknownDomeError: this server has none. RigError: darkness could not be confirmed.
@@ -154,14 +154,10 @@ class Dome:
 
     def _stop_captures(self) -> tuple[str, ...]:
         try:
-            capturing = [job.id for job in self._jobs.capturing()]
-            for job in capturing:
-                with suppress(JobStateError):
-                    self._jobs.cancel(job)
+            return tuple(self._jobs.cancel_captures())
         except sql.exc.SQLAlchemyError:
             logging.getLogger(__name__).exception("captures could not be told of ALL OFF; the dome refuses them light")
             return ()
-        return tuple(capturing)
 
     def _ask(self, timeout_s: float, **command: object) -> DomeAnswer:
         try:

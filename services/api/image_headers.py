@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 HEADER_BYTES = 2**20
 """Whatever a header says beyond this is not believed."""
 
@@ -23,6 +24,17 @@ class Declared:
     decoded_bytes: int
     file_bytes: int | None = None
     """Size of the file if the format fixes it."""
+
+
+@dataclass(frozen=True)
+class PngHeader:
+    """The header of a PNG; depth is in bits per channel, colour its code."""
+
+    width: int
+    height: int
+    depth: int
+    colour: int
+    is_interlaced: bool
 
 
 def declared(path: Path, suffix: str) -> Declared | None:
@@ -64,12 +76,22 @@ def _npy(head: bytes) -> Declared:
     return Declared(f"{' x '.join(map(str, shape)) or 'one'} numbers of {dtype.itemsize} bytes", array_bytes, stream.tell() + array_bytes)
 
 
-def _png(head: bytes) -> Declared:
-    if head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+def png_header(head: bytes) -> PngHeader:
+    """What a PNG declares in its first bytes.
+
+    Raises:
+        ValueError: it is no PNG. struct.error: it is cut off.
+    """
+    if head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
         raise ValueError("it is no PNG")
-    width, height, depth, colour = struct.unpack(">IIBB", head[16:26])
-    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[colour]  # a palette decodes to three
-    return _pixels(width, height, channels, -(-depth // 8))
+    width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", head[16:29])
+    return PngHeader(width, height, depth, colour, is_interlaced=interlace != 0)
+
+
+def _png(head: bytes) -> Declared:
+    header = png_header(head)
+    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[header.colour]  # a palette decodes to three
+    return _pixels(header.width, header.height, channels, -(-header.depth // 8))
 
 
 def _tiff(head: bytes) -> Declared:

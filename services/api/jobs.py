@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import Field
@@ -19,8 +20,9 @@ from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, JobFilter, Repository
 from services.api.runner import RunJob, Runner
 from services.api.time_ranges import TimeRange, TimeRanges
-from services.core.errors import SettingsError, StoreError
+from services.core.errors import JobStateError, SettingsError, StoreError
 from services.core.geometry import Record
+from services.core.masks import is_stale
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
@@ -106,8 +108,13 @@ class Jobs:
         return self.repository.get(job_id)
 
     def retry(self, job_id: str) -> Job:
-        """Queue a failed or cancelled job again; it resumes from what it had published."""
-        self.repository.apply(job_id, Trigger.RETRY)
+        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it had published and is still good.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: there is nothing to do again.
+        """
+        is_revised = self.repository.get(job_id).state is JobState.SUCCEEDED and is_stale(self.folder(job_id))
+        self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY)
         self._runner.wake()
         return self.repository.get(job_id)
 
@@ -125,8 +132,16 @@ class Jobs:
 
     def capturing(self) -> list[Job]:
         """Jobs under way, of any server of the database, whose capture is not published yet."""
-        running = self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING)))
-        return [job for job in running if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
+        return self._to_capture(self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
+
+    def cancel_captures(self) -> list[str]:
+        """Cancel every job that captures or will capture next; returns their ids."""
+        cancelled = []
+        for job in self._to_capture(self.repository.queued()) + self.capturing():
+            with suppress(JobStateError):
+                self.cancel(job.id)
+                cancelled.append(job.id)
+        return cancelled
 
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, None if nothing keeps it."""
@@ -148,6 +163,9 @@ class Jobs:
     def is_running(self) -> bool:
         """Whether queued jobs will be run."""
         return self._runner.is_running
+
+    def _to_capture(self, jobs: list[Job]) -> list[Job]:
+        return [job for job in jobs if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
 
     def _tidy(self) -> None:
         # Finish deletions that were cut short, and delete what has been kept long enough.

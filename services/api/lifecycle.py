@@ -10,7 +10,8 @@ CANCELLING  CANCELLING             -                   SUCCEEDED           FAILE
 DELETING    -                      -                   -                   -                      DELETING, erase
 ==========  =====================  ==================  ==================  =====================  =================
 
-Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch; RUNNING -pause-> QUEUED, launch.
+Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch; SUCCEEDED -revise-> QUEUED,
+launch, where its masks were changed; RUNNING -pause-> QUEUED, launch.
 What has ended can be deleted: -delete-> DELETING, erase; so can what is DELETING, as the erasing itself may have been cut short.
 
 ``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from what it had
@@ -57,6 +58,7 @@ class Trigger(StrEnum):
     FAIL = "fail"
     LOSE = "lose"
     RETRY = "retry"
+    REVISE = "revise"
     PAUSE = "pause"
     DELETE = "delete"
 
@@ -104,6 +106,7 @@ TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
         (JobState.CANCELLING, Trigger.PAUSE): Transition(JobState.CANCELLED),
         (JobState.FAILED, Trigger.RETRY): _QUEUED,
         (JobState.CANCELLED, Trigger.RETRY): _QUEUED,
+        (JobState.SUCCEEDED, Trigger.REVISE): _QUEUED,
         (JobState.FAILED, Trigger.DELETE): _DELETING,
         (JobState.CANCELLED, Trigger.DELETE): _DELETING,
         (JobState.SUCCEEDED, Trigger.DELETE): _DELETING,

@@ -30,9 +30,10 @@ from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.machine_class import machine_class
 from services.api.workers import Workers
 from services.core.errors import DiskFullError, InputError, JobCancelledError, PlatformError, SchedulerLostError, WorkerLostError
+from services.core.masks import is_stale
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
-from services.core.store import is_published, open_stage, read_record, write_record
+from services.core.store import is_published, open_stage, read_record, withdraw, write_record
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -109,6 +110,8 @@ def run_stages(
     root = root.resolve()
     with _sole_owner(root):
         _claim_folder(root, spec)
+        if "prepare" in stages and is_stale(root):
+            _withdraw_prepared(root)
         address = events or folder_events(root)
         todo = tuple(stage for stage in stages if again or not is_published(root, _PUBLISHED_AS[stage]))
         with address.open() as log:
@@ -270,6 +273,14 @@ def _sole_owner(root: Path) -> Iterator[None]:
         except BlockingIOError:
             raise InputError(f"Folder {root} is in use by another running job; wait for it or choose another folder.") from None
         yield
+
+
+def _withdraw_prepared(root: Path) -> None:
+    """Remove what was made with masks by hand that have changed since; last what says so, so that a kill in between is gone on with."""
+    for result in ("report.html", "parameters.json", "errors.json"):
+        (root / result).unlink(missing_ok=True)
+    for folder in ("asset", "fit", "prepared"):
+        withdraw(root, folder)
 
 
 def _claim_folder(root: Path, spec: JobSpec) -> None:

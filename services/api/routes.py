@@ -84,7 +84,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
 
     @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def retry(job_id: str) -> Job:
-        """Queue a failed or cancelled job again; it resumes from what it had published."""
+        """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from what it had published."""
         return jobs.retry(job_id)
 
     @router.delete("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])

@@ -12,6 +12,8 @@
     │   ├── UnknownPresetError no such set of options
     │   ├── UnknownWebhookError no such webhook or delivery
     │   ├── WebhookAddressError a webhook may not go there
+    │   ├── MaskError         a mask by hand does not fit its image
+    │   ├── UnknownMaskError  no such mask, camera or light
     │   ├── UnknownCalibrationError no such calibration
     │   ├── CalibrationTakenError a calibration's name means another content
     │   ├── UnknownDomeError  this server has no dome
@@ -147,6 +149,18 @@ class JobStateError(InputError):
     """The job's state, or an earlier submission, does not allow what was asked."""
 
     code = "job-state"
+
+
+class MaskError(InputError):
+    """A mask by hand is no image of its camera's size."""
+
+    code = "bad-mask"
+
+
+class UnknownMaskError(InputError):
+    """There is no such mask, or the capture has no such camera or light."""
+
+    code = "mask-unknown"
 
 
 class UnknownCalibrationError(InputError):

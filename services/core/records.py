@@ -171,6 +171,7 @@ class PreparedManifest(Record):
     cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
     tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
+    masks: str = Field(default="", description="digest of the masks by hand that it was prepared with; empty without any")
     notes: tuple[str, ...] = Field(default=(), description="what to know of the capture before trusting a fit of it, one sentence each")
     valid_fraction: float
 

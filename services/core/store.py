@@ -114,6 +114,16 @@ class StageWriter:
         return final
 
 
+def withdraw(root: Path, stage: str) -> None:
+    """Remove a stage's published result, for readers all at once."""
+    published, retired = Path(root) / stage, Path(root) / f".{stage}.retired"
+    shutil.rmtree(retired, ignore_errors=True)
+    if published.exists():
+        published.rename(retired)
+        _fsync_folder(Path(root))
+        shutil.rmtree(retired)
+
+
 def is_published(root: Path, stage: str) -> bool:
     """Whether the stage has a complete result."""
     return (Path(root) / stage / MANIFEST).is_file()

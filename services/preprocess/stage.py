@@ -31,6 +31,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     import numpy as np
 
     from services.preprocess.brightness import Brightness
+    from services.preprocess.masks import HandMasks
     from services.preprocess.quality import QualityReport, assess, unusable_note, write_picture
     from services.preprocess.subject import NOTHING, read_subject
     from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
@@ -41,6 +42,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     held_out = _held_out(spec, source)
     if unknown := set(spec.channels or ()) - set(channels):
         raise SettingsError(f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it.")
+    masks = HandMasks(context.root, source.description)
     subject = read_subject(source.root, whole=spec.kind == "jaw")
     teeth = subject.teeth
     require_plausible_scale(cameras, lights, teeth)
@@ -71,6 +73,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             context.raise_if_cancelled()
             bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
             bits[:h, :w] = valid_bits(image, footprint, camera, lights[j], glossy)
+            bits[:h, :w] |= masks.bits(camera.name, lights[j].name, camera.size)
             of_teeth = (bits[:h, :w] == 0) & (footprint.mesh < len(teeth))
             if not brightness.add(image, footprint, camera, lights[j], of_teeth):
                 bits[:h, :w] |= np.uint16(MaskBit.UNLIT)
@@ -122,6 +125,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         cavity=subject.whole and subject.cavity is not None,
         tooth_pixels=tuple(seen.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
+        masks=masks.digest,
         notes=tuple(notes),
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
     )

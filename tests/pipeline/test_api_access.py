@@ -36,6 +36,8 @@ KNOWN_SCOPES = {
     "GET /v1/audit": Scope.ADMIN,
     "POST /v1/session": Scope.READ,
     "GET /v1/openapi.json": Scope.READ,
+    "PUT /v1/jobs/{job_id}/masks/{camera}/{light}": Scope.SUBMIT,
+    "GET /v1/jobs/{job_id}/masks/{camera}/{light}": Scope.READ,
     "PUT /v1/calibrations/{name}": Scope.SUBMIT,
     "GET /v1/calibrations": Scope.READ,
     "GET /v1/dome": Scope.OPERATE_DOME,

@@ -272,11 +272,14 @@ def test_a_capture_has_the_dome_for_itself(client: httpx.Client, observer: DomeO
             assert job in answer.json()["detail"]
         assert client.get("/v1/dome").json()["capturing"] == [job]
         assert client.delete("/v1/dome/light").status_code == 200
-        assert client.post("/v1/dome/off").json()["stopped"] == [job]
-        assert client.get(f"/v1/jobs/{job}").json()["state"] == "CANCELLING"
+        queued = client.post("/v1/jobs", json={"rig": rig(tmp_path)}).json()["id"]
+        other = client.post("/v1/jobs", json={"capture": str(tmp_path)}).json()["id"]
+        assert client.post("/v1/dome/off").json()["stopped"] == [queued, job]
+        states = [client.get(f"/v1/jobs/{one}").json()["state"] for one in (job, queued, other)]
+        assert states == ["CANCELLING", "CANCELLED", "QUEUED"], "the next capture in the queue would light the dome again"
     finally:
         go.set()
-        client.get(f"/v1/jobs/{job}/events")
+        client.get(f"/v1/jobs/{other}/events")
 
 
 class Seen:

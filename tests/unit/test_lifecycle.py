@@ -38,7 +38,7 @@ def test_a_launch_always_leads_to_queued_and_only_queued_jobs_start(sequence: li
 def test_an_end_is_left_only_by_deletion_or_retry_and_success_never_by_retry(sequence: list[Trigger]) -> None:
     for state, trigger, _ in walk(sequence):
         if state.is_final:
-            assert trigger is Trigger.DELETE or (trigger is Trigger.RETRY and state is not JobState.SUCCEEDED)
+            assert trigger in {Trigger.DELETE, Trigger.REVISE if state is JobState.SUCCEEDED else Trigger.RETRY}
 
 
 @given(triggers)

@@ -1,0 +1,68 @@
+"""Masks as PNG: what a sent one must be, checked without building an image, and the picture of stored bits."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import TYPE_CHECKING
+
+from services.api.image_headers import PNG_SIGNATURE, PngHeader, png_header
+from services.core.errors import MaskError
+from services.core.geometry import Camera
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_GREY = 0
+_DEPTHS = (1, 8)
+
+
+def require_mask(content: bytes, camera: Camera) -> None:
+    """Let a whole grey PNG of the camera's size pass, of 1 or 8 bits a pixel.
+
+    Raises:
+        MaskError: what is wrong with it.
+    """
+    try:
+        _require_header(png_header(content), camera)
+        _require_rows(content, camera)
+    except (ValueError, struct.error, zlib.error) as problem:
+        size, why = " x ".join(map(str, camera.size)), "it is cut off" if isinstance(problem, struct.error) else problem
+        raise MaskError(f"The mask of camera {camera.name} cannot be used: {why}; send a grey PNG of {size} pixels.") from problem
+
+
+def _require_header(header: PngHeader, camera: Camera) -> None:
+    if (header.width, header.height) != camera.size:
+        raise ValueError(f"it has {header.width} x {header.height} pixels")
+    if header.colour != _GREY or header.depth not in _DEPTHS or header.is_interlaced:
+        raise ValueError("it is not plain grey of 1 or 8 bits a pixel")
+
+
+def _require_rows(content: bytes, camera: Camera) -> None:
+    # Inflates what the header promises and not a byte more; every row begins with the number of its filter.
+    (width, height), depth = camera.size, png_header(content).depth
+    expected_bytes = height * (1 + -(-width * depth // 8))
+    inflater, inflated_bytes, place = zlib.decompressobj(), 0, len(PNG_SIGNATURE)
+    while True:
+        length, kind = struct.unpack_from(">I4s", content, place)
+        data, (checksum,) = content[place + 8 : place + 8 + length], struct.unpack_from(">I", content, place + 8 + length)
+        if zlib.crc32(kind + data) != checksum:
+            raise ValueError("a part of it is damaged")
+        if kind == b"IDAT":
+            inflated_bytes += len(inflater.decompress(data, expected_bytes - inflated_bytes + 1))
+            if inflated_bytes > expected_bytes:
+                raise ValueError("it holds more than its header declares")
+        if kind == b"IEND":
+            break
+        place += 12 + length
+    if inflated_bytes != expected_bytes:
+        raise ValueError("it holds less than its header declares")
+
+
+def picture_of(bits: NDArray[np.uint8]) -> bytes:
+    """A grey PNG of 8 bits a pixel, of an array (height, width)."""
+    height, width = bits.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in bits)
+    parts = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, _GREY, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    return PNG_SIGNATURE + b"".join(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)

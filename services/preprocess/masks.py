@@ -1,0 +1,49 @@
+"""Masks by hand, decoded for the images they belong to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.masks import ALL_LIGHTS, digest_of, mask_path, read_masks
+from services.core.records import FolderCapture, MaskBit
+
+
+class HandMasks:
+    """A job's masks as they were when the preparation began."""
+
+    def __init__(self, root: Path, description: FolderCapture) -> None:
+        """Read them.
+
+        Raises:
+            CaptureInputError: one is of no camera or light of the capture.
+        """
+        self._root, self._masks = root, read_masks(root)
+        self.digest = digest_of(self._masks)
+        cameras, lights = {camera.name for camera in description.cameras}, {light.name for light in description.lights} | {ALL_LIGHTS}
+        for camera, light in self._masks:
+            if camera not in cameras or light not in lights:
+                raise CaptureInputError(f"Mask {mask_path(root, camera, light)} is of no camera and light of the capture; remove it or correct its name.")
+
+    def bits(self, camera: str, light: str, size: tuple[int, int]) -> NDArray[np.uint16]:
+        """MANUAL where the mask of this light, or the one of all lights, is set; ``size`` is (width, height).
+
+        Raises:
+            CaptureInputError: a mask is no image of this size.
+        """
+        bits = np.zeros(size[::-1], dtype=np.uint16)
+        for of in ((camera, light), (camera, ALL_LIGHTS)):
+            if (content := self._masks.get(of)) is not None:
+                bits[self._decode(mask_path(self._root, *of), content, size) > 0] = MaskBit.MANUAL
+        return bits
+
+    def _decode(self, path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
+        import cv2
+
+        mask: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        if mask is None or mask.shape != size[::-1]:
+            raise CaptureInputError(f"Mask {path} is no image of {size[0]} x {size[1]} pixels; draw it again, or remove it.")
+        return mask
