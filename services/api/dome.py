@@ -18,7 +18,7 @@ from services.core.geometry import Record
 from services.core.records import RigSpec, Unit
 from services.core.settings import DomeSettings
 
-ANSWER_S = 10.0
+ANSWER_S = 30.0
 PREFLIGHT_S = 300.0
 OFF_S = 5.0
 """A process that has not switched off by then is ended, and another one does it."""
