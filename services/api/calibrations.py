@@ -38,11 +38,6 @@ class NamedCalibration(Record):
     id: str = Field(description="SHA-256 of its content: the same for the same cameras, lights and channels")
     created_s: float = Field(description="Unix time")
 
-    @property
-    def path(self) -> str:
-        """What a job gives as its option 'calibration'."""
-        return f"{FOLDER}/{self.id}"
-
 
 class CalibrationDetail(NamedCalibration):
     """A calibration and what it says."""
@@ -63,7 +58,7 @@ class Calibrations:
     """Use-cases over one data folder, which servers may share."""
 
     def __init__(self, data: Path, now_s: Callable[[], float] = time.time) -> None:
-        self._data, self._folder, self._now_s = data, data / FOLDER, now_s
+        self._folder, self._now_s = data / FOLDER, now_s
         self._names = self._folder / "names"
 
     def put(self, name: str, calibration: Calibration) -> CalibrationCreation:
@@ -138,4 +133,4 @@ def is_stored(path: Path) -> bool:
 
 
 def _detail(entry: NamedCalibration, calibration: Calibration) -> CalibrationDetail:
-    return CalibrationDetail(**entry.model_dump(), option=entry.path, calibration=calibration)
+    return CalibrationDetail(**entry.model_dump(), option=f"{FOLDER}/{entry.id}", calibration=calibration)

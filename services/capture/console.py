@@ -22,7 +22,7 @@ from services.capture.address import dome_address
 from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import DomeObserver, ModbusDome, all_off
 from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
-from services.core.errors import DentineError, DomeBusyError, RigError, SettingsError
+from services.core.errors import DentineError, DomeBusyError, RigError, RigStoppedError, SettingsError
 from services.core.settings import DomeSettings
 
 TICK_S = 0.1
@@ -42,6 +42,7 @@ class Console:
         self._held = ExitStack()
         self._dome: ModbusDome | None = None
         self._budget, self._until_s = ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s), 0.0
+        self._newest_off = 0
         self._keeper = threading.Thread(target=self._keep, name="light keeper")
         self._keeper.start()
 
@@ -69,6 +70,7 @@ class Console:
     def _carry_out(self, command: DomeCommand) -> DomeAnswer:
         findings: tuple[str, ...] = ()
         if command.do == "off":
+            self._newest_off = max(self._newest_off, command.number)
             status = all_off(self._host, self._port)
             if self._driving.acquire(timeout=PATIENCE_S):
                 self._let_go()
@@ -77,6 +79,7 @@ class Console:
             if not self._driving.acquire(timeout=PATIENCE_S):
                 raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
             try:
+                self._require_wanted(command)
                 if command.do == "light":
                     self._light(command)
                 else:
@@ -100,6 +103,7 @@ class Console:
                 if time.monotonic() > self._until_s + DOSE_S:
                     self._budget.spent_s.clear()
                 self._dome = self._held.enter_context(ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s))
+            self._require_wanted(command)
             _require_light(command.light, self._dome.light_count)
             self._dome.light(command.light, command.level, command.on_s)
         except BaseException:
@@ -116,7 +120,13 @@ class Console:
             raise SettingsError("A preflight needs a rig; give its mouth folder.")
         planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}"}))
         with planned.in_use() as (dome, cameras):
+            self._require_wanted(command)
             return preflight(planned.plan, dome, cameras, planned.spec)
+
+    def _require_wanted(self, command: DomeCommand) -> None:
+        # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the controller.
+        if command.number < self._newest_off:
+            raise RigStoppedError("ALL OFF was pressed after this was asked for; ask again when the subject is ready.")
 
     def _status(self) -> DomeStatus:
         observer = DomeObserver(self._host, self._port)

@@ -28,7 +28,7 @@ class DomeStatus(Record):
 class DomeCommand(Record):
     """One thing to do, one line on the process's standard input."""
 
-    number: int
+    number: int = Field(description="grows; what was asked before an ALL OFF is not done after it")
     do: Literal["status", "off", "light", "dark", "preflight"]
     light: int = 0
     level: float = 0.0

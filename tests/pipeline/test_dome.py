@@ -167,7 +167,7 @@ def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAns
     """The dome's process without a process around it."""
     console = Console(*address, DomeSettings(watchdog_s=WATCHDOG_S, **limits))
     try:
-        yield lambda **command: console.answer(DomeCommand(number=1, **command))
+        yield lambda **command: console.answer(DomeCommand(**{"number": 1} | command))
     finally:
         console.close()
 
@@ -182,6 +182,14 @@ def test_light_by_hand_adds_up_to_the_limit(shared_dome: Address, observer: Dome
         assert answer(do="light", light=0, level=0.1, on_s=14.9).code == "rig-exposure-limit"
         assert lit(observer) == ()
         assert answer(do="light", light=1, level=0.1, on_s=14.9).code is None
+
+
+def test_a_light_that_was_asked_for_before_all_off_does_not_come_after_it(shared_dome: Address, observer: DomeObserver) -> None:
+    with console(shared_dome) as answer:
+        assert answer(number=2, do="off").code is None
+        assert answer(number=1, do="light", light=0, level=0.1, on_s=5).code == "rig-stopped"
+        assert observer.status().stopped
+        assert answer(number=3, do="light", light=0, level=0.1, on_s=5).code is None
 
 
 def test_a_dome_that_does_not_answer_is_a_sentence() -> None:
