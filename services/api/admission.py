@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 
-from services.core.errors import DentineError, DiskFullError, JobTooLargeError
+from services.core.errors import DentineError, DiskFullError, JobTooLargeError, StoreError
 from services.core.records import JobSpec
 
 DISK_PER_CAPTURE = 6.0
@@ -123,7 +123,7 @@ class Admission:
 
     def pause(self, job_id: str, problem: DentineError) -> None:
         """Let a job wait that could not go on."""
-        what = "disk" if isinstance(problem, DiskFullError) else "workers"
+        what = "disk" if isinstance(problem, DiskFullError) else "store" if isinstance(problem, StoreError) else "workers"
         with self._lock:
             self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
 

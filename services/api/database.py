@@ -23,6 +23,9 @@ WRITER_LOCK = 0x64656E74
 MOST_ID = 2**31 - 1
 """Largest number of a row: Postgres' INTEGER, to which it takes nothing larger for comparison either."""
 
+POSTGRES_SILENCE_S = 15
+"""After so long without a sign of life, each side of a connection takes the other for gone, also in the middle of a transaction."""
+
 PATIENCE_S = 600.0
 """How long whoever works on a job waits for a database that went away."""
 
@@ -52,7 +55,7 @@ def open_database(url: str) -> sql.Engine:
     if parsed.get_backend_name() != "postgresql":
         raise SettingsError(f"The database {parsed.get_backend_name()!r} is not supported; use sqlite or postgresql.")
     try:
-        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True)
+        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True, connect_args=_watchful(parsed))
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
 
@@ -61,8 +64,12 @@ def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
     """Make a call again while the database does not answer, for so long."""
     import stamina
 
-    again = stamina.RetryingCaller(attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0)
-    return again((sql.exc.OperationalError, sql.exc.InterfaceError), call)
+    def is_lost(problem: Exception) -> bool:
+        return isinstance(problem, sql.exc.OperationalError | sql.exc.InterfaceError) or (
+            isinstance(problem, sql.exc.DBAPIError) and problem.connection_invalidated
+        )
+
+    return stamina.RetryingCaller(attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0)(is_lost, call)
 
 
 @contextmanager
@@ -72,6 +79,17 @@ def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
         if engine.dialect.name == "postgresql":
             connection.execute(sql.select(sql.func.pg_advisory_xact_lock(WRITER_LOCK)))
         yield connection
+
+
+def _watchful(url: sql.URL) -> dict[str, Any]:
+    # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps what its transaction has locked for two.
+    third_s, silence_ms = POSTGRES_SILENCE_S // 3, 1000 * POSTGRES_SILENCE_S
+    probes = {"keepalives_idle": third_s, "keepalives_interval": third_s, "keepalives_count": 2}
+    theirs = {f"tcp_{name}": value for name, value in probes.items()}
+    theirs |= {"tcp_user_timeout": silence_ms, "idle_in_transaction_session_timeout": silence_ms}
+    ours: dict[str, Any] = probes | {"tcp_user_timeout": silence_ms, "connect_timeout": BUSY_MS // 1000}
+    ours["options"] = " ".join(f"-c {name}={value}" for name, value in theirs.items())
+    return {name: value for name, value in ours.items() if name not in url.query}  # what the URL says holds
 
 
 def _sqlite(url: sql.URL) -> sql.Engine:

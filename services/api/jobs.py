@@ -104,7 +104,10 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: it has ended.
         """
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
-            request_cancel(self.folder(job_id))
+            try:
+                request_cancel(self.folder(job_id))
+            except OSError as problem:  # the runner asks again in each of its rounds
+                logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
         return self.repository.get(job_id)
 
     def retry(self, job_id: str) -> Job:

@@ -4,18 +4,17 @@
 
     capture {DOME: 1} -> prepare -> fit -> export        capture only where the job names a rig
 
-Each stage is one task. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task
-whose worker dies is run again by Dask on another worker; it then counts one attempt more than any before, which fences whatever
-the old one may still write. The fit spreads its passes over the same workers and secedes from its own slot meanwhile.
+Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its part: a rig may go away
+after its capture. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task whose worker dies is run again by
+Dask on another worker; it then counts one attempt more than any before, which fences whatever the old one may still write. The fit spreads its passes over the
+same workers and secedes from its own slot meanwhile.
 """
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import importlib
 import secrets
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
@@ -29,11 +28,11 @@ from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.machine_class import machine_class
 from services.api.workers import Workers
-from services.core.errors import DiskFullError, InputError, JobCancelledError, PlatformError, SchedulerLostError, WorkerLostError
+from services.core.errors import InputError, JobCancelledError, PlatformError, SchedulerLostError, WorkerLostError
 from services.core.masks import is_stale
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
-from services.core.store import is_published, open_stage, read_record, withdraw, write_record
+from services.core.store import is_published, open_stage, read_record, telling_disk_faults, withdraw, write_record
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -42,6 +41,8 @@ Listener = Callable[[JobEvent], None]
 
 JOB_FILE = "job.json"
 POLL_S = 0.25
+KEEP_S = 10.0
+"""How often workers that were given up are started again."""
 GRACE_S = 5.0
 """How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
 
@@ -108,7 +109,7 @@ def run_stages(
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
     root = root.resolve()
-    with _sole_owner(root):
+    with telling_disk_faults(root), _sole_owner(root):
         _claim_folder(root, spec)
         if "prepare" in stages and is_stale(root):
             _withdraw_prepared(root)
@@ -117,9 +118,9 @@ def run_stages(
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
+                tasks = [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo]
                 with nullcontext(cluster) if cluster is not None else Workers() as processes:
-                    client = processes.connect(workers or spec.workers)
-                    _await_stages(client, [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo], watch)
+                    _run_tasks(processes, workers or spec.workers, tasks, watch)
             watch.tell()
 
 
@@ -145,7 +146,7 @@ class StageTask:
     again: bool = False
     is_logged: bool = False
 
-    def __call__(self, _previous: str | None = None) -> str:
+    def __call__(self) -> str:
         """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
         folder = _PUBLISHED_AS[self.stage]
         if is_published(self.root, folder) and not self.again:
@@ -166,7 +167,7 @@ class StageTask:
                 context = LocalContext(self.root, attempt, tell)
                 context.raise_if_cancelled()
                 module, function = self.door.split(":")
-                with _telling_a_full_disk(self.root), _telling_a_missing_package(self.stage):
+                with telling_disk_faults(self.root), _telling_a_missing_package(self.stage):
                     getattr(importlib.import_module(module), function)(self.spec, context)
                 if "finished" not in told:
                     tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
@@ -179,17 +180,6 @@ class StageTask:
         from services.api.logs import stage_logs
 
         return stage_logs(self.stage, attempt, self.events)
-
-
-@contextmanager
-def _telling_a_full_disk(root: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as problem:
-        if problem.errno not in {errno.ENOSPC, errno.EDQUOT}:
-            raise
-        what = f"The disk was full at {problem.filename or root}; free some space, the job goes on from what it had published."
-        raise DiskFullError(what, {"free_disk_bytes": shutil.disk_usage(root).free}) from problem
 
 
 @contextmanager
@@ -220,39 +210,42 @@ class _Watch:
             self._after = new[-1].id
 
 
-def _await_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None:
-    """Submit the chain, follow its events, and raise what it raises."""
+def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _Watch) -> None:
+    """Submit each stage once the one before has ended, follow its events, and raise what it raises."""
     from distributed.comm import CommClosedError
 
+    client = processes.connect(count)
     try:
-        _follow_stages(client, tasks, watch)
+        for task in tasks:
+            _follow_stage(client, lambda: processes.keep(count), task, watch)
     except (CancelledError, CommClosedError) as problem:
         raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.") from problem
 
 
-def _follow_stages(client: Client, tasks: list[StageTask], watch: _Watch) -> None:
+def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: _Watch) -> None:
     from distributed import KilledWorker, wait
 
-    last: Future | None = None
-    for task in tasks:
-        key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
-        last = client.submit(task, last, key=key, resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
-    flag, give_up_at = tasks[0].root / CANCEL_FLAG, None
-    while not last.done():  # type: ignore[union-attr]
+    key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
+    stage: Future = client.submit(task, key=key, resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
+    flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
+    while not stage.done():
         with suppress(TimeoutError):
-            wait([last], timeout=POLL_S)
+            wait([stage], timeout=POLL_S)
         watch.tell()
+        if time.monotonic() > keep_at:
+            keep_workers()
+            keep_at = time.monotonic() + KEEP_S
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S
         if give_up_at is not None and time.monotonic() > give_up_at and watch.stage != "capture":
             _stop_workers(client)
             raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
     try:
-        last.result()  # type: ignore[union-attr]
+        stage.result()
     except KilledWorker as problem:
         raise WorkerLostError(
-            f"Every worker that took on stage {watch.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
-            {"stage": watch.stage, "deaths": problem.allowed_failures + 1},
+            f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
+            {"stage": task.stage, "deaths": problem.allowed_failures + 1},
         ) from problem
 
 

@@ -21,6 +21,8 @@ from services.core.geometry import Record
 
 PROBE_S = 1.0
 """How long the database may take to grant a write."""
+STORE_PROBE_S = 3.0
+"""How long the store may take for a small file."""
 _BLOCK = bytes(4096)
 
 CheckName = Literal["database", "scheduler", "store", "disk"]
@@ -50,7 +52,7 @@ class Readiness:
         self._engine, self._jobs_folder = engine, jobs_folder
         self._is_running, self._free_bytes, self._address = is_running, free_bytes, scheduler
         self._file = _identity(engine)
-        self._prober = ThreadPoolExecutor(1, "readiness")
+        self._prober, self._store_prober = ThreadPoolExecutor(1, "readiness"), ThreadPoolExecutor(1, "store-readiness")
 
     def checks(self) -> tuple[Check, ...]:
         """Try everything; none of it raises."""
@@ -87,19 +89,26 @@ class Readiness:
         return "Queued jobs are being run."
 
     def _store(self) -> str:
-        probe = self._jobs_folder / f".probe-{secrets.token_hex(6)}"
+        writing_once = self._store_prober.submit(self._write_file)
         try:
-            self._jobs_folder.mkdir(parents=True, exist_ok=True)
-            try:
-                with probe.open("wb") as stream:
-                    stream.write(_BLOCK)
-                    stream.flush()
-                    os.fsync(stream.fileno())
-            finally:
-                probe.unlink(missing_ok=True)
+            writing_once.result(STORE_PROBE_S)
+        except TimeoutError:
+            writing_once.cancel()
+            raise StoreError(f"The jobs' folder takes no file within {STORE_PROBE_S:g} s; look at its disk, or at the network to it.") from None
         except OSError as problem:
             raise StoreError(f"The jobs' folder cannot be written ({problem.strerror}); check its rights, its mount and the disk.") from problem
         return "The jobs' folder can be written."
+
+    def _write_file(self) -> None:
+        probe = self._jobs_folder / f".probe-{secrets.token_hex(6)}"
+        self._jobs_folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with probe.open("wb") as stream:
+                stream.write(_BLOCK)
+                stream.flush()
+                os.fsync(stream.fileno())
+        finally:
+            probe.unlink(missing_ok=True)
 
     def _disk(self) -> str:
         try:

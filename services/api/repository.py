@@ -6,6 +6,7 @@ holder still says of the job is refused.
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -244,13 +245,15 @@ class Repository:
         """Tell every job under way that no process works on it any more."""
         return self._lose(sql.true())
 
-    def lose_expired(self, keep: Lease | None = None) -> list[str]:
+    def lose_expired(self, keep: Lease | None = None, length_s: float = math.inf) -> list[str]:
         """Tell those that have no lease, or one that ran out.
 
         Args:
             keep: holds whatever the clock says: the caller's own, who knows that it works on that job.
+            length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped back, and counts as run out.
         """
-        held = lease_table.c.until_s >= self._clock()
+        now_s = self._clock()
+        held: sql.ColumnElement[bool] = lease_table.c.until_s.between(now_s, now_s + 2 * length_s)
         if keep is not None:
             held |= (lease_table.c.job == keep.job.id) & (lease_table.c.number == keep.number)
         return self._lose(job_table.c.id.not_in(sql.select(lease_table.c.job).where(held)))

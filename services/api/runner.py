@@ -17,9 +17,10 @@ from services.api.lifecycle import JobState, Trigger
 from services.api.logs import log_context
 from services.api.pipeline import request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
-from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, SchedulerLostError
+from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 from services.core.stage import StageName
+from services.core.store import telling_disk_faults
 
 RunJob = Callable[[JobSpec, Path, EventAddress], object]
 """Runs a job in a folder to its end, events to the given table; raises what a stage raises."""
@@ -121,8 +122,10 @@ class Runner:
             try:
                 if (lease := self._current) is not None and not self._repository.renew(lease, LEASE_S):
                     log.warning("job %s was taken over by another server", lease.job.id)
-                for job_id in self._repository.lose_expired(lease):
+                for job_id in self._repository.lose_expired(lease, LEASE_S):
                     log.warning("job %s was lost by its server and is queued again", job_id)
+                if lease is not None and self._is_cancelled(lease):
+                    request_cancel(self._folder(lease.job.id))
                 self._on_round()
             except Exception:
                 log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
@@ -130,12 +133,9 @@ class Runner:
 
     def _run_one(self, lease: Lease) -> None:
         job, folder = lease.job, self._folder(lease.job.id)
-        folder.mkdir(parents=True, exist_ok=True)
-        withdraw_cancel(folder)
-        if self._closing.is_set() or self._repository.get(job.id).state is JobState.CANCELLING:
-            request_cancel(folder)
         trigger, failure = Trigger.SUCCEED, None
         try:
+            self._prepare(lease, folder)
             self._run(self._locate(job.spec), folder, self._repository.address_of(lease))
         except JobCancelledError:
             state = patiently(lambda: self._repository.get(job.id).state)
@@ -143,7 +143,7 @@ class Runner:
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
-        except (DiskFullError, SchedulerLostError) as problem:
+        except (DiskFullError, ReadOnlyStoreError, SchedulerLostError) as problem:
             self._admission.pause(job.id, problem)
             trigger = Trigger.PAUSE
         except DentineError as problem:
@@ -160,6 +160,16 @@ class Runner:
         logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
         if transition.state is JobState.SUCCEEDED:
             self._on_success(job)
+
+    def _prepare(self, lease: Lease, folder: Path) -> None:
+        with telling_disk_faults(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            withdraw_cancel(folder)
+            if self._closing.is_set() or self._is_cancelled(lease):
+                request_cancel(folder)
+
+    def _is_cancelled(self, lease: Lease) -> bool:
+        return self._repository.get(lease.job.id).state is JobState.CANCELLING
 
     def _stage(self, job: Job) -> StageName | None:
         latest = self._repository.events_of(job.id).latest()

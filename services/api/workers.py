@@ -59,6 +59,12 @@ class Workers:
                 self._cluster.scale(count)
             return self._client
 
+    def keep(self, count: int) -> None:
+        """Start again what was lost of ``count`` workers: Dask gives up one that does not come back within 15 s, as on a busy machine."""
+        with self._lock:
+            if self._cluster is not None:
+                self._cluster.scale(count)
+
     def close(self) -> None:
         """End the processes, or leave those that run elsewhere."""
         with self._lock:
@@ -88,16 +94,19 @@ class Workers:
 
 
 def require_scheduler(address: str) -> None:
-    """Look whether a scheduler listens.
+    """Look whether a scheduler answers: it greets whoever connects.
 
     Args:
         address: ``tcp://HOST:PORT``
 
     Raises:
-        SchedulerLostError: nobody listens there.
+        SchedulerLostError: nobody answers there.
     """
     parts = urlsplit(address)
     try:
-        socket.create_connection((parts.hostname, parts.port), PROBE_S).close()
+        with socket.create_connection((parts.hostname, parts.port), PROBE_S) as connection:
+            is_greeted = parts.scheme != "tcp" or connection.recv(1) != b""  # TLS waits for the client's word
     except (OSError, ValueError) as problem:
         raise SchedulerLostError(f"The scheduler {address} does not answer; start it, jobs wait for it.") from problem
+    if not is_greeted:
+        raise SchedulerLostError(f"The scheduler {address} does not answer; start it, jobs wait for it.")

@@ -39,7 +39,8 @@
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
     │   ├── CorruptStoreError a shard is missing, truncated or altered
-    │   └── FencedError       a newer attempt owns this stage
+    │   ├── FencedError       a newer attempt owns this stage
+    │   └── ReadOnlyStoreError the store takes no write; the job waits for it
     ├── PlatformError         the machine lacks something: a library, a device
     │   └── SchedulerLostError the workers' scheduler does not answer; the job waits for it
     ├── RigError              the dome or a camera misbehaves; lights are dark when it is raised
@@ -313,6 +314,12 @@ class FencedError(StoreError):
     """A newer attempt owns the stage; this one must not write."""
 
     code = "attempt-fenced"
+
+
+class ReadOnlyStoreError(StoreError):
+    """The store takes no write; nothing half-written is visible."""
+
+    code = "store-read-only"
 
 
 class PlatformError(DentineError):

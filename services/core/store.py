@@ -17,6 +17,7 @@ would read as zeros, is an error here.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -30,7 +31,7 @@ import zarr
 from pydantic import ValidationError
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from services.core.errors import CaptureInputError, CorruptStoreError, FencedError, MissingStageError
+from services.core.errors import CaptureInputError, CorruptStoreError, DiskFullError, FencedError, MissingStageError, ReadOnlyStoreError
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -180,6 +181,25 @@ def reading(path: Path) -> Iterator[zarr.Array[Any]]:
         yield array
     except (FileNotFoundError, ValueError, RuntimeError) as problem:
         raise CorruptStoreError(f"{path} cannot be read ({problem}); restore it or run its stage again.") from problem
+
+
+@contextmanager
+def telling_disk_faults(root: Path) -> Iterator[None]:
+    """Turn what a disk refuses into the error that says so.
+
+    Raises:
+        DiskFullError, ReadOnlyStoreError: either passes, and the job goes on from what it had published.
+    """
+    try:
+        yield
+    except OSError as problem:
+        place = problem.filename or root
+        if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
+            what = f"The disk was full at {place}; free some space, the job goes on from what it had published."
+            raise DiskFullError(what, {"free_disk_bytes": shutil.disk_usage(next(one for one in (root, *root.parents) if one.exists())).free}) from problem
+        if problem.errno == errno.EROFS:
+            raise ReadOnlyStoreError(f"The store is read-only at {place}; make it writable, the job goes on from what it had published.") from problem
+        raise
 
 
 def _sha256(path: Path) -> str:

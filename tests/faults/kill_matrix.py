@@ -1,83 +1,74 @@
-"""Kill -9 of every part of the service at every boundary and in the middle of every stage.
+"""Faults of every part of the service in every stage, kill -9 also at every boundary.
 
 python -m tests.faults.kill_matrix --out matrix.json
 
-A job of toy stages runs through the real API, database, scheduler and workers. It is held at one point, one part is killed, what an orchestrator restarts is
-started again, and the job is let go on. A cell is good when the job succeeded, every stage was published once and by its newest attempt, nothing half-written
-is visible, the dome is dark, and the events tell of it in order. Parts: the API, the scheduler, the process that runs the stage, the whole host of that
-process, and the database.
+A job of toy stages runs through the real API, database, scheduler and workers, each on a host of its own. It is held at one point, one fault strikes, the
+job is let go on, and what an orchestrator restarts is started again. A cell is good when the job succeeded, every stage was published once and by an attempt
+that the events tell of, what is published is whole, the dome is dark, the events tell of it in order, and there is one job for every submission. In the end all
+stores are looked at once more, as an attempt that was given up may write late.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
+import secrets
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import httpx
-
+from services.core.errors import StoreError
+from services.core.records import AssetManifest
+from services.core.store import open_stage
+from tests.faults.strikes import FAULTS, Held
 from tests.support.small_system import SmallSystem, small_system
 
 STAGES = ("capture", "prepare", "fit", "export")
 POINTS = ("start", "middle", "end")
-PARTS = ("api", "scheduler", "stage", "host", "database")
+KILLS = ("api", "scheduler", "stage", "host", "database")
 FOLDERS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What was killed where, and how the job ended."""
+    """What went wrong where, and how the job ended."""
 
-    part: str
+    fault: str
     stage: str
     point: str
+    job: str
     state: str
     attempts: dict[str, int]
     """Starts of each stage."""
     seconds: float
-    """From the kill to the job's end."""
+    """From the fault to the job's end."""
     faults: tuple[str, ...]
     """What is wrong; empty when the cell is good."""
 
 
-def run_cell(system: SmallSystem, part: str, stage: str, point: str) -> Cell:
-    """Run one job through one kill."""
-    mouth = system.data.parent / "mouth"
-    mouth.mkdir(exist_ok=True)
-    with system.client() as client:
-        job = client.post("/v1/jobs", json={"workers": 1, "rig": {"mouth": str(mouth)}}).raise_for_status().json()["id"]
-    folder = system.data / "jobs" / job
-    hold, reached = folder / f"hold-{stage}-{point}", folder / f"at-{stage}-{point}"
-    folder.mkdir(parents=True, exist_ok=True)
+def run_cell(system: SmallSystem, fault: str, stage: str, point: str) -> Cell:
+    """Run one job through one fault."""
+    key = secrets.token_hex(4)
+    steering = system.data.parent / f"mouth-{key}" / "steering"
+    steering.mkdir(parents=True)
+    hold, reached = steering / f"hold-{stage}-{point}", steering / f"at-{stage}-{point}"
     hold.touch()
+    spec = {"workers": 1, "rig": {"mouth": str(steering.parent)}}
+    with system.client() as client:
+        job = client.post("/v1/jobs", json=spec, headers={"Idempotency-Key": key}).raise_for_status().json()["id"]
+    system.acknowledged.append(job)
     system.wait_until(reached.exists, f"stage {stage} never reached its {point}")
-    pid = _pid(reached)
+    held = Held(system, job, key, spec, stage, reached, _pid(reached))
 
     began = time.monotonic()
-    if part == "stage":
-        os.kill(pid, signal.SIGKILL)
-    elif part == "host":
-        system.kill("rig" if stage == "capture" else _host_of(system, pid))
-    else:
-        system.kill(part)
-    system.start(*(("database",) if part == "database" else ()))
-    hold.unlink()
-    job_ended = _Ended(system, job)
-    system.wait_until(job_ended, f"job {job} did not end after {part} was killed at the {point} of {stage}")
-    return _judge(folder, job_ended.detail, job_ended.events(), Cell(part, stage, point, job_ended.detail["state"], {}, time.monotonic() - began, ()))
-
-
-def _host_of(system: SmallSystem, pid: int) -> str:
-    return next(name for name in ("worker", "rig") if pid in system.pids(name))
+    with FAULTS[fault](held):
+        hold.unlink()
+    system.wait_until(held.ended, f"job {job} did not end after {fault} at the {point} of {stage}")
+    return _judge(held, steering, Cell(fault, stage, point, job, "", {}, time.monotonic() - began, ()))
 
 
 def _pid(reached: Path) -> int:
@@ -86,76 +77,79 @@ def _pid(reached: Path) -> int:
     return int(text)
 
 
-class _Ended:
-    """Whether a job has ended."""
-
-    def __init__(self, system: SmallSystem, job: str) -> None:
-        self._system, self._job = system, job
-        self.detail: dict[str, Any] = {}
-
-    def __call__(self) -> bool:
-        with suppress(httpx.TransportError), self._system.client() as client:
-            answer = client.get(f"/v1/jobs/{self._job}")
-            if answer.status_code == 200:
-                self.detail = answer.json()
-        return self.detail.get("state") in {"SUCCEEDED", "FAILED", "CANCELLED"}
-
-    def events(self) -> list[dict[str, Any]]:
-        """All of them, as the stream replays them."""
-        with self._system.client() as client:
-            lines = client.get(f"/v1/jobs/{self._job}/events").text.splitlines()
-        told = (json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: {"))
-        return [event for event in told if "id" in event]
-
-
-def _judge(folder: Path, detail: dict[str, Any], events: Sequence[dict[str, Any]], cell: Cell) -> Cell:
-    faults = []
-    if cell.state != "SUCCEEDED":
-        faults.append(f"the job ended {cell.state}: {detail['failure']}")
-    published = Counter((folder / "publications.txt").read_text().split())
-    faults += [f"stage {stage} was published {published[stage]} times" for stage in STAGES if published[stage] != 1]
+def _judge(held: Held, steering: Path, cell: Cell) -> Cell:
+    detail = held.get(f"/v1/jobs/{held.job}")
     attempts = {stage["stage"]: stage["attempt"] for stage in detail["stages"]}
-    for stage, place in FOLDERS.items():
-        by = folder / place / "by.txt"
-        if not by.exists() or not 1 <= int(by.read_text()) <= attempts[stage]:
-            faults.append(f"stage {stage} has no result of an attempt that is told of")
-    if (folder / "lit").exists():
+    events = _events(held)
+    faults = _store_faults(held.system.data / "jobs" / held.job, attempts)
+    if detail["state"] != "SUCCEEDED":
+        faults.append(f"the job ended {detail['state']}: {detail['failure']}")
+    published = Counter((steering / "publications.txt").read_text().split())
+    faults += [f"stage {stage} was published {published[stage]} times" for stage in STAGES if published[stage] != 1]
+    if (steering / "lit").exists():
         faults.append("the dome is lit")
     ids = [event["id"] for event in events]
     if ids != sorted(set(ids)):
         faults.append("events are out of order")
-    if [event["data"]["state"] for event in events if event["kind"] == "state"][-1:] != [cell.state]:
+    if [event["data"]["state"] for event in events if event["kind"] == "state"][-1:] != [detail["state"]]:
         faults.append("the last event tells of another state")
-    return Cell(**{**asdict(cell), "attempts": attempts, "faults": tuple(faults)})
+    listed = {job["id"]: job["state"] for job in held.get("/v1/jobs?limit=500")["jobs"]}
+    if listed != dict.fromkeys(held.system.acknowledged, "SUCCEEDED"):
+        faults.append(f"{len(held.system.acknowledged)} jobs were acknowledged, and there are {listed}")
+    return replace(cell, state=detail["state"], attempts=attempts, faults=tuple(faults))
+
+
+def _events(held: Held) -> list[dict[str, Any]]:
+    """All of a job's, as the stream replays them."""
+    with held.system.client() as client:
+        lines = client.get(f"/v1/jobs/{held.job}/events").text.splitlines()
+    told = (json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: {"))
+    return [event for event in told if "id" in event]
+
+
+def _store_faults(folder: Path, attempts: dict[str, int]) -> list[str]:
+    faults = []
+    for stage, place in FOLDERS.items():
+        try:
+            published, _ = open_stage(folder, place, AssetManifest)
+        except StoreError as problem:
+            faults.append(problem.message)
+            continue
+        if not 1 <= int((published / "by.txt").read_text()) <= attempts[stage]:
+            faults.append(f"stage {stage} has a result of an attempt that nobody tells of")
+    return faults
 
 
 def run_cells(system: SmallSystem, cells: Sequence[tuple[str, str, str]]) -> Iterator[Cell]:
     """One cell after the other, on one system."""
-    for part, stage, point in cells:
-        yield run_cell(system, part, stage, point)
+    for fault, stage, point in cells:
+        yield run_cell(system, fault, stage, point)
 
 
 def all_cells() -> list[tuple[str, str, str]]:
-    """Every part, stage and point."""
-    return [(part, stage, point) for part in PARTS for stage in STAGES for point in POINTS]
+    """Every kill at every point of every stage, every other fault in the middle of each."""
+    kills = [(part, stage, point) for part in KILLS for stage in STAGES for point in POINTS]
+    return kills + [(fault, stage, "middle") for fault in FAULTS if fault not in KILLS for stage in STAGES]
 
 
 def main() -> None:
     """Run all cells, print them as they end and write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--part", action="append", choices=PARTS, help="only this part; may be repeated")
+    parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one; may be repeated")
+    parser.add_argument("--stage", action="append", choices=STAGES, help="only in this stage; may be repeated")
     arguments = parser.parse_args()
-    cells = [cell for cell in all_cells() if not arguments.part or cell[0] in arguments.part]
+    cells = [cell for cell in all_cells() if (not arguments.fault or cell[0] in arguments.fault) and (not arguments.stage or cell[1] in arguments.stage)]
     done: list[Cell] = []
-    with tempfile.TemporaryDirectory() as folder, small_system(Path(folder)) as system:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, small_system(Path(folder), on_hosts=True) as system:
         for cell in run_cells(system, cells):
             done.append(cell)
-            print(f"{cell.part:10} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}", flush=True)
+            print(f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}", flush=True)
             arguments.out.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n")
+        late = [fault for cell in done for fault in _store_faults(system.data / "jobs" / cell.job, cell.attempts)]
     good = sum(not cell.faults for cell in done)
-    print(f"{good} of {len(done)} cells are good.")
-    raise SystemExit(good != len(done))
+    print(f"{good} of {len(done)} cells are good; {len(late)} stores changed afterwards.")
+    raise SystemExit(good != len(done) or bool(late))
 
 
 if __name__ == "__main__":

@@ -5,9 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import socket
+import signal
 import sqlite3
+import subprocess
+import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -16,6 +19,7 @@ from typing import Any
 
 import httpx
 import pytest
+from pydantic import SecretStr
 
 from services.api import readiness as readiness_module
 from services.api.admission import KEPT_FREE_BYTES
@@ -26,6 +30,7 @@ from services.api.migrations import upgrade
 from services.api.readiness import Readiness
 from services.core.settings import DATABASE_FILE, ServerSettings
 from tests.support.live_server import serving
+from tests.support.postgres import new_database, postgres_server
 from tests.support.small_system import free_port
 
 NOBODY = 65534
@@ -176,10 +181,50 @@ def unprivileged() -> Iterator[None]:
         os.seteuid(0)
 
 
-def test_a_scheduler_that_does_not_listen_is_told(tmp_path: Path) -> None:
-    settings = ServerSettings(data=tmp_path, scheduler=f"tcp://127.0.0.1:{free_port()}")
+def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path) -> None:
+    port = free_port()
+    settings = ServerSettings(data=tmp_path, scheduler=f"tcp://127.0.0.1:{port}")
+    told = {"scheduler": f"The scheduler {settings.scheduler} does not answer; start it, jobs wait for it."}
     with serving(create_app(settings, lambda *_: None)) as client:
-        assert bad_checks(client) == {"scheduler": f"The scheduler {settings.scheduler} does not answer; start it, jobs wait for it."}
-        assert settings.scheduler is not None
-        with socket.create_server(("127.0.0.1", int(settings.scheduler.rpartition(":")[2]))):
+        assert bad_checks(client) == told
+        command = [sys.executable, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        with subprocess.Popen(command, stderr=subprocess.DEVNULL) as scheduler:
+            try:
+                while client.get("/v1/health/ready").status_code != 200:
+                    assert scheduler.poll() is None
+                assert bad_checks(client) == {}
+                scheduler.send_signal(signal.SIGSTOP)  # the system still takes connections for it
+                assert bad_checks(client) == told
+                scheduler.send_signal(signal.SIGCONT)
+                while client.get("/v1/health/ready").status_code != 200:
+                    assert scheduler.poll() is None
+            finally:
+                scheduler.kill()
+        assert bad_checks(client) == told
+
+
+def test_a_postgres_that_is_killed_is_told(tmp_path: Path) -> None:
+    with postgres_server() as postgres:
+        settings = ServerSettings(data=tmp_path, database=SecretStr(new_database(postgres, "ready")))
+        with serving(create_app(settings, lambda *_: None)) as client:
             assert bad_checks(client) == {}
+            postgres.kill()
+            bad = bad_checks(client)
+            assert set(bad) == {"database"}
+            assert "cannot be written" in bad["database"]
+            assert client.get("/v1/jobs").json()["code"] == "database-lost"
+            postgres.start()
+            assert bad_checks(client) == {}
+
+
+def test_a_store_that_hangs_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    thawed = threading.Event()
+    monkeypatch.setattr(readiness_module, "STORE_PROBE_S", 0.2)
+    with monkeypatch.context() as frozen:
+        frozen.setattr(readiness_module.os, "fsync", lambda _descriptor: thawed.wait())
+        try:
+            assert bad_checks(client) == {"store": "The jobs' folder takes no file within 0.2 s; look at its disk, or at the network to it."}
+        finally:
+            thawed.set()
+    monkeypatch.undo()
+    assert bad_checks(client) == {}

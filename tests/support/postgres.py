@@ -17,15 +17,20 @@ import pytest
 import sqlalchemy as sql
 
 from services.api.database import open_database
+from tests.support.network import Network
 
 USER = "postgres"
 """Who runs the server where the tests run as root, which Postgres refuses."""
 
 
 class PostgresServer:
-    """A server in a temporary folder that can be killed and started again. Skips where Postgres is not installed."""
+    """A server in a temporary folder that can be killed and started again. Skips where Postgres is not installed.
 
-    def __init__(self) -> None:
+    Args:
+        network: where it is the host ``database``; without one it is reached by its socket alone.
+    """
+
+    def __init__(self, network: Network | None = None) -> None:
         found = next(iter(sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)), None)
         if found is None:
             pytest.skip("Postgres is not installed.")
@@ -38,15 +43,18 @@ class PostgresServer:
         if self._as_user:
             shutil.chown(self._folder, USER, USER)
         self._data = self._folder / "data"
+        self._inside, self._address = (network.inside("database"), network.address("database")) if network else ([], "")
         self._run("initdb", "--username", USER, "--auth", "trust", "--no-sync")
+        with (self._data / "pg_hba.conf").open("a") as rules:
+            rules.write("host all all all trust\n")
 
     def url(self, name: str) -> str:
         """Of one of its databases."""
-        return f"postgresql://{USER}@/{name}?host={self._folder}"
+        return f"postgresql://{USER}@/{name}?host={self._address or self._folder}"
 
     def start(self) -> None:
         """Start, after a kill too."""
-        options = f"-c listen_addresses= -c unix_socket_directories={self._folder} -c fsync=off"
+        options = f"-c listen_addresses={self._address} -c unix_socket_directories={self._folder} -c fsync=off"
         self._run("pg_ctl", "--wait", "--log", str(self._folder / "log"), "--options", options, "start")
 
     def kill(self) -> None:
@@ -64,14 +72,16 @@ class PostgresServer:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _run(self, program: str, *arguments: str) -> None:
-        command = [str(self._programs / program), "--pgdata", str(self._data), *arguments]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=self._folder, **self._as_user)
+        command, options = [str(self._programs / program), "--pgdata", str(self._data), *arguments], self._as_user
+        if self._inside:  # only the superuser enters a namespace
+            command, options = [*self._inside, "setpriv", "--reuid", USER, "--regid", USER, "--clear-groups", *command], {}
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=self._folder, **options)
 
 
 @contextmanager
-def postgres_server() -> Iterator[PostgresServer]:
+def postgres_server(network: Network | None = None) -> Iterator[PostgresServer]:
     """A running server, removed in the end."""
-    server = PostgresServer()
+    server = PostgresServer(network)
     try:
         server.start()
         yield server

@@ -1,4 +1,7 @@
-"""Database, scheduler, workers and API as processes of their own, each of which a test can kill and start again."""
+"""Database, scheduler, workers and API as processes of their own, each of which a test can kill and start again.
+
+As the superuser each may be a host of its own on a network that can be cut, and the store a disk of its own that can be full.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import httpx
 import psutil
 
+from services.core.store import write_atomic
 from tests.support.live_server import connect
+from tests.support.network import Network, network_of
 from tests.support.postgres import PostgresServer, new_database
+from tests.support.store_disk import StoreDisk, store_disk
 
 ROOT = Path(__file__).parents[2]
+DASK_TIMEOUTS = {"COMM__TIMEOUTS__TCP": "11s", "COMM__TIMEOUTS__CONNECT": "5s", "SCHEDULER__WORKER_TTL": "20s"}
+"""As tests wait for them; Dask's own are 30 s, 30 s and 5 min, and the first one's least is 11 s."""
 PATIENCE_S = 300.0
 """A bound for a machine that is busy with something else."""
 
@@ -31,20 +39,33 @@ def free_port() -> int:
 
 
 class SmallSystem:
-    """One of each, two workers, of which one may reach the dome."""
+    """One of each, two workers, of which one may reach the dome.
 
-    def __init__(self, folder: Path, postgres: PostgresServer) -> None:
-        self.data, self._folder, self._postgres = folder / "data", folder, postgres
-        scheduler = f"tcp://127.0.0.1:{free_port()}"
+    Args:
+        network: hosts that the scheduler, the workers and the database are; None for this one.
+        disk: where the data folder lies; None for an ordinary folder.
+    """
+
+    def __init__(self, folder: Path, postgres: PostgresServer, network: Network | None = None, disk: StoreDisk | None = None) -> None:
+        self.data, self.network, self.disk, self._folder, self._postgres = folder / "data", network, disk, folder, postgres
+        self.acknowledged: list[str] = []
+
+        def host(name: str) -> str:
+            return network.address(name) if network else "127.0.0.1"
+
+        def inside(name: str) -> list[str]:
+            return network.inside(name) if network else []
+
+        scheduler = f"tcp://{host('scheduler')}:{free_port()}"
         settings = {"data": str(self.data), "port": free_port(), "database": new_database(postgres, "small"), "scheduler": scheduler}
         self.address = f"http://127.0.0.1:{settings['port']}"
         dask = [sys.executable, "-m", "dask"]
         worker = [*dask, "worker", scheduler, "--nworkers", "1", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "dask")]
         self._commands = {
-            "scheduler": [*dask, "scheduler", "--host", "127.0.0.1", "--port", scheduler.rpartition(":")[2], "--no-dashboard"],
-            "worker": worker,
-            "rig": [*worker, "--resources", "DOME=1"],
-            "api": [sys.executable, "-m", "tests.support.toy_server", json.dumps(settings)],
+            "scheduler": [*inside("scheduler"), *dask, "scheduler", "--host", host("scheduler"), "--port", scheduler.rpartition(":")[2], "--no-dashboard"],
+            "worker": [*inside("worker"), *worker, "--host", host("worker")],
+            "rig": [*inside("rig"), *worker, "--host", host("rig"), "--resources", "DOME=1"],
+            "api": [sys.executable, "-m", "tests.support.stepped_clock", str(self._clock_step), "tests.support.toy_server", json.dumps(settings)],
         }
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -77,6 +98,14 @@ class SmallSystem:
             if process.poll() is None:
                 self.kill(name)
 
+    def step_clock(self, ahead_s: float) -> None:
+        """Set by how much the API's clock goes ahead of the true one."""
+        write_atomic(self._clock_step, str(ahead_s).encode())
+
+    @property
+    def _clock_step(self) -> Path:
+        return self._folder / "clock-step"
+
     def client(self) -> httpx.Client:
         """A client of the API."""
         return connect(self.address)
@@ -93,8 +122,9 @@ class SmallSystem:
     def _launch(self, *names: str) -> None:
         for name in names:
             if name in self._commands and (name not in self._processes or self._processes[name].poll() is not None):
+                environment = os.environ | {f"DASK_DISTRIBUTED__{option}": value for option, value in DASK_TIMEOUTS.items()}
                 with (self._folder / f"{name}.log").open("ab") as log:
-                    self._processes[name] = subprocess.Popen(self._commands[name], cwd=ROOT, stdout=log, stderr=log, start_new_session=True)
+                    self._processes[name] = subprocess.Popen(self._commands[name], cwd=ROOT, env=environment, stdout=log, stderr=log, start_new_session=True)
 
     def _answers(self) -> bool:
         with suppress(httpx.TransportError), connect(self.address) as client:
@@ -103,16 +133,21 @@ class SmallSystem:
 
 
 @contextmanager
-def small_system(folder: Path) -> Iterator[SmallSystem]:
-    """A running system, ended with the block."""
+def small_system(folder: Path, *, on_hosts: bool = False) -> Iterator[SmallSystem]:
+    """A running system, ended with the block.
+
+    Args:
+        on_hosts: its parts are hosts on a network and its store is a disk; skips where this is not permitted.
+    """
     from tests.support.postgres import postgres_server
 
-    (folder / "data").mkdir(parents=True)
     os.environ.setdefault("PYTHONPATH", str(ROOT))
-    with postgres_server() as postgres:
-        system = SmallSystem(folder, postgres)
-        try:
-            system.start()
-            yield system
-        finally:
-            system.close()
+    with ExitStack() as stack:
+        network, disk = None, None
+        if on_hosts:
+            network, disk = stack.enter_context(network_of("scheduler", "worker", "rig", "database")), stack.enter_context(store_disk(folder / "data"))
+        system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk)
+        system.data.mkdir(parents=True, exist_ok=True)
+        stack.callback(system.close)
+        system.start()
+        yield system

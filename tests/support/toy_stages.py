@@ -1,10 +1,15 @@
-"""Stages that publish tiny results, for tests of what surrounds stages; what they do is steered by files in the job's folder."""
+"""Stages that publish tiny results, for tests of what surrounds stages.
+
+What they do is steered by files in the job's folder, or in ``steering`` below the folder that the job names, where there is one: it is there before the job
+and may be written whatever happens to the store. What they did is told in the same place.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
+from pathlib import Path
 
 from services.core.errors import CaptureInputError, JobCancelledError
 from services.core.records import AssetManifest, JobSpec
@@ -14,56 +19,62 @@ from services.core.store import StageWriter
 DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("capture", "prepare", "fit", "export")}
 
 
-def _publish(stage: StageName, folder: str, context: StageContext) -> AssetManifest:
+def _steering(spec: JobSpec, context: StageContext) -> Path:
+    source = spec.rig.mouth if spec.rig else spec.capture
+    return source / "steering" if source is not None and (source / "steering").is_dir() else context.root
+
+
+def _publish(stage: StageName, folder: str, spec: JobSpec, context: StageContext) -> AssetManifest:
     writer = StageWriter(context.root, folder, context.attempt)
     (writer.folder / "by.txt").write_text(f"{context.attempt}\n")
     record = AssetManifest(files=("by.txt",), held_out_error=0.04)
     if stage != "capture":
-        _reach(context, stage, "middle")
+        _reach(spec, context, stage, "middle")
     writer.publish(record)
-    with (context.root / "publications.txt").open("a") as stream:
+    with (_steering(spec, context) / "publications.txt").open("a") as stream:
         stream.write(f"{stage}\n")
-    _reach(context, stage, "end")
+    _reach(spec, context, stage, "end")
     return record
 
 
-def _reach(context: StageContext, stage: StageName, point: str) -> None:
+def _reach(spec: JobSpec, context: StageContext, stage: StageName, point: str) -> None:
     # Says where it is and in which process, and waits there as long as it is told to.
-    (context.root / f"at-{stage}-{point}").write_text(str(os.getpid()))
-    while (context.root / f"hold-{stage}-{point}").exists():
+    steering = _steering(spec, context)
+    (steering / f"at-{stage}-{point}").write_text(str(os.getpid()))
+    while (steering / f"hold-{stage}-{point}").exists():
         context.raise_if_cancelled()
         time.sleep(0.02)
 
 
-def capture(_spec: JobSpec, context: StageContext) -> AssetManifest:
+def capture(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Lights a dome (a file) and darkens it on every exit; waits for ``hold-capture`` to go away."""
-    _reach(context, "capture", "start")
-    lit = context.root / "lit"
+    _reach(spec, context, "capture", "start")
+    lit = _steering(spec, context) / "lit"
     lit.touch()
     try:
         while (context.root / "hold-capture").exists():
             context.raise_if_cancelled()
             time.sleep(0.02)
-        _reach(context, "capture", "middle")
+        _reach(spec, context, "capture", "middle")
     except JobCancelledError:
         time.sleep(0.2)
         raise
     finally:
         lit.unlink(missing_ok=True)
-    return _publish("capture", "capture", context)
+    return _publish("capture", "capture", spec, context)
 
 
-def prepare(_spec: JobSpec, context: StageContext) -> AssetManifest:
+def prepare(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Fails with a sentence while ``bad-input`` exists."""
-    _reach(context, "prepare", "start")
+    _reach(spec, context, "prepare", "start")
     if (context.root / "bad-input").exists():
         raise CaptureInputError("Frame c0_l3.npy is missing from the capture; copy it there.")
-    return _publish("prepare", "prepared", context)
+    return _publish("prepare", "prepared", spec, context)
 
 
-def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
+def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
-    _reach(context, "fit", "start")
+    _reach(spec, context, "fit", "start")
     for step in range(10):
         data = {"channel": "green", "step": step, "loss": 0.5**step, "held_out_error": 0.6**step, "parameters": {"enamel.sigma": 4.0}}
         context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=(step + 1) / 10, data=data))
@@ -75,11 +86,11 @@ def fit(_spec: JobSpec, context: StageContext) -> AssetManifest:
             context.raise_if_cancelled()
             time.sleep(0.02)
         context.raise_if_cancelled()
-    return _publish("fit", "fit", context)
+    return _publish("fit", "fit", spec, context)
 
 
-def export(_spec: JobSpec, context: StageContext) -> AssetManifest:
+def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Publishes an asset."""
-    _reach(context, "export", "start")
+    _reach(spec, context, "export", "start")
     (context.root / "report.html").write_text("<!doctype html><title>report</title>")
-    return _publish("export", "asset", context)
+    return _publish("export", "asset", spec, context)

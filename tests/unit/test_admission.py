@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.api.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
-from services.core.errors import DiskFullError, JobTooLargeError, SchedulerLostError
+from services.core.errors import DentineError, DiskFullError, JobTooLargeError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 
 GIB = 2**30
@@ -49,8 +49,11 @@ def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> 
     assert world.admission.reason("a") is None
 
 
-@pytest.mark.parametrize(("problem", "what"), [(DiskFullError("Full; free some."), "disk"), (SchedulerLostError("Gone; start it."), "workers")])
-def test_what_was_paused_is_tried_again_after_a_while(spec: JobSpec, problem: DiskFullError | SchedulerLostError, what: str) -> None:
+@pytest.mark.parametrize(
+    ("problem", "what"),
+    [(DiskFullError("Full; free some."), "disk"), (SchedulerLostError("Gone; start it."), "workers"), (ReadOnlyStoreError("Locked; open it."), "store")],
+)
+def test_what_was_paused_is_tried_again_after_a_while(spec: JobSpec, problem: DentineError, what: str) -> None:
     world = World()
     world.admission.pause("a", problem)
     assert world.admission.holds("a", spec)

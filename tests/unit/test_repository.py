@@ -13,7 +13,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from services.api import audit, capture_table, tokens, webhook_tables
-from services.api.database import metadata, open_database, sqlite_url
+from services.api.database import metadata, open_database, patiently, sqlite_url, writing
 from services.api.events import event_table
 from services.api.lifecycle import JobState, Trigger
 from services.api.migrations import FIRST, upgrade
@@ -102,6 +102,17 @@ def test_what_is_not_renewed_is_lost_and_its_holder_has_no_say_any_more(reposito
     with repository.address_of(new).open() as log:
         assert log.begin_stage("fit") == 1
     assert repository.settle(new, Trigger.SUCCEED).state is JobState.SUCCEEDED
+
+
+def test_a_lease_from_before_the_clock_stepped_back_is_not_waited_for(repository: Repository, clock: Clock) -> None:
+    clock.now_s += 3600
+    job = repository.create(SPEC, None).job
+    repository.lease(job.id, "dead", 60)
+    clock.now_s -= 3600
+    assert repository.lose_expired(length_s=60) == [job.id]
+    repository.lease(job.id, "alive", 60)
+    clock.now_s -= 59  # no more than servers may differ by
+    assert repository.lose_expired(length_s=60) == []
 
 
 def test_a_server_that_stopped_working_on_a_job_loses_it_like_any_other(repository: Repository, clock: Clock) -> None:
@@ -231,3 +242,22 @@ def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock)
 def test_other_databases_are_refused_by_name(bad: str) -> None:
     with pytest.raises(SettingsError, match="postgresql"):
         open_database(bad)
+
+
+def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.database.POSTGRES_SILENCE_S", 1)
+    silent, other = open_database(server.url("postgres")), open_database(server.url("postgres"))
+    tries: list[int] = []
+
+    def write() -> int:
+        tries.append(1)
+        with writing(silent) as connection:
+            if len(tries) == 1:
+                with writing(other):  # not before the server has ended the silent one's transaction
+                    pass
+            return int(connection.scalar(sql.select(1)) or 0)
+
+    assert patiently(write) == 1
+    assert len(tries) == 2
+    for engine in (silent, other):
+        engine.dispose()

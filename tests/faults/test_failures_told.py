@@ -1,0 +1,102 @@
+"""Four ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what was measured and what to do next."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.benchmarks.cancel_in_kernel import POLL_S, await_end, cancel_once, submit, worker_of_next
+from tests.support.engine_server import MEMORY_BYTES
+from tests.support.engine_stages import MIB
+from tests.support.live_server import toy_server
+from tests.support.store_disk import store_disk
+
+pytestmark = pytest.mark.timeout(900)
+LONGEST_CANCEL_S = 5.0
+GIB = 2**30
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    with toy_server(tmp_path_factory.mktemp("data"), stages="tests.support.engine_stages", module="tests.support.engine_server") as (client, _):
+        yield client
+
+
+def failure_of(client: httpx.Client, capture: Path, call: str) -> dict[str, Any]:
+    told = await_end(client, submit(client, capture, call))
+    assert told["state"] == "FAILED"
+    assert told["failure"]["stage"] == "fit"
+    return dict(told["failure"])
+
+
+def test_a_memory_kill(client: httpx.Client, tmp_path: Path) -> None:
+    failure = failure_of(client, tmp_path, "grow")
+    assert failure["code"] == "memory-killed"
+    assert failure["message"].endswith("lower samples_per_pixel, raise pixel_step or give the worker more memory.")
+    limit = failure["evidence"]["memory_limit_bytes"]
+    assert limit <= MEMORY_BYTES
+    assert limit < failure["evidence"]["peak_memory_bytes"]
+
+
+def test_a_crash_by_a_signal(client: httpx.Client, tmp_path: Path) -> None:
+    failure = failure_of(client, tmp_path, "crash")
+    assert failure["code"] == "process-crashed"
+    assert "ended by SIGSEGV twice in one task; look for its last words in the worker's log." in failure["message"]
+    assert failure["evidence"]["exit_status"] == -signal.SIGSEGV
+
+
+def test_a_lost_worker(client: httpx.Client, tmp_path: Path) -> None:
+    failure = failure_of(client, tmp_path, "lose")
+    assert failure["code"] == "worker-lost"
+    assert failure["message"].endswith("free some memory or set fewer workers, then run again.")
+    assert failure["evidence"] == {"stage": "fit", "deaths": 4}
+
+
+def test_bad_input(client: httpx.Client, tmp_path: Path) -> None:
+    failure = failure_of(client, tmp_path, "read")
+    assert (failure["code"], failure["exit_status"]) == ("bad-capture", 2)
+    assert failure["message"] == f"{tmp_path / 'capture.json'} does not exist; check the path."
+
+
+def test_a_cancel_in_mid_kernel_of_the_real_engine_leaves_the_worker_the_same_process(client: httpx.Client, tmp_path: Path) -> None:
+    before = worker_of_next(client, tmp_path / "before")
+    cancelled = cancel_once(client, tmp_path / "cancelled")
+    assert cancelled.seconds < LONGEST_CANCEL_S
+    assert (cancelled.worker, worker_of_next(client, tmp_path / "after")) == (before, before)
+
+
+def test_a_job_that_never_fits_the_disk_is_refused_and_one_that_will_fit_waits(tmp_path: Path) -> None:
+    with store_disk(tmp_path / "data", 4 * GIB) as disk, toy_server(disk.folder) as (client, _):
+        refused = client.post("/v1/jobs", json={"workers": 1, "rig": {"mouth": str(tmp_path)}})
+        assert (refused.status_code, refused.json()["code"]) == (507, "job-too-large")
+        assert refused.json()["detail"].startswith("The job needs about 12.1 GiB of disk and there are 3.")
+        with disk.almost_full(128 * MIB):
+            job = submit(client, tmp_path / "teeth", "answer")
+            while (told := client.get(f"/v1/jobs/{job}").json())["waits_for"] is None:
+                pass
+            assert (told["state"], told["waits_for"]) == ("QUEUED", "Waits for disk: about 0.3 GiB are needed and 0.1 GiB are free.")
+            assert [check["name"] for check in client.get("/v1/health/ready").json()["checks"] if not check["ok"]] == ["disk"]
+        assert await_end(client, job)["state"] == "SUCCEEDED"
+
+
+def test_a_disk_that_fills_under_a_job_and_its_database_loses_nothing(tmp_path: Path) -> None:
+    steering = tmp_path / "teeth" / "steering"
+    steering.mkdir(parents=True)
+    (steering / "hold-fit-middle").touch()
+    with store_disk(tmp_path / "data", 4 * GIB) as disk, toy_server(disk.folder) as (client, _):
+        job = submit(client, tmp_path / "teeth", "answer")
+        while not (steering / "at-fit-middle").exists():
+            time.sleep(POLL_S)
+        with disk.full():
+            (steering / "hold-fit-middle").unlink()
+            while (answer := client.get("/v1/health/ready")).status_code == 200:
+                pass
+            assert {"store", "disk"} <= {check["name"] for check in answer.json()["checks"] if not check["ok"]}
+        assert await_end(client, job)["state"] == "SUCCEEDED"
+        assert (steering / "publications.txt").read_text().split() == ["prepare", "fit", "export"]

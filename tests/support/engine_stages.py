@@ -1,0 +1,64 @@
+"""A fit that makes one call to an engine on the worker's rendering process, named by a file in the capture's folder; it publishes what a toy fit does."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+from services.core.records import AssetManifest, CaptureManifest, JobSpec
+from services.core.stage import CANCEL_FLAG, StageContext
+from services.core.store import read_record
+from services.fit.blocks import StoredFile, write_recipe
+from services.fit.engine_host import EngineHost
+from services.fit.executors import executor
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.recipe import SceneRecipe
+from tests.support import toy_stages
+from tests.support.small_tooth import camera_at, recipe, whole_view
+
+capture, prepare, export = toy_stages.capture, toy_stages.prepare, toy_stages.export
+BROKEN = "tests.support.broken_engine:BrokenEngine"
+REAL = "tests.support.engine_stages:LongEngine"
+TISSUE = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5), (0.5, 0.4))
+MIB = 2**20
+
+
+class LongEngine(Engine):
+    """The real engine, asked for an image that takes hours."""
+
+    def __init__(self, scene: SceneRecipe, threads: int | None = None) -> None:
+        super().__init__(scene, threads)
+
+    def render(self, started: str) -> None:
+        """Compile the kernel on a few paths, say in a file that it runs, and trace all of them."""
+        view = whole_view(camera_at((0.2, 1, 0.1), size=64))
+        self.images(TISSUE, view, seed=1, samples=16)
+        Path(started).write_text(str(os.getpid()))
+        self.images(TISSUE, view, seed=1, samples=2**26)
+
+
+def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Do what the capture's file ``call`` says."""
+    assert spec.capture is not None
+    call = (spec.capture / "call").read_text()
+    if call == "read":
+        read_record(spec.capture / "capture.json", CaptureManifest)
+    if call == "lose":
+        os.kill(os.getpid(), signal.SIGKILL)
+    (spec.capture / "worker.pid").write_text(str(os.getpid()))
+    method, *arguments = {
+        "grow": ("grow", 8 * MIB),
+        "crash": ("die", int(signal.SIGSEGV)),
+        "render": ("render", str(spec.capture / "started")),
+    }.get(call, ("answer", 1))
+    with executor(context.root / CANCEL_FLAG, REAL if call == "render" else BROKEN) as run_on:
+        run_on.gather([run_on.submit(call, ask, write_recipe(context.root, recipe()), method, *arguments)])
+    return toy_stages.fit(spec, context)
+
+
+def ask(host: EngineHost, scene: StoredFile, method: str, *arguments: Any) -> None:
+    """A task of a fit."""
+    host.call(method, scene, *arguments)
