@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -17,9 +16,7 @@ import httpx
 import pytest
 
 from services.api.app import STATIC
-from services.core.meshfiles import write_mesh
 from tests.support.live_server import running_server
-from tests.support.small_mouth import revolved
 from tests.support.small_system import free_port
 from tests.support.uploading import write_capture
 
@@ -66,15 +63,12 @@ def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path
 
 
 def test_a_stage_whose_packages_are_absent_says_so(environment: Path, tmp_path: Path) -> None:
-    capture = write_capture(tmp_path / "mine")
-    write_mesh(capture / "teeth" / "11" / "outer.ply", revolved((2.0, 3.0)))
     with served(environment, tmp_path / "data") as client:
-        job = client.post("/v1/jobs", json={"capture": str(capture), "workers": 1}).json()["id"]
+        job = client.post("/v1/jobs", json={"rig": {"mouth": str(write_capture(tmp_path / "mine"))}, "workers": 1}).json()["id"]
         client.get(f"/v1/jobs/{job}/events", timeout=300)
         detail = client.get(f"/v1/jobs/{job}").json()
-    assert detail["state"] == "FAILED"
-    assert detail["failure"]["code"] == "platform"
-    assert re.fullmatch(r"Stage prepare needs \w+, which its workers do not have; install dentine\[preprocess\] .*", detail["failure"]["message"])
+    assert (detail["state"], detail["failure"]["code"]) == ("FAILED", "platform-missing")
+    assert detail["failure"]["message"].startswith("Stage capture needs pymodbus, which its workers do not have; install dentine[capture] ")
 
 
 def test_a_job_waits_for_a_scheduler_elsewhere(environment: Path, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from services.api.events import JobEvent, folder_events
-from services.api.pipeline import request_cancel, run_job, stages_of, withdraw_cancel
-from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, WorkerLostError
+from services.api.pipeline import StageTask, request_cancel, run_job, stages_of, withdraw_cancel
+from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, PlatformError, WorkerLostError
 from services.core.records import JobSpec, RigSpec
 from services.core.stage import StageEvent
 from services.core.store import is_published
@@ -67,6 +67,12 @@ def test_a_stage_that_always_kills_ends_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(WorkerLostError, match="stage fit died 4 times"):
         run(FOLDER, tmp_path)
     assert not is_published(tmp_path, "fit")
+
+
+def test_a_package_that_a_worker_lacks_is_named(tmp_path: Path) -> None:
+    task = StageTask("capture", "tests.support.toy_stages:needy", RIG, tmp_path, folder_events(tmp_path))
+    with pytest.raises(PlatformError, match=r"needs no_such_package, which its workers do not have; install dentine\[capture\]"):
+        task()
 
 
 def test_cancel_waits_until_the_dome_is_dark(tmp_path: Path) -> None:

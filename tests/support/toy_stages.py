@@ -94,3 +94,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     _reach(spec, context, "export", "start")
     (context.root / "report.html").write_text("<!doctype html><title>report</title>")
     return _publish("export", "asset", spec, context)
+
+
+def needy(_spec: JobSpec, _context: StageContext) -> AssetManifest:
+    """Needs a package that nobody has."""
+    import no_such_package
+
+    return no_such_package.publish()
