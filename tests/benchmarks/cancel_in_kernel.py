@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 import psutil
 
-from tests.support.live_server import toy_server
+from tests.support.engine_server import engine_server
 
 POLL_S = 0.1
 ENDED = {"SUCCEEDED", "FAILED", "CANCELLED"}
@@ -89,10 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10)
     times = parser.parse_args().times
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        toy_server(Path(folder) / "data", stages="tests.support.engine_stages", module="tests.support.engine_server") as (client, _),
-    ):
+    with tempfile.TemporaryDirectory() as folder, engine_server(Path(folder) / "data") as (client, _):
         first = worker_of_next(client, Path(folder) / "first")
         seconds, workers = [], {first}
         for number in range(times):
