@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from services.api.app import create_app
 from services.api.events import EventAddress
 from services.api.mask_images import picture_of
-from services.api.pipeline import run_stages
+from services.api.pipeline import StageTask, run_stages
 from services.core.errors import CaptureInputError
 from services.core.masks import is_stale, mask_path
 from services.core.records import JobSpec, MaskBit
@@ -40,21 +40,18 @@ class InThisProcess:
     """The pipeline's own order of stages without workers: a real preparation, then a toy fit and export."""
 
     def __init__(self) -> None:
-        self._doors = {"prepare": stage.run, "fit": toy_stages.fit, "export": toy_stages.export}
         self.go = threading.Event()
         self.go.set()
 
     def __call__(self, spec: JobSpec, folder: Path, events: EventAddress) -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("services.api.pipeline._await_stages", lambda _client, tasks, _watch: [self._run(task) for task in tasks])
-            patch.setattr("services.api.pipeline.Workers.connect", lambda *_: None)
-            run_stages(spec, folder, ("prepare", "fit", "export"), events=events)
+            patch.setattr("services.api.pipeline._run_tasks", self._run)
+            run_stages(spec, folder, ("prepare", "fit", "export"), events=events, doors=toy_stages.DOORS | {"prepare": "services.preprocess.stage:run"})
 
-    def _run(self, task: Any) -> None:
+    def _run(self, _processes: object, _count: int, tasks: list[StageTask], _watch: object) -> None:
         assert self.go.wait(60)
-        with task.events.open() as log:
-            attempt = log.begin_stage(task.stage)
-            self._doors[task.stage](task.spec, LocalContext(task.root, attempt, lambda event: log.append(attempt, event)))
+        for task in tasks:
+            task()
 
 
 @pytest.fixture(scope="module")
