@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import sqlalchemy as sql
 from fastapi.responses import StreamingResponse
@@ -18,6 +19,10 @@ PING_S = 15.0
 """A silent stream says that it lives this often."""
 MOST_EVENTS = 1000
 """Read and sent at once."""
+EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {"itemSchema": {"type": "object", "properties": {name: {"type": "string"} for name in ("data", "event", "id")}}}}}
+}
+"""What the API's description says of a stream."""
 
 
 class EventStream(StreamingResponse):

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
 from services.api.database import MOST_ID
-from services.api.feed import EventFeed, EventStream
+from services.api.feed import EVENT_ANSWERS, EventFeed, EventStream
 from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
@@ -97,7 +97,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         """The receipt of a deleted job."""
         return jobs.repository.deletion(job_id)
 
-    @router.get("/jobs/{job_id}/events", response_class=EventStream, tags=["jobs"], dependencies=[needs("read")])
+    @router.get("/jobs/{job_id}/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
     def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> EventStream:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         return EventStream(feed.follow(jobs.repository.get(job_id).id, last_event_id or 0), headers={"X-Accel-Buffering": "no"})

@@ -133,9 +133,10 @@ class Runner:
 
     def _run_one(self, lease: Lease) -> None:
         job, folder = lease.job, self._folder(lease.job.id)
-        trigger, failure = Trigger.SUCCEED, None
+        trigger, failure, is_begun = Trigger.SUCCEED, None, False
         try:
             self._prepare(lease, folder)
+            is_begun = True
             self._run(self._locate(job.spec), folder, self._repository.address_of(lease))
         except JobCancelledError:
             state = patiently(lambda: self._repository.get(job.id).state)
@@ -149,6 +150,8 @@ class Runner:
         except DentineError as problem:
             trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
         except Exception as problem:
+            if not is_begun:
+                raise  # nothing of the job broke; whoever leases it next may have better luck
             logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
