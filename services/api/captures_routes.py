@@ -14,7 +14,7 @@ from services.api.captures import Captures
 from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import MEDIA_TYPE, Problem, refusals
-from services.api.receiving import in_thread
+from services.api.threads import in_thread
 from services.api.tus_routes import build_tus_router
 from services.core.errors import IncompleteCaptureError
 

@@ -13,6 +13,7 @@ from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
 from services.api.repository import Repository
+from services.api.threads import in_thread
 
 PERIOD_S = 0.2
 PING_S = 15.0
@@ -66,7 +67,7 @@ class EventFeed:
         while True:
             newest: dict[str, int] = {}
             with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
-                newest = await asyncio.to_thread(self._repository.newest_events, self._newest)
+                newest = await in_thread(self._repository.newest_events, self._newest)
             if newest:
                 self._newest = max(newest.values())
                 ended, self._turn = self._turn, Turn()

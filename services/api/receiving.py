@@ -9,20 +9,18 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
 
 from starlette.requests import ClientDisconnect
 
 from services.api.blobs import PartialFile
+from services.api.threads import in_thread
 from services.api.tus import Checksum
 from services.api.uploads import Upload, Uploads
 from services.core.errors import ChecksumError, DentineError, TooLargeError
 
-P = ParamSpec("P")
-R = TypeVar("R")
 BLOCK_BYTES = 2**20
 RECORD_BYTES = 64 * 2**20
 """A long request is recorded every so often, so that a dead server loses no more of it."""
@@ -59,16 +57,6 @@ async def receive(uploads: Uploads, capture: str, number: int, offset: int, stre
             return result
     except DentineError:
         await _drain(body)
-        raise
-
-
-async def in_thread(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-    """Run a function in a thread and, also when this task is cancelled, return only after it: it has a file open or claimed."""
-    running = asyncio.create_task(asyncio.to_thread(function, *arguments, **options))
-    try:
-        return await asyncio.shield(running)
-    except asyncio.CancelledError:
-        await asyncio.wait([running])
         raise
 
 

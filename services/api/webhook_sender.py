@@ -17,6 +17,7 @@ import httpx
 import sqlalchemy as sql
 
 from services.api.deliveries import Attempt, Claim, Deliveries
+from services.api.threads import in_thread
 from services.api.webhook_address import AddressPolicy
 from services.api.webhooks import KEY_PREFIX
 from services.core.errors import WebhookAddressError
@@ -74,9 +75,9 @@ class WebhookSender:
                 while True:
                     sending = {webhook: task for webhook, task in sending.items() if not task.done()}
                     try:
-                        await asyncio.to_thread(self._deliveries.collect, self._clock())
+                        await in_thread(self._deliveries.collect, self._clock())
                         most = MOST_AT_ONCE - len(sending)
-                        for claim in await asyncio.to_thread(self._deliveries.claim, self._clock(), tuple(sending), most) if most else ():
+                        for claim in await in_thread(self._deliveries.claim, self._clock(), tuple(sending), most) if most else ():
                             sending[claim.webhook] = asyncio.create_task(self._deliver(http, claim))
                     except sql.exc.SQLAlchemyError as problem:
                         logging.getLogger(__name__).warning("Webhooks wait for the database: %s", problem.__class__.__name__)
@@ -102,7 +103,7 @@ class WebhookSender:
         attempt = Attempt(time_s=started_s, duration_s=time.monotonic() - started, status=status, error=error)
         wait_s = retry_s(claim.tries + 1, self._draw())
         try:
-            await asyncio.to_thread(self._deliveries.settle, claim, attempt, wait_s, is_gone=status == 410)
+            await in_thread(self._deliveries.settle, claim, attempt, wait_s, is_gone=status == 410)
         except sql.exc.SQLAlchemyError as problem:
             logging.getLogger(__name__).warning("A webhook's delivery could not be logged: %s", type(problem).__name__, extra={"webhook": claim.webhook})
 
