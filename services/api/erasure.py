@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -32,8 +33,9 @@ def erase(folder: Path) -> Erased:
     if not listing.exists():
         write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
     try:
-        if folder.exists():
-            shutil.rmtree(folder)
+        while folder.exists():
+            with suppress(FileNotFoundError):  # another server removes it too
+                shutil.rmtree(folder)
     except OSError as problem:
         raise StoreError(
             f"{problem.filename or folder} could not be removed ({problem.strerror}); correct its permissions and delete the job again."

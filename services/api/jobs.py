@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +21,7 @@ from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, JobFilter, Repository
 from services.api.runner import RunJob, Runner
 from services.api.time_ranges import TimeRange, TimeRanges
-from services.core.errors import JobStateError, SettingsError, StoreError
+from services.core.errors import JobStateError, SettingsError, StoreError, UnknownJobError
 from services.core.geometry import Record
 from services.core.masks import is_stale
 from services.core.records import JobSpec
@@ -57,6 +58,7 @@ class Jobs:
         self._time_ranges = TimeRanges(self.repository, self.locate, self.waits_for, machine)
         self._runner = Runner(self.repository, self.folder, self.locate, run, self._admission, self._tidy, self._time_ranges.learn)
         self._is_alone = settings.database is None
+        self._deleting = threading.Lock()
 
     def start(self) -> None:
         """Queue again what an earlier server left unfinished, then run jobs."""
@@ -128,10 +130,13 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be removed; delete it again.
         """
         self.repository.apply(job_id, Trigger.DELETE)
-        erased = erase(self.folder(job_id))
-        receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
-        forget_listing(self.folder(job_id))
-        return receipt
+        with self._deleting:
+            with suppress(UnknownJobError):
+                return self.repository.deletion(job_id)  # a round found the deletion begun and has finished it
+            erased = erase(self.folder(job_id))
+            receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
+            forget_listing(self.folder(job_id))
+            return receipt
 
     def capturing(self) -> list[Job]:
         """Jobs under way, of any server of the database, whose capture is not published yet."""
@@ -176,6 +181,8 @@ class Jobs:
         for job_id in self.repository.ended_before(oldest_s):
             try:
                 self.delete(job_id)
+            except UnknownJobError:
+                continue  # deleted meanwhile
             except StoreError as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
 
-from services.api.erasure import erase, forget_listing
+from services.api import jobs
+from services.api.erasure import Erased, erase, forget_listing
+from services.api.jobs import Jobs
+from services.api.lifecycle import Trigger
 from services.core.errors import StoreError
+from services.core.records import JobSpec
+from services.core.settings import ServerSettings
 
 
 def write_job(folder: Path) -> str:
@@ -50,3 +56,33 @@ def test_a_removal_that_was_cut_short_counts_from_its_beginning(tmp_path: Path, 
 
 def test_an_absent_folder_is_empty(tmp_path: Path) -> None:
     assert erase(tmp_path / "none").files == 0
+
+
+def test_a_round_that_meets_a_deletion_lets_it_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, erased, problems, second = tmp_path / "data", [], [], threading.Event()
+    service = Jobs(ServerSettings(data=data), lambda *_: None)
+    job = service.repository.create(JobSpec(capture=tmp_path), key=None).job.id
+    service.repository.apply(job, Trigger.CANCEL)
+    write_job(service.folder(job))
+
+    def tidy() -> None:
+        try:
+            service._tidy()
+        except Exception as problem:
+            problems.append(problem)
+
+    round_of_server = threading.Thread(target=tidy)
+
+    def erase_during_a_round(folder: Path) -> Erased:
+        erased.append(folder)
+        if len(erased) == 1:
+            round_of_server.start()
+            second.wait(0.3)
+        second.set()
+        return erase(folder)
+
+    monkeypatch.setattr(jobs, "erase", erase_during_a_round)
+    receipt = service.delete(job)
+    round_of_server.join()
+    assert (receipt.files, len(erased), problems) == (2, 1, [])
+    service.repository.close()
