@@ -132,7 +132,9 @@ class Sender:
         self._session = requests.Session()
         self._session.trust_env = False
         admin = {"Authorization": f"Bearer {tokens['admin']}"}
-        described = self._session.get(f"{address}/v1/openapi.json", headers=admin, timeout=ANSWER_S).json()
+        told = self._session.get(f"{address}/v1/openapi.json", headers=admin, timeout=ANSWER_S)
+        told.raise_for_status()
+        described = told.json()
         for operation in (one for path in described["paths"].values() for one in path.values()):
             operation.pop("security", None)  # the callers say who asks
         self._schema = schemathesis.openapi.from_dict(described, config=schemathesis.Config.from_dict(CONFIG))
