@@ -56,6 +56,7 @@ def main() -> NoReturn:
 def build_app() -> typer.Typer:
     """Put the commands together."""
     from services.core.settings import read_settings
+    from services.dask_command import add_dask_commands
     from services.slab_command import simulate_slab_command
     from services.token_command import build_token_app
 
@@ -63,6 +64,7 @@ def build_app() -> typer.Typer:
     app.callback()(_root)
     for command in (serve, dome_sim, capture, run, upload, submit, watch, cancel, retry, export, phantom, bench):
         app.command()(command)
+    add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)
@@ -253,6 +255,7 @@ def submit(
     job: JobFile,
     server: Server = None,
     send: Annotated[bool, typer.Option("--upload", help="Upload the job's capture folder first.")] = False,
+    calibration: Annotated[str | None, typer.Option(metavar="NAME", help="Calibration that the server stores, in place of the job's own.")] = None,
     key: Annotated[str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")] = None,
     follow: Annotated[bool, typer.Option("--watch", help="Watch the job until it ends.")] = False,
     as_json: Json = False,
@@ -266,6 +269,8 @@ def submit(
             from services.upload_command import with_uploaded_capture
 
             spec = with_uploaded_capture(client, spec, job)
+        if calibration is not None:
+            spec = spec.model_copy(update={"calibration": Path(client.calibration(calibration)["option"])})
         created = client.submit(spec, key)
         print(json.dumps(created) if as_json else created["id"])
         if follow:

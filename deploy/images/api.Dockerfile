@@ -1,4 +1,4 @@
-# The API and its dashboard: no renderer, no camera, no dome.
+# The API and its dashboard: no renderer; of the capture what switches the dome by hand.
 FROM node:22-bookworm-slim AS dashboard
 WORKDIR /dashboard
 COPY services/api/dashboard/package.json services/api/dashboard/package-lock.json services/api/dashboard/tsconfig.json ./
@@ -12,7 +12,7 @@ WORKDIR /app
 COPY pyproject.toml README.md ./
 COPY services services
 COPY --from=dashboard /dashboard/static services/api/dashboard/static
-RUN pip install --no-cache-dir '.[api,postgres]'
+RUN pip install --no-cache-dir '.[api,postgres,capture]'
 USER dentine
 VOLUME /data
 CMD ["dentine", "serve"]

@@ -16,6 +16,7 @@ import psutil
 
 from services.core.errors import DentineError, DiskFullError, JobTooLargeError, StoreError
 from services.core.records import JobSpec
+from services.core.store import MANIFEST
 
 DISK_PER_CAPTURE = 6.0
 """Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are most."""
@@ -27,6 +28,8 @@ WORKER_BYTES = 3 * 2**29
 """Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
 MOST_FILES = 5_000
 """Of a capture that are looked at."""
+_DESCRIPTIONS = ("capture.json", MANIFEST, f"capture/{MANIFEST}")
+"""One of these makes a folder a capture, or a job that holds one."""
 KEPT_FREE_BYTES = 256 * 2**20
 """Disk that no job may count on."""
 RETRY_S = 10.0
@@ -48,8 +51,11 @@ def predict(spec: JobSpec) -> Needs:
 
 
 def _stored_bytes(folder: Path) -> int:
-    # What lies on the disk, of as many files as a capture may have.
+    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its stage and not walked through here.
     total = 0
+    with suppress(OSError):
+        if not any((folder / one).is_file() for one in _DESCRIPTIONS):
+            return 0
     for path in itertools.islice(folder.rglob("*"), MOST_FILES):
         with suppress(OSError):
             status = path.lstat()

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from services.api.dask_tls import Certificates
 from services.api.events import EventAddress
 from services.api.jobs import Jobs
 from services.api.pipeline import run_job
@@ -23,11 +24,12 @@ if TYPE_CHECKING:
 STATIC = Path(__file__).parent / "dashboard" / "static"
 
 
-def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
+def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Workers | None = None) -> FastAPI:
     """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
 
     Args:
         run: in place of the stages.
+        workers: those that ``run`` runs on, closed with the application; default its own.
     """
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
@@ -43,9 +45,11 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     from services.api.observation import Observation
     from services.api.routes import build_router
     from services.api.shield import Shield
+    from services.api.worker_routes import build_workers_router
 
     access.refuse_open_network(settings)
-    workers = Workers(settings.scheduler)
+    certificates = Certificates.of(settings.tls) if settings.tls is not None else None
+    workers = workers or Workers(settings.scheduler, certificates)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         run_job(spec, folder, events=events, cluster=workers, is_logged=True)
@@ -58,7 +62,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     jobs = Jobs(settings, run_in_turn)
     dome = Dome(settings.dome, jobs)
     feed = EventFeed(jobs.repository)
-    observation = Observation(jobs, settings)
+    observation = Observation(jobs, settings, certificates)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -82,6 +86,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None) -> FastAPI:
     app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
     app.include_router(build_masks_router(jobs, Masks(jobs)))
     app.include_router(build_dome_router(dome))
+    app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")

@@ -28,7 +28,7 @@ def build_calibrations_router(calibrations: Calibrations, captures: Captures) ->
         """One calibration with its cameras and lights."""
         return calibrations.get(name)
 
-    @router.put("/calibrations/{name}", dependencies=[needs("submit")])
+    @router.put("/calibrations/{name}", status_code=201, responses={200: {"model": CalibrationDetail}}, dependencies=[needs("submit")])
     def put(name: Name, calibration: Calibration, response: Response) -> CalibrationDetail:
         """Store a calibration under a new name: 201, or 200 where it is there already. A name never changes its content: 409."""
         creation = calibrations.put(name, calibration)

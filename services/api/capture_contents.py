@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from pydantic_core import from_json
 
 from services.api.image_headers import declared
+from services.api.image_metadata import metadata_fault
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
 
@@ -55,7 +56,7 @@ def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> st
         return f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
     if image.decoded_bytes > MOST_TIMES_PACKED * size:
         return f"Image {name} declares {image.size} in {size} bytes, which no photograph packs to; export it again."
-    return None
+    return metadata_fault(path, name, suffix)
 
 
 def _description_fault(name: str, description: FolderCapture, limits: UploadLimits, names: frozenset[str]) -> str | None:

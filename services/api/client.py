@@ -42,6 +42,10 @@ class Client:
         """Submit a job; the same key and options give the same job."""
         return self.run(self._exchange.submit(spec, key))
 
+    def calibration(self, name: str) -> dict[str, Any]:
+        """A stored calibration; its 'option' is what a job takes."""
+        return self.run(self._exchange.calibration(name))
+
     def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> UploadResult:
         """Upload a folder capture and commit it. Files that the server knows are not sent; a broken upload resumes, also in a new process.
 
@@ -62,6 +66,10 @@ class Client:
     def retry(self, job_id: str) -> dict[str, Any]:
         """Queue a failed or cancelled job again."""
         return self.run(self._exchange.retry(job_id))
+
+    def workers(self) -> dict[str, Any]:
+        """The workers, what each is doing, and how many jobs they got done."""
+        return self.run(self._exchange.workers())
 
     def events(self, job_id: str, after: int = 0) -> Iterator[JobEvent]:
         """A job's events until it ends; survives a restart of the server without loss or repetition."""
@@ -130,6 +138,10 @@ class AsyncClient:
         """See ``Client``."""
         return await self.run(self._exchange.submit(spec, key))
 
+    async def calibration(self, name: str) -> dict[str, Any]:
+        """See ``Client``."""
+        return await self.run(self._exchange.calibration(name))
+
     async def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> UploadResult:
         """See ``Client``. ``progress`` may be called in another thread."""
         return await self.run(self._exchange.upload(folder, progress, subject))
@@ -145,6 +157,10 @@ class AsyncClient:
     async def retry(self, job_id: str) -> dict[str, Any]:
         """See ``Client``."""
         return await self.run(self._exchange.retry(job_id))
+
+    async def workers(self) -> dict[str, Any]:
+        """See ``Client``."""
+        return await self.run(self._exchange.workers())
 
     async def events(self, job_id: str, after: int = 0) -> AsyncIterator[JobEvent]:
         """See ``Client``."""

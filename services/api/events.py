@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,7 +21,7 @@ import sqlalchemy as sql
 from pydantic import Field
 from pydantic_core import from_json
 
-from services.api.database import metadata, open_database, sqlite_url, writing
+from services.api.database import Query, metadata, open_database, sqlite_url, writing
 from services.core.errors import FencedError
 from services.core.geometry import Record
 from services.core.stage import StageEvent, StageName
@@ -72,10 +73,12 @@ class JobEvent(Record):
 _COLUMNS = tuple(JobEvent.model_fields)
 
 
-def _latest_of_each_stage() -> sql.Select[Any]:
-    """Of job ``of``: its stages' last events, and the last ``done`` of the same attempt."""
-    of_job = event_table.c.job == sql.bindparam("of")
-    of_stage = sql.select(sql.func.max(event_table.c.id)).where(of_job, event_table.c.stage.is_not(None)).group_by(event_table.c.stage)
+def latest_of_stages(which: sql.ColumnElement[bool]) -> sql.Select[Any]:
+    """Query for the last event of each stage of certain jobs, and for the last one with which each was started; see ``begun``."""
+    is_start = event_table.c.kind == "started"
+    of_stage = (
+        sql.select(sql.func.max(event_table.c.id)).where(which, event_table.c.stage.is_not(None)).group_by(event_table.c.job, event_table.c.stage, is_start)
+    )
     earlier = event_table.alias()
     last_done = (
         sql.select(earlier.c.done)
@@ -88,8 +91,40 @@ def _latest_of_each_stage() -> sql.Select[Any]:
     return sql.select(event_table, last_done.label("last_done")).where(event_table.c.id.in_(of_stage)).order_by(event_table.c.id)
 
 
-_LATEST = _latest_of_each_stage()
-"""Built once: building it takes longer than asking it."""
+# Queries are built once: building one takes longer than asking it.
+_LATEST = Query(latest_of_stages(event_table.c.job == sql.bindparam("of")))
+_NEWEST_ID = Query(sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == sql.bindparam("of")))
+_TOLD = Query(
+    sql.select(event_table.c.id, event_table.c.time_s, event_table.c.data)
+    .where(event_table.c.job == sql.bindparam("of"), event_table.c.kind == sql.bindparam("of_kind"), event_table.c.id > sql.bindparam("after"))
+    .order_by(event_table.c.id)
+    .limit(PAGE)
+)
+# An overtaken attempt is refused, so the last event of a stage is of its newest attempt: one row to look at, however long the fit.
+_NEWEST_ATTEMPT = (
+    sql.select(event_table.c.attempt)
+    .where(event_table.c.job == sql.bindparam("of"), event_table.c.stage == sql.bindparam("of_stage"))
+    .order_by(event_table.c.id.desc())
+    .limit(1)
+)
+_INSERT = event_table.insert()
+
+
+@cache
+def _page_of(columns: tuple[str, ...]) -> Query:
+    """Events of job ``of`` after ``after``, at most ``most``; each of the columns must be what the parameter of its name says."""
+    query = sql.select(event_table).where(event_table.c.job == sql.bindparam("of"), event_table.c.id > sql.bindparam("after"))
+    query = query.where(*(event_table.c[name] == sql.bindparam(f"of_{name}") for name in columns))
+    return Query(query.order_by(event_table.c.id).limit(sql.bindparam("most", type_=sql.Integer)))
+
+
+class Begun(NamedTuple):
+    """How far the stages of a job are."""
+
+    latest: Sequence[JobEvent] = ()
+    """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""
+    started: JobEvent | None = None
+    """With which the newest stage was started."""
 
 
 class Told(NamedTuple):
@@ -134,7 +169,7 @@ def insert_event(connection: sql.Connection, job: str, attempt: int, event: Stag
     if event is not None:
         columns = {"stage": event.stage, "kind": event.kind, "message": event.message, "done": event.done, "data": event.data} | columns
     row = {"job": job, "attempt": attempt, "time_s": time.time(), "stage": None, "message": "", "done": None} | columns
-    connection.execute(event_table.insert().values(row | {"data": json.dumps(columns.get("data", {}), allow_nan=False)}))
+    connection.execute(_INSERT, row | {"data": json.dumps(columns.get("data", {}), allow_nan=False)})
 
 
 class EventLog:
@@ -173,22 +208,18 @@ class EventLog:
 
     def read(self, after: int = 0, limit: int = PAGE, **only: str | int | None) -> list[JobEvent]:
         """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None for anything."""
-        query = sql.select(event_table).where(event_table.c.job == self.job, event_table.c.id > after).order_by(event_table.c.id).limit(limit)
-        query = query.where(*(event_table.c[column] == value for column, value in only.items() if value is not None))
-        with self._engine.connect() as connection:
-            return [_event(row) for row in connection.execute(query).mappings()]
+        asked = {name: value for name, value in only.items() if value is not None}
+        values = {f"of_{name}": value for name, value in asked.items()}
+        return [_event(row) for row in _page_of(tuple(asked)).rows(self._engine, of=self.job, after=after, most=limit, **values)]
 
     def told(self, kind: str) -> Iterator[Told]:
         """All events of one kind, oldest first, as little of them as a curve of hundreds needs."""
-        columns = sql.select(event_table.c.id, event_table.c.time_s, event_table.c.data).where(event_table.c.job == self.job, event_table.c.kind == kind)
         after: int | None = 0
         while after is not None:
-            query = columns.where(event_table.c.id > after).order_by(event_table.c.id).limit(PAGE)
-            with self._engine.connect() as connection:
-                rows = connection.execute(query).all()
-            data = from_json("[" + ",".join(row.data for row in rows) + "]")
-            yield from map(Told, (row.time_s for row in rows), data)
-            after = rows[-1].id if len(rows) == PAGE else None
+            rows = _TOLD.rows(self._engine, of=self.job, of_kind=kind, after=after)
+            data = from_json("[" + ",".join(data for _, _, data in rows) + "]")
+            yield from map(Told, (time_s for _, time_s, _ in rows), data)
+            after = rows[-1][0] if len(rows) == PAGE else None
 
     def every(self, **only: str | int | None) -> Iterator[JobEvent]:
         """All of the job's events, oldest first, a page at a time; ``only`` as in ``read``."""
@@ -205,22 +236,37 @@ class EventLog:
         with self._engine.connect() as connection:
             return connection.scalar(sql.select(sql.func.min(columns.time_s)).where(of_attempt, enough))
 
-    def latest(self) -> list[JobEvent]:
-        """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""
-        with self._engine.connect() as connection:
-            return [_event(row, done=row["last_done"]) for row in connection.execute(_LATEST, {"of": self.job}).mappings()]
+    def begun(self) -> Begun:
+        """How far the job's stages are."""
+        return begun(_LATEST.rows(self._engine, of=self.job)).get(self.job, Begun())
+
+    def latest(self) -> Sequence[JobEvent]:
+        """The last event of each stage, oldest first."""
+        return self.begun().latest
 
     def newest_id(self) -> int:
         """Id of the job's last event, 0 before the first."""
-        with self._engine.connect() as connection:
-            return connection.scalar(sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == self.job)) or 0
+        return _NEWEST_ID.rows(self._engine, of=self.job)[0][0] or 0
 
     def _newest_attempt(self, connection: sql.Connection, stage: StageName) -> int:
-        # An overtaken attempt is refused, so the last event of a stage is of its newest attempt: one row to look at, however long the fit.
-        of_stage = sql.select(event_table.c.attempt).where(event_table.c.job == self.job, event_table.c.stage == stage)
-        return connection.scalar(of_stage.order_by(event_table.c.id.desc()).limit(1)) or 0
+        return connection.scalar(_NEWEST_ATTEMPT, {"of": self.job, "of_stage": stage}) or 0
 
 
-def _event(row: Any, **changes: Any) -> JobEvent:
+def begun(rows: Iterable[Sequence[Any]]) -> dict[str, Begun]:
+    """By job, what ``latest_of_stages`` has found."""
+    latest: dict[str, dict[str | None, JobEvent]] = {}
+    started: dict[str, JobEvent] = {}
+    for row in rows:  # oldest first
+        event = _event(row[:-1], done=row[-1])
+        of_job = latest.setdefault(event.job, {})
+        of_job.pop(event.stage, None)
+        of_job[event.stage] = event
+        if event.kind == "started":
+            started[event.job] = event
+    return {job: Begun(tuple(of_job.values()), started.get(job)) for job, of_job in latest.items()}
+
+
+def _event(row: Sequence[Any], **changes: Any) -> JobEvent:
     # Not validated again: the row is this program's own, and a curve has hundreds.
-    return JobEvent.model_construct(**{name: row[name] for name in _COLUMNS} | {"data": json.loads(row["data"])} | changes)
+    fields = dict(zip(_COLUMNS, row, strict=True))
+    return JobEvent.model_construct(**fields | {"data": from_json(fields["data"])} | changes)

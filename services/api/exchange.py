@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import quote
 
 from pydantic import SecretStr
 
@@ -76,6 +77,10 @@ class Exchange:
         headers = {"Idempotency-Key": key} if key is not None else {}
         return self._answer("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True), headers=headers)
 
+    def calibration(self, name: str) -> Flow[dict[str, Any]]:
+        """A stored calibration; its 'option' is what a job takes."""
+        return self._answer("GET", f"/calibrations/{quote(name, safe='')}")
+
     def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> Flow[UploadResult]:
         """Upload a folder capture and commit it."""
         from services.api.uploader import Uploader
@@ -93,6 +98,10 @@ class Exchange:
     def retry(self, job_id: str) -> Flow[dict[str, Any]]:
         """Queue a failed or cancelled job again."""
         return self._answer("POST", f"/jobs/{job_id}/retry")
+
+    def workers(self) -> Flow[dict[str, Any]]:
+        """The workers and what each is doing."""
+        return self._answer("GET", "/workers")
 
     def _answer(self, method: str, path: str, **options: Any) -> Flow[dict[str, Any]]:
         return answer(self.server, Ask(method, path, options))

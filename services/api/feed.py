@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import sqlalchemy as sql
-from fastapi.responses import StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
 from services.api.repository import Repository
@@ -24,6 +25,9 @@ EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {"itemSchema": {"type": "object", "properties": {name: {"type": "string"} for name in ("data", "event", "id")}}}}}
 }
 """What the API's description says of a stream."""
+
+
+_UNBUFFERED = MappingProxyType({"X-Accel-Buffering": "no"})
 
 
 class EventStream(StreamingResponse):
@@ -75,11 +79,24 @@ class EventFeed:
                 ended.ended.set()
             await asyncio.sleep(PERIOD_S)
 
-    async def follow(self, job_id: str, after: int) -> AsyncIterator[bytes]:
-        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state."""
+    async def answer(self, job_id: str, after: int) -> Response:
+        """A job's events after an id as a response: a stream, or at once where the job has ended and few are left to tell.
+
+        Raises:
+            UnknownJobError: there is no such job.
+        """
+        turn = self._turn
+        chapter = await self._read(turn, job_id, after)
+        if chapter.is_last:
+            return Response(chapter.text, headers=_UNBUFFERED, media_type=EventStream.media_type)
+        return EventStream(self.follow(job_id, after, (turn, chapter)), headers=_UNBUFFERED)
+
+    async def follow(self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None) -> AsyncIterator[bytes]:
+        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state; ``opening`` was read already."""
         while True:
-            turn = self._turn
-            chapter = await self._read(turn, job_id, after)
+            turn = self._turn if opening is None else opening[0]
+            chapter = await self._read(turn, job_id, after) if opening is None else opening[1]
+            opening = None
             if chapter.text:
                 yield chapter.text
             if chapter.is_last:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from typing import Any
 
 from pydantic import Field
@@ -97,6 +99,39 @@ def read_history(log: EventLog, points: int, channel: str | None = None) -> Hist
         if isinstance(told.data.get("step"), int) and channel in {None, name}:
             thinned.setdefault(name, _Thinned(points)).add(told)
     return History(series=[_series(name, one) for name, one in thinned.items()])
+
+
+class Histories:
+    """Curves as JSON. Rows of the event table are never changed, so that a curve is read again only after its job's newest event is another one.
+
+    Args:
+        most_bytes: what is kept at most; those that were asked for longest ago go first.
+    """
+
+    def __init__(self, most_bytes: int = 2**24) -> None:
+        self._most_bytes, self._bytes = most_bytes, 0
+        self._kept: OrderedDict[tuple[str, int, str | None], tuple[int, bytes]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def read(self, log: EventLog, points: int, channel: str | None = None) -> bytes:
+        """What ``read_history`` tells."""
+        key, newest = (log.job, points, channel), log.newest_id()
+        with self._lock:
+            if (kept := self._kept.get(key)) is not None and kept[0] == newest:
+                self._kept.move_to_end(key)
+                return kept[1]
+        text = read_history(log, points, channel).model_dump_json().encode()
+        with self._lock:
+            self._drop(key)
+            self._kept[key] = newest, text
+            self._bytes += len(text)
+            while self._bytes > self._most_bytes:
+                self._drop(next(iter(self._kept)))
+        return text
+
+    def _drop(self, key: tuple[str, int, str | None]) -> None:
+        _, text = self._kept.pop(key, (0, b""))
+        self._bytes -= len(text)
 
 
 class _Thinned:

@@ -94,25 +94,44 @@ def _png(head: bytes) -> Declared:
     return _pixels(header.width, header.height, channels, -(-header.depth // 8))
 
 
-def _tiff(head: bytes) -> Declared:
+@dataclass(frozen=True)
+class TiffLayout:
+    """How a TIFF's directories are written: byte order, ``struct`` formats of a count of entries and of an offset, and where the first one lies."""
+
+    order: str
+    count: str
+    offset: str
+    entry_bytes: int
+    start: int
+
+
+def tiff_layout(head: bytes) -> TiffLayout:
+    """What a TIFF says of itself in its first 16 bytes.
+
+    Raises:
+        ValueError: it is no TIFF. struct.error: it is cut off.
+    """
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
-    if order is None:
-        raise ValueError("it is no TIFF")
-    (magic,) = struct.unpack_from(f"{order}H", head, 2)
-    if magic not in {42, 43}:
+    (magic,) = struct.unpack_from(f"{order or '<'}H", head, 2)
+    if order is None or magic not in {42, 43}:
         raise ValueError("it is no TIFF")
     is_big = magic == 43
     offset_at, offset_code, count_code, entry_bytes = (8, "Q", "Q", 20) if is_big else (4, "I", "H", 12)
     (start,) = struct.unpack_from(f"{order}{offset_code}", head, offset_at)
-    if start >= len(head):
+    return TiffLayout(order, f"{order}{count_code}", f"{order}{offset_code}", entry_bytes, start)
+
+
+def _tiff(head: bytes) -> Declared:
+    layout = tiff_layout(head)
+    if layout.start >= len(head):
         raise ValueError(f"its directory lies beyond the first {HEADER_BYTES} bytes; write it with the directory in front")
-    (count,) = struct.unpack_from(f"{order}{count_code}", head, start)
-    first = start + struct.calcsize(f"{order}{count_code}")
+    (count,) = struct.unpack_from(layout.count, head, layout.start)
+    first = layout.start + struct.calcsize(layout.count)
     tags = {}
-    for place in range(first, first + min(count, 4096) * entry_bytes, entry_bytes):
-        tag, kind = struct.unpack_from(f"{order}HH", head, place)
+    for place in range(first, first + min(count, 4096) * layout.entry_bytes, layout.entry_bytes):
+        tag, kind = struct.unpack_from(f"{layout.order}HH", head, place)
         if tag in {256, 257, 258, 277}:
-            tags[tag] = _tiff_values(head, order, kind, place + 4, is_big=is_big)
+            tags[tag] = _tiff_values(head, layout.order, kind, place + 4, is_big=layout.entry_bytes == 20)
     return _pixels(tags[256][0], tags[257][0], tags.get(277, [1])[0], -(-max(tags.get(258, [1])) // 8))
 
 
@@ -128,7 +147,12 @@ def _tiff_values(head: bytes, order: str, kind: int, place: int, *, is_big: bool
     return list(struct.unpack_from(f"{order}{count}{code}", head, value))
 
 
-def _exr(head: bytes) -> Declared:
+def exr_parts(head: bytes) -> list[dict[str, bytes]]:
+    """The attributes of each part of an OpenEXR file, from its first bytes.
+
+    Raises:
+        ValueError: it is no OpenEXR file, or cut off. struct.error, IndexError: it is cut off.
+    """
     if head[:4] != b"\x76\x2f\x31\x01":
         raise ValueError("it is no OpenEXR image")
     (flags,) = struct.unpack_from("<I", head, 4)
@@ -137,13 +161,20 @@ def _exr(head: bytes) -> Declared:
         attributes, place = _exr_attributes(head, place)
         if not attributes:
             break
-        left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
-        channels = _exr_channels(attributes["channels"])
-        parts.append(_pixels(right - left + 1, bottom - top + 1, len(channels), max(channels, default=0)))
+        parts.append(attributes)
         if not is_multipart:
             break
     if not parts:
         raise ValueError("its header is cut off or damaged")
+    return parts
+
+
+def _exr(head: bytes) -> Declared:
+    parts = []
+    for attributes in exr_parts(head):
+        left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
+        channels = _exr_channels(attributes["channels"])
+        parts.append(_pixels(right - left + 1, bottom - top + 1, len(channels), max(channels, default=0)))
     return Declared("; ".join(part.size for part in parts[:4]), sum(part.decoded_bytes for part in parts))
 
 

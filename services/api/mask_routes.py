@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from services.api.artifacts import artifact_response
+from services.api.artifacts import ANSWERS, artifact_response
 from services.api.guard import needs
 from services.api.jobs import Jobs
 from services.api.masks import MaskList, Masks
@@ -30,9 +30,9 @@ def build_masks_router(jobs: Jobs, masks: Masks) -> APIRouter:
         """List a job's masks by hand, and whether its preparation has taken them in."""
         return masks.list(job)
 
-    @router.get("/{camera}/{light}", response_class=Response, responses={200: {"content": {PNG: {}}}}, dependencies=[needs("read", audited=True)])
+    @router.get("/{camera}/{light}", response_class=Response, responses=ANSWERS | {200: {"content": {PNG: {}}}}, dependencies=[needs("read", audited=True)])
     def get(job: Found, camera: str, light: str, request: Request, which: Literal["hand", "prepared"] = "hand") -> Response:
-        """A mask as PNG: by hand, as it was put; prepared, the sum of the reasons why a pixel is out (MaskBit), 0 where the fit may look."""
+        """A mask as PNG: by hand, as put, without metadata; prepared, the sum of the reasons why a pixel is out (MaskBit), 0 where the fit may look."""
         if which == "prepared":
             return Response(masks.prepared(job, camera, light), media_type=PNG)
         return artifact_response(request, masks.get(job, camera, light))

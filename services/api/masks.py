@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from services.api.image_metadata import plain_png
 from services.api.jobs import Jobs
 from services.api.lifecycle import JobState
 from services.api.mask_images import picture_of, require_mask
@@ -65,7 +66,7 @@ class Masks:
         return path
 
     def put(self, job: Job, camera: str, light: str, content: bytes) -> None:
-        """Store a mask, in place of an earlier one.
+        """Store a mask without metadata, in place of an earlier one.
 
         Raises:
             MaskError: it is no mask of this camera. UnknownMaskError: no such camera or light. JobStateError: the job is at work.
@@ -74,7 +75,7 @@ class Masks:
         self._require_rest(job)
         path = mask_path(self._jobs.folder(job.id), camera, light)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, content)
+        write_atomic(path, plain_png(content))
 
     def delete(self, job: Job, camera: str, light: str) -> None:
         """Take a mask back.

@@ -6,12 +6,13 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 
+from services.api.answers import JSON, in_json
 from services.api.archive import stream_zip
 from services.api.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
 from services.api.database import MOST_ID
 from services.api.events import EventLog
 from services.api.guard import needs
-from services.api.history import History, LogPage, PreviewPage, read_history, read_log, read_previews
+from services.api.history import Histories, History, LogPage, PreviewPage, read_log, read_previews
 from services.api.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
 from services.api.problems import refusals
@@ -24,11 +25,13 @@ After = Annotated[int, Query(ge=0, le=MOST_ID, description="id of the last one t
 def build_observe_router(jobs: Jobs) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
+    histories = Histories()
 
     def events_of(job_id: str) -> EventLog:
         return jobs.repository.events_of(jobs.repository.get(job_id).id)
 
     @router.get("/jobs/{job_id}/logs", tags=["jobs"], dependencies=[needs("read")])
+    @in_json
     def logs(
         job_id: str,
         after: After = 0,
@@ -39,12 +42,13 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         """What the job's stages said, oldest first."""
         return read_log(events_of(job_id), after, limit, stage, attempt)
 
-    @router.get("/jobs/{job_id}/history", tags=["jobs"], dependencies=[needs("read")])
-    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> History:
+    @router.get("/jobs/{job_id}/history", response_model=History, tags=["jobs"], dependencies=[needs("read")])
+    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> Response:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
-        return read_history(events_of(job_id), points, channel)
+        return Response(histories.read(events_of(job_id), points, channel), media_type=JSON)
 
     @router.get("/jobs/{job_id}/previews", tags=["artifacts"], dependencies=[needs("read")])
+    @in_json
     def previews(job_id: str, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
         """Pictures that the fit has made so far, oldest first."""
         return read_previews(events_of(job_id), job_id, after, limit)
@@ -82,11 +86,13 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
 
     @router.get("/presets", tags=["options"], dependencies=[needs("read")])
+    @in_json
     def presets() -> list[Preset]:
         """Named sets of options."""
         return list_presets()
 
     @router.get("/presets/{name}", tags=["options"], dependencies=[needs("read")])
+    @in_json
     def preset(name: str) -> Preset:
         """One set of options, to merge into a job's own."""
         return find_preset(name)

@@ -28,11 +28,19 @@ from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.machine_class import machine_class
 from services.api.workers import Workers
-from services.core.errors import InputError, JobCancelledError, PlatformError, SchedulerLostError, WorkerLostError
+from services.core.errors import (
+    CorruptStoreError,
+    InputError,
+    JobCancelledError,
+    MissingStageError,
+    PlatformError,
+    SchedulerLostError,
+    WorkerLostError,
+)
 from services.core.masks import is_stale
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
-from services.core.store import is_published, open_stage, read_record, telling_disk_faults, withdraw, write_record
+from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -40,6 +48,8 @@ if TYPE_CHECKING:
 Listener = Callable[[JobEvent], None]
 
 JOB_FILE = "job.json"
+DAMAGE_FLAG = ".damaged"
+"""In a job's folder: a stage found another one's published files damaged, so the next run looks for what it must make anew."""
 POLL_S = 0.25
 KEEP_S = 10.0
 """How often workers that were given up are started again."""
@@ -111,6 +121,8 @@ def run_stages(
     root = root.resolve()
     with telling_disk_faults(root), _sole_owner(root):
         _claim_folder(root, spec)
+        if (root / DAMAGE_FLAG).exists():
+            _withdraw_damaged(root)
         if "prepare" in stages and is_stale(root):
             _withdraw_prepared(root)
         address = events or folder_events(root)
@@ -119,7 +131,7 @@ def run_stages(
             watch = _Watch(log, listener, log.newest_id())
             if todo:
                 tasks = [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo]
-                with nullcontext(cluster) if cluster is not None else Workers() as processes:
+                with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch)
             watch.tell()
 
@@ -274,6 +286,28 @@ def _withdraw_prepared(root: Path) -> None:
         (root / result).unlink(missing_ok=True)
     for folder in ("asset", "fit", "prepared"):
         withdraw(root, folder)
+
+
+@contextmanager
+def _remembering_damage(root: Path) -> Iterator[None]:
+    # Not withdrawn at once: whoever has a copy may restore it before a retry.
+    try:
+        yield
+    except CorruptStoreError:
+        (root / DAMAGE_FLAG).touch()
+        raise
+
+
+def _withdraw_damaged(root: Path) -> None:
+    """Remove published stages that are not as published, so that they are run again; those after them were made of the whole ones. Never a capture."""
+    for stage in ("prepared", "fit", "asset"):
+        try:
+            require_intact(root, stage)
+        except CorruptStoreError:
+            withdraw(root, stage)
+        except MissingStageError:
+            continue
+    (root / DAMAGE_FLAG).unlink()
 
 
 def _claim_folder(root: Path, spec: JobSpec) -> None:

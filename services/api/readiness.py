@@ -13,6 +13,7 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.admission import KEPT_FREE_BYTES
+from services.api.dask_tls import Certificates
 from services.api.database import writing
 from services.api.events import event_table
 from services.api.workers import require_scheduler
@@ -44,13 +45,20 @@ class Readiness:
         is_running: whether queued jobs are run.
         free_bytes: free space where jobs are stored.
         scheduler: address of the workers' scheduler; None where workers are the server's own.
+        certificates: what to show it; None without TLS.
     """
 
     def __init__(
-        self, engine: sql.Engine, jobs_folder: Path, is_running: Callable[[], bool], free_bytes: Callable[[], int], scheduler: str | None = None
+        self,
+        engine: sql.Engine,
+        jobs_folder: Path,
+        is_running: Callable[[], bool],
+        free_bytes: Callable[[], int],
+        scheduler: str | None = None,
+        certificates: Certificates | None = None,
     ) -> None:
         self._engine, self._jobs_folder = engine, jobs_folder
-        self._is_running, self._free_bytes, self._address = is_running, free_bytes, scheduler
+        self._is_running, self._free_bytes, self._address, self._certificates = is_running, free_bytes, scheduler, certificates
         self._file = _identity(engine)
         self._prober, self._store_prober = ThreadPoolExecutor(1, "readiness"), ThreadPoolExecutor(1, "store-readiness")
 
@@ -85,7 +93,7 @@ class Readiness:
         if not self._is_running():
             raise PlatformError("Jobs are not being run; restart the server and read its log.")
         if self._address is not None:
-            require_scheduler(self._address)
+            require_scheduler(self._address, self._certificates)
         return "Queued jobs are being run."
 
     def _store(self) -> str:

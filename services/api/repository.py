@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, Self
 
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import metadata, open_database, writing
-from services.api.events import EventAddress, EventLog, event_table, insert_event, lease_table
+from services.api.database import Query, metadata, open_database, writing
+from services.api.events import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
 from services.api.past_runs import PastRuns, past_run_table
@@ -25,6 +26,9 @@ from services.core.errors import DentineError, FencedError, JobStateError, Unkno
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
+
+KNOWN_SPECS = 1024
+"""Jobs whose options are kept as they were read."""
 
 job_table = sql.Table(
     "job",
@@ -95,7 +99,7 @@ class JobFilter(Record):
     def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
         """What a row of the job table must fulfil."""
         if self.states:
-            yield job_table.c.state.in_(self.states)
+            yield sql.or_(*(job_table.c.state == state.value for state in self.states))
         if self.kind is not None:
             yield job_table.c.kind == self.kind
         if self.created_after_s is not None:
@@ -133,6 +137,25 @@ class Lease:
     number: int
 
 
+_IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)
+_JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields))  # built once, as what follows: building a query takes longer than asking it
+_ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
+_WITH_KEY = _JOBS.where(job_table.c.key == sql.bindparam("of_key"))
+_NEWEST_EVENTS = Query(
+    sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > sql.bindparam("after")).group_by(event_table.c.job)
+)
+_UNFINISHED = Query(_JOBS.where(_IS_UNFINISHED).order_by(job_table.c.number))
+_BEGUN = Query(latest_of_stages(event_table.c.job.in_(sql.select(job_table.c.id).where(_IS_UNFINISHED))))
+_INSERT = job_table.insert()
+
+
+@lru_cache(64)
+def _listing(only: JobFilter, *, is_first: bool) -> Query:
+    """The newest ``most`` jobs, those with a number below ``before`` unless it is the first page."""
+    query = _JOBS.where(*only.conditions()).order_by(job_table.c.number.desc()).limit(sql.bindparam("most", type_=sql.Integer))
+    return Query(query if is_first else query.where(job_table.c.number < sql.bindparam("before")))
+
+
 class Repository:
     """The database of a server, brought to this version's tables when it is opened.
 
@@ -145,6 +168,7 @@ class Repository:
         self.engine = open_database(url)
         upgrade(self.engine)
         self.past_runs = PastRuns(self.engine)
+        self._spec_of = lru_cache(KNOWN_SPECS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
 
     def close(self) -> None:
         """Close every connection."""
@@ -158,14 +182,14 @@ class Repository:
         """
         options = spec.model_dump_json()
         with writing(self.engine) as connection:
-            if key is not None and (earlier := connection.execute(sql.select(job_table).where(job_table.c.key == key)).mappings().first()):
-                if earlier["spec"] != options:
+            if key is not None and (earlier := connection.execute(_WITH_KEY, {"of_key": key}).first()):
+                if earlier.spec != options:
                     raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
-                return Creation(_job(earlier), is_new=False)
+                return Creation(self._job(earlier), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
             row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
             row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture)}
-            connection.execute(job_table.insert().values(row))
+            connection.execute(_INSERT, row)
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
             return Creation(self._find(connection, job_id), is_new=True)
@@ -176,30 +200,26 @@ class Repository:
         Raises:
             UnknownJobError: there is none with this id.
         """
-        with self.engine.connect() as connection:
-            return self._find(connection, job_id)
+        return self._only(_ONE.rows(self.engine, of=job_id), job_id)
 
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
-        query = sql.select(job_table).order_by(job_table.c.number.desc()).limit(limit)
-        if only is not None:
-            query = query.where(*only.conditions())
-        if before is not None:
-            query = query.where(job_table.c.number < before)
-        with self.engine.connect() as connection:
-            return [_job(row) for row in connection.execute(query).mappings()]
+        values = {"most": limit} | ({} if before is None else {"before": before})
+        return self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values))
 
     def unfinished(self) -> list[Job]:
         """Jobs that run or wait, those that have waited longest first."""
-        query = sql.select(job_table).where(job_table.c.state.in_([JobState.RUNNING, JobState.QUEUED])).order_by(job_table.c.number)
-        with self.engine.connect() as connection:
-            return [_job(row) for row in connection.execute(query).mappings()]
+        return self._jobs(_UNFINISHED.rows(self.engine))
+
+    def begun(self) -> dict[str, Begun]:
+        """How far the stages are of each job that runs or waits and was begun."""
+        return begun(_BEGUN.rows(self.engine))
 
     def queued(self) -> list[Job]:
         """Jobs that wait, those that have waited longest first."""
-        query = sql.select(job_table).where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number)
+        query = _JOBS.where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number)
         with self.engine.connect() as connection:
-            return [_job(row) for row in connection.execute(query).mappings()]
+            return self._jobs(connection.execute(query))
 
     def lease(self, job_id: str, holder: str, seconds: float) -> Lease:
         """Start a queued job.
@@ -316,18 +336,34 @@ class Repository:
 
     def newest_events(self, after: int) -> dict[str, int]:
         """Jobs with events after an id, and the id of the last one of each."""
-        query = sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > after).group_by(event_table.c.job)
-        with self.engine.connect() as connection:
-            return {row.job: row.newest for row in connection.execute(query)}
+        return {str(job): int(newest) for job, newest in _NEWEST_EVENTS.rows(self.engine, after=after)}
 
     def _lease_number(self, connection: sql.Connection, job_id: str) -> int:
         return connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == job_id)) or 0
 
     def _find(self, connection: sql.Connection, job_id: str) -> Job:
-        row = connection.execute(sql.select(job_table).where(job_table.c.id == job_id)).mappings().first()
-        if row is None:
+        return self._only(connection.execute(_ONE.statement, {"of": job_id}).all(), job_id)
+
+    def _only(self, rows: Sequence[Sequence[Any]], job_id: str) -> Job:
+        if not rows:
             raise UnknownJobError(f"There is no job {job_id}; list the jobs to see their ids.")
-        return _job(row)
+        return self._job(rows[0])
+
+    def _jobs(self, rows: Iterable[Any]) -> list[Job]:
+        return [self._job(row) for row in rows]
+
+    def _job(self, row: Sequence[Any]) -> Job:
+        job_id, number, state, created_s, changed_s, spec, failure, request_id = row
+        return Job(
+            id=job_id,
+            number=number,
+            state=state,
+            created_s=created_s,
+            changed_s=changed_s,
+            spec=self._spec_of(spec),
+            failure=Failure.model_validate_json(failure) if failure else None,
+            request_id=request_id,
+        )
 
     def _apply(self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
         before = self._find(connection, job_id).state
@@ -340,9 +376,3 @@ class Repository:
         message = failure.message if failure else f"{transition.state.capitalize()}."
         insert_event(connection, job_id, 0, kind="state", message=message, data=data)
         return transition
-
-
-def _job(row: Any) -> Job:
-    fields = {name: row[name] for name in ("id", "number", "state", "created_s", "changed_s", "request_id")}
-    failure = Failure.model_validate_json(row["failure"]) if row["failure"] else None
-    return Job(**fields, spec=JobSpec.model_validate_json(row["spec"]), failure=failure)

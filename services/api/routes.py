@@ -6,9 +6,10 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
 
+from services.api.answers import in_json
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
 from services.api.database import MOST_ID
-from services.api.feed import EVENT_ANSWERS, EventFeed, EventStream
+from services.api.feed import EVENT_ANSWERS, EventFeed
 from services.api.guard import needs
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
@@ -58,6 +59,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return creation.job
 
     @router.get("/jobs", tags=["jobs"], dependencies=[needs("read")])
+    @in_json
     def page(
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None,
@@ -73,6 +75,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("read")])
+    @in_json
     def get(job_id: str) -> JobDetail:
         """One job with its stages."""
         return detail(jobs.repository.get(job_id))
@@ -93,16 +96,18 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return jobs.delete(job_id)
 
     @router.get("/deletions/{job_id}", tags=["jobs"], dependencies=[needs("read")])
+    @in_json
     def deletion(job_id: str) -> Deletion:
         """The receipt of a deleted job."""
         return jobs.repository.deletion(job_id)
 
     @router.get("/jobs/{job_id}/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
-    def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> EventStream:
+    async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> Response:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
-        return EventStream(feed.follow(jobs.repository.get(job_id).id, last_event_id or 0), headers={"X-Accel-Buffering": "no"})
+        return await feed.answer(job_id, last_event_id or 0)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
+    @in_json
     def artifacts(job_id: str) -> list[Artifact]:
         """List the job's files."""
         return list_artifacts(jobs.folder(jobs.repository.get(job_id).id))

@@ -14,12 +14,13 @@ from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app
 from services.api.logs import configure_logs
 from services.api.runner import RunJob
+from services.api.workers import Workers
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
 
 
-def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens.
+def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers | None = None) -> None:
+    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens. ``run`` and ``workers`` as in ``create_app``.
 
     Raises:
         PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
@@ -39,7 +40,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None) -> None:
         configure_logs(sys.stderr)
         proxies = settings.trusted_proxies
         config = uvicorn.Config(
-            create_app(settings, run),
+            create_app(settings, run, workers),
             log_config=None,
             log_level="warning",
             access_log=False,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 from pydantic import Field
 
-from services.api.events import EventLog, JobEvent
+from services.api.events import Begun, EventLog, JobEvent
 from services.api.forecast import LEAST, Observation, foresee
 from services.api.job_size import method_of, size_of
 from services.api.lifecycle import JobState
@@ -109,46 +110,59 @@ class TimeRanges:
     def of(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
         if job.state is JobState.RUNNING:
-            return self._own(job)
+            return self._own(job, self._repository.events_of(job.id).begun(), _Past(self._repository))
         if job.state is not JobState.QUEUED:
             return None
-        unfinished = self._repository.unfinished()
+        unfinished, stages, past = self._repository.unfinished(), self._repository.begun(), _Past(self._repository)
         ahead = [one for one in unfinished if one.state is JobState.RUNNING or one.number < job.number]
         if sum(one.state is JobState.RUNNING for one in ahead) > 1:
             return TimeRange(reason="Several servers run jobs at once, so the place in the queue does not tell a time.")
-        total = self._own(job)
+        total = self._own(job, stages.get(job.id, Begun()), past)
         for one in ahead:
             if total.low_s is None:
                 break
-            earlier = self._own(one)
+            earlier = self._own(one, stages.get(one.id, Begun()), past)
             if earlier.reason is not None:
                 return TimeRange(reason=f"Job {one.number} comes first: {earlier.reason}")
             total = total.after(earlier)
         return total
 
-    def _own(self, job: Job) -> TimeRange:
+    def _own(self, job: Job, stages: Begun, past: _Past) -> TimeRange:
         # Without the jobs before it.
         if (waits_for := self._waits_for(job)) is not None:
             return TimeRange(reason=waits_for)
-        log = self._repository.events_of(job.id)
-        position = _position(job, log)
+        position = _position(job, stages.latest, self._repository.events_of(job.id))
         if position is None:
             return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
         size = size_of(self._locate(job.spec))
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
-        machine = self._machine_of(log)
-        runs = [] if machine is None else self._repository.past_runs.alike(method_of(job.spec), machine)
-        return time_range(size.features, position, runs)
-
-    def _machine_of(self, log: EventLog) -> str | None:
-        started = log.read(kind="started")
-        return (started[-1].data.get("machine") if started else self._machine) or self._repository.past_runs.newest_machine()
+        machine = (stages.started.data.get("machine") if stages.started is not None else self._machine) or past.newest_machine
+        return time_range(size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine))
 
 
-def _position(job: Job, log: EventLog) -> Position | None:
+class _Past:
+    """Past runs while one range is told: jobs in a queue are mostly alike, and what is asked for one is known for the others."""
+
+    def __init__(self, repository: Repository) -> None:
+        self._runs = repository.past_runs
+        self._alike: dict[tuple[str, str], list[PastRun]] = {}
+
+    def alike(self, method: str, machine: str) -> list[PastRun]:
+        """The newest runs of jobs that did the same on the same class of machine, oldest first."""
+        if (method, machine) not in self._alike:
+            self._alike[method, machine] = self._runs.alike(method, machine)
+        return self._alike[method, machine]
+
+    @cached_property
+    def newest_machine(self) -> str | None:
+        """Class of the machine on which a job succeeded last."""
+        return self._runs.newest_machine()
+
+
+def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position | None:
     """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is left."""
-    latest, stages = log.latest(), stages_of(job.spec)
+    stages = stages_of(job.spec)
     if job.state is JobState.QUEUED:
         if not latest:
             return Position()

@@ -24,7 +24,7 @@ import sqlalchemy as sql
 from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
 from services.api.audit import Deed
-from services.api.database import metadata, writing
+from services.api.database import Query, metadata, writing
 from services.core.errors import InputError, UnauthenticatedError, UnknownTokenError
 from services.core.geometry import Record
 
@@ -33,6 +33,8 @@ LAST_USE_STEP_S = 3600.0
 DAY_S = 86400.0
 NAME = "[A-Za-z0-9][A-Za-z0-9.-]{0,63}"
 """Pattern of a token's name."""
+ID = "[0-9a-f]{12}"
+"""Pattern of a token's id, which no name has, so that either names one token."""
 
 token_table = sql.Table(
     "token",
@@ -46,6 +48,8 @@ token_table = sql.Table(
     sql.Column("revoked_s", sql.Float),
     sql.Column("last_used_s", sql.Float),
 )
+
+_ONE = Query(sql.select(token_table).where(token_table.c.id == sql.bindparam("of")))
 
 
 class Scope(StrEnum):
@@ -115,8 +119,9 @@ class Tokens:
         Raises:
             InputError: the name is malformed or belongs to a living token, or there is no scope.
         """
-        if not re.fullmatch(NAME, name) or name == LOCAL.name:
-            raise InputError(f"Token name {name!r} does not serve; use up to 64 letters, digits, points and hyphens, and not '{LOCAL.name}'.")
+        if not re.fullmatch(NAME, name) or name == LOCAL.name or re.fullmatch(ID, name):
+            what = f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like an id"
+            raise InputError(f"Token name {name!r} does not serve; {what}.")
         if not (wanted := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
         token_id, now = secrets.token_hex(6), self._clock()
@@ -138,7 +143,7 @@ class Tokens:
             return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
 
     def revoke(self, token_id: str, deed: Deed) -> Token:
-        """End a token now, by its id or by the name of a living one; ending it again changes nothing.
+        """End a token now, by its id, else by the name of one that is not revoked; ending it again changes nothing.
 
         Raises:
             UnknownTokenError: there is none.
@@ -146,7 +151,8 @@ class Tokens:
         now = self._clock()
         with writing(self._engine) as connection:
             is_meant = sql.or_(token_table.c.id == token_id, sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)))
-            found = connection.execute(sql.select(token_table).where(is_meant).order_by(token_table.c.created_s.desc())).mappings().first()
+            id_first = sql.case((token_table.c.id == token_id, 0), else_=1)
+            found = connection.execute(sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())).mappings().first()
             if found is None:
                 raise UnknownTokenError(f"There is no token {token_id}; list the tokens to see their ids.")
             row = dict(found)
@@ -182,8 +188,8 @@ class Tokens:
         return Token(**_fields(row))
 
     def _find(self, token_id: str) -> Any:
-        with self._engine.connect() as connection:
-            return connection.execute(sql.select(token_table).where(token_table.c.id == token_id)).mappings().first()
+        rows = _ONE.rows(self._engine, of=token_id)
+        return dict(zip(token_table.c.keys(), rows[0], strict=True)) if rows else None
 
     def _note_use(self, row: Any) -> None:
         now = self._clock()

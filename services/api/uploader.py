@@ -7,7 +7,8 @@ import random
 import re
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
 from pydantic import Field
@@ -15,6 +16,7 @@ from pydantic import Field
 from services.api.capture_paths import path_fault, require_paths
 from services.api.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
 from services.api.exchange import Ask, Flow, Pause, Work, answer, error_in
+from services.api.image_metadata import metadata_fault
 from services.core.errors import CaptureInputError, PlatformError, UploadError
 from services.core.geometry import Record
 
@@ -78,6 +80,7 @@ class Uploader:
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
             raise UploadError(f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no name.")
         files, left_out = yield Work(lambda: _scan(folder))
+        yield Work(lambda: _require_no_metadata(folder, files))
         self._total_bytes = sum((folder / path).stat().st_size for path in files)
         hashed = yield Work(lambda: tuple(self._hashed(folder, path) for path in files))
         manifest = UploadManifest(files=hashed, subject=subject)
@@ -198,6 +201,14 @@ def _scan(folder: Path) -> tuple[list[str], tuple[str, ...]]:
     files = [path for path, is_plain in inside if is_plain and path_fault(path) is None]
     require_paths(files)
     return files, tuple(path for path, is_plain in inside if not is_plain or path_fault(path) is not None)
+
+
+def _require_no_metadata(folder: Path, files: list[str]) -> None:
+    # The server refuses it too, but then it has left this machine.
+    for path in files:
+        with suppress(ValueError):  # what is no image the server says with all its faults
+            if (fault := metadata_fault(folder / path, path, PurePosixPath(path).suffix.lower())) is not None:
+                raise UploadError(fault)
 
 
 def _walk(root: Path, folder: Path) -> Iterator[tuple[str, bool]]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import socket
+import ssl
 import threading
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
+from services.api.dask_tls import Certificates, scheduler_address
 from services.core.errors import SchedulerLostError
 
 if TYPE_CHECKING:
@@ -18,10 +20,29 @@ if TYPE_CHECKING:
     from distributed import Client
 
 WORKER_CONFIG: Mapping[str, Any] = MappingProxyType(
-    {"distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]}  # Ctrl-C is the parent's to handle
+    {
+        "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],  # Ctrl-C is the parent's to handle
+        # What Dask samples and remembers for its developers, in this process too: the stack a hundred times a second, the loop's delay fifty times, a thousand
+        # messages and transitions with their tasks at each end of each connection.
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.tick.interval": "500ms",
+        "distributed.admin.low-level-log-length": 50,
+        "distributed.admin.log-length": 500,
+        "distributed.admin.system-monitor.log-length": 120,
+    }
 )
 CONNECT_S = 10.0
 PROBE_S = 1.0
+LOOK_S = 3.0
+"""How long the scheduler may take to tell of its workers."""
+
+
+class Census(NamedTuple):
+    """What a scheduler tells of its workers, each by its address."""
+
+    workers: Mapping[str, Mapping[str, Any]]
+    processing: Mapping[str, Sequence[Any]]
+    """Keys of the tasks that each has been given."""
 
 
 class Workers:
@@ -30,10 +51,11 @@ class Workers:
     Args:
         scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. Any of those may reach the dome, one
             stage at a time.
+        certificates: what to show that scheduler; None for connections without TLS.
     """
 
-    def __init__(self, scheduler: str | None = None) -> None:
-        self._scheduler = scheduler
+    def __init__(self, scheduler: str | None = None, certificates: Certificates | None = None) -> None:
+        self._scheduler, self._certificates = scheduler and scheduler_address(scheduler, certificates), certificates
         self._lock = threading.Lock()
         self._cluster: Any = None
         self._client: Client | None = None
@@ -65,6 +87,24 @@ class Workers:
             if self._cluster is not None:
                 self._cluster.scale(count)
 
+    def look(self) -> Census | None:
+        """Who works on what by now; None where workers of this process's own have not been started yet, as the first job does that.
+
+        Raises:
+            SchedulerLostError: the scheduler does not answer.
+        """
+        client = self._client  # without the lock, which whoever starts workers holds for seconds
+        if client is None or client.status != "running":
+            if self._scheduler is None:
+                return None
+            require_scheduler(self._scheduler, self._certificates)
+            client = self.connect(0)
+        try:
+            census: Census = client.sync(_census, client, callback_timeout=LOOK_S)
+        except (OSError, TimeoutError) as problem:
+            raise SchedulerLostError(f"The scheduler {self._scheduler or 'of this server'} does not answer; jobs wait for it.") from problem
+        return census
+
     def close(self) -> None:
         """End the processes, or leave those that run elsewhere."""
         with self._lock:
@@ -74,15 +114,16 @@ class Workers:
         import dask
         from distributed import Client, LocalCluster
 
+        dask.config.set(WORKER_CONFIG)  # for good, as connections that are made later read it too
         if self._scheduler is not None:
             try:
-                return Client(self._scheduler, timeout=CONNECT_S)
+                security = self._certificates.security() if self._certificates else None
+                return Client(self._scheduler, timeout=CONNECT_S, security=security)
             except OSError as problem:
                 raise SchedulerLostError(f"The scheduler {self._scheduler} does not answer; start it, the job waits.") from problem
-        with dask.config.set(WORKER_CONFIG):
-            self._cluster = LocalCluster(
-                n_workers=count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
-            )
+        self._cluster = LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
+        )
         return Client(self._cluster)
 
     def _close(self) -> None:
@@ -93,19 +134,31 @@ class Workers:
         self._client = self._cluster = None
 
 
-def require_scheduler(address: str) -> None:
-    """Look whether a scheduler answers: it greets whoever connects.
+async def _census(client: Client) -> Census:
+    identity = await client.scheduler.identity(n_workers=-1)
+    return Census(identity["workers"], await client.scheduler.processing(workers=None))
+
+
+def require_scheduler(address: str, certificates: Certificates | None = None) -> None:
+    """Look whether a scheduler answers: it greets whoever connects, and by TLS only whom it trusts.
 
     Args:
         address: ``tcp://HOST:PORT``
+        certificates: what to show it; None without TLS.
 
     Raises:
         SchedulerLostError: nobody answers there.
     """
     parts = urlsplit(address)
     try:
-        with socket.create_connection((parts.hostname, parts.port), PROBE_S) as connection:
-            is_greeted = parts.scheme != "tcp" or connection.recv(1) != b""  # TLS waits for the client's word
+        with (
+            socket.create_connection((parts.hostname, parts.port), PROBE_S) as plain,
+            certificates.context().wrap_socket(plain) if certificates else nullcontext(plain) as connection,
+        ):
+            is_greeted = connection.recv(1) != b""
+    except ssl.SSLError as problem:
+        what = f"The scheduler {address} and this server do not trust each other ({problem.reason})"
+        raise SchedulerLostError(f"{what}; give both certificates of one authority, jobs wait for it.") from problem
     except (OSError, ValueError) as problem:
         raise SchedulerLostError(f"The scheduler {address} does not answer; start it, jobs wait for it.") from problem
     if not is_greeted:

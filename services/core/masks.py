@@ -15,8 +15,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import quote, unquote
 
-from services.core.errors import CaptureInputError
-from services.core.store import MANIFEST, is_published
+from services.core.errors import CaptureInputError, CorruptStoreError
+from services.core.store import is_published, published_record
 
 FOLDER = "masks"
 ALL_LIGHTS = "all"
@@ -50,8 +50,11 @@ def digest_of(masks: Mapping[tuple[str, str], bytes]) -> str:
 
 
 def is_stale(root: Path) -> bool:
-    """Whether the job's published preparation was made with other masks than there are now."""
+    """Whether the job's published preparation was made with other masks than there are now; not where it does not say, as it is damaged."""
     if not is_published(root, "prepared"):
         return False
-    record = json.loads((root / "prepared" / MANIFEST).read_text())["record"]
+    try:
+        record = published_record(root, "prepared")
+    except CorruptStoreError:
+        return False
     return bool(record.get("masks", "") != digest_of(read_masks(root)))

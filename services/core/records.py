@@ -195,6 +195,8 @@ class ToothReport(Record):
     parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
     fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
     held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
+    shape: tuple[float, ...] = Field(default=(), description="dentin's blend weights, all channels alike; empty where the dentin is known or absent")
+    enamel_thickness: Estimate | None = Field(default=None, description="mean over what the first camera sees of the tooth; null if nothing, or without dentin")
 
 
 class Correlation(Record):

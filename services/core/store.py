@@ -139,22 +139,60 @@ def open_stage(root: Path, stage: str, kind: type[R], *, verify: bool = True) ->
     Raises:
         MissingStageError: nothing published. CorruptStoreError: names the first file that is not as published.
     """
-    folder = Path(root) / stage
+    folder, manifest = Path(root) / stage, _manifest(Path(root), stage)
+    if verify:
+        _require_intact(folder, stage, manifest["files"])
+    try:
+        return folder, kind.model_validate(manifest["record"])
+    except ValidationError as problem:
+        what = f"{folder / MANIFEST} of published stage {stage} holds no {kind.__name__} of this version"
+        raise CorruptStoreError(f"{what}; {_remedy(stage)}.") from problem
+
+
+def require_intact(root: Path, stage: str) -> None:
+    """Compare every file of a published stage with what was published.
+
+    Raises:
+        MissingStageError: nothing published. CorruptStoreError: names the first file that is not as published.
+    """
+    _require_intact(Path(root) / stage, stage, _manifest(Path(root), stage)["files"])
+
+
+def published_record(root: Path, stage: str) -> dict[str, Any]:
+    """What a published stage says of itself, as it is stored.
+
+    Raises:
+        MissingStageError: nothing published. CorruptStoreError: it cannot be read.
+    """
+    return dict(_manifest(Path(root), stage)["record"])
+
+
+def _manifest(root: Path, stage: str) -> dict[str, Any]:
     if not is_published(root, stage):
         raise MissingStageError(f"Stage {stage} has no published result in {root}; run the job from that stage.")
-    manifest = json.loads((folder / MANIFEST).read_text())
-    if verify:
-        for name, expected in manifest["files"].items():
-            path = folder / name
-            if not path.is_file():
-                raise CorruptStoreError(f"{path} is missing from published stage {stage}; restore it or run the stage again.")
-            if path.stat().st_size != expected["bytes"]:
-                raise CorruptStoreError(
-                    f"{path} has {path.stat().st_size} bytes instead of {expected['bytes']} (truncated?); restore it or run stage {stage} again."
-                )
-            if _sha256(path) != expected["sha256"]:
-                raise CorruptStoreError(f"{path} differs from its published checksum; restore it or run stage {stage} again.")
-    return folder, kind.model_validate(manifest["record"])
+    path = root / stage / MANIFEST
+    try:
+        manifest = json.loads(path.read_bytes())
+        return {"files": dict(manifest["files"]), "record": manifest["record"]}
+    except (ValueError, KeyError, TypeError) as problem:
+        raise CorruptStoreError(f"{path}, the list of what stage {stage} published, cannot be read; {_remedy(stage)}.") from problem
+
+
+def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
+    for name, expected in files.items():
+        path = folder / name
+        if not path.is_file():
+            raise CorruptStoreError(f"{path} is missing from published stage {stage}; {_remedy(stage)}.")
+        if path.stat().st_size != expected["bytes"]:
+            what = f"{path} of published stage {stage} has {path.stat().st_size} bytes instead of {expected['bytes']} (truncated?)"
+            raise CorruptStoreError(f"{what}; {_remedy(stage)}.")
+        if _sha256(path) != expected["sha256"]:
+            raise CorruptStoreError(f"{path} of published stage {stage} differs from its published checksum; {_remedy(stage)}.")
+
+
+def _remedy(stage: str) -> str:
+    # What cameras saw cannot be computed again.
+    return "restore it or capture again" if stage == "capture" else f"restore it, or retry the job, which then makes {stage} anew"
 
 
 def create_array(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from services.core.errors import CorruptStoreError
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
+from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
@@ -87,6 +88,18 @@ class Block:
     def view_under(self, lights: NDArray[np.bool_]) -> View:
         """The view under some of the lights, (L,); under all where that leaves none."""
         return replace(self.view, lights=tuple(np.flatnonzero(lights).tolist())) if lights.any() and not lights.all() else self.view
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """What every task on a block is told."""
+
+    block: StoredFile
+    index: int
+    recipe: StoredFile
+    step: str
+    tissue: Tissue | Mouth
+    samples: int
 
 
 def pixels_per_block(lights: int) -> int:

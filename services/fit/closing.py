@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import read_block
+from services.fit.blocks import BlockTask, read_block
+from services.fit.derivatives import Differentiation
 from services.fit.engine_host import EngineHost
 from services.fit.optics.domain import similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
-from services.fit.passes import BlockTask, Differentiation, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
@@ -72,10 +73,11 @@ def closing_task(
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
     few = max(task.samples // SHIFT_SAMPLES, 1)
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
+    exact = slopes.render(host, task, view, seeds, block.parts)
     sums = closing_sums(
         whiten,
         jacobian.derivatives(host),
-        (slopes.render(host, task, view, seeds[0]), slopes.render(host, task, view, seeds[1])),
+        (exact[0], exact[1]),
         borrowed,
         (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
         np.array(moved).reshape(len(ends), 2, renders[0].size),

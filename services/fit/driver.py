@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.fit.alignment import offsets_told
+from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.anatomy.thickness import ThicknessMap, thickness_map
 from services.fit.attempt import Attempt, judge, worst_error
@@ -125,7 +127,7 @@ class FitDriver:
         )
 
     def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:
-        parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin")
+        parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")
         fitted_shape = shape_known if any(name.startswith("shape.") for name in shape_known.domain.parameters) else None
         return estimates(fit.tissue, parts, known, fitted_shape)
 
@@ -133,24 +135,38 @@ class FitDriver:
 def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
     """The dentin surface the job asks for: the given one, a blend shape made from the enamel, or none.
 
-    The blend modes' axes follow from the mesh and from where the cameras stand.
+    The blend modes' axes follow from the mesh, from its FDI number, and where these leave them open from where the cameras stand.
     """
     if spec.dentin == "known":
         assert tooth.dentin is not None
         return DentinShape.known(tooth.dentin)
     if spec.dentin == "fit":
-        from services.fit.anatomy.blend import dentin_blend_shape
-        from services.fit.anatomy.dimensions import upper_tooth
-        from services.fit.anatomy.frame import estimate_frame
+        from services.fit.anatomy.jaw_frames import tooth_frame
 
-        centres_mm = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
-        return dentin_blend_shape(tooth.outer, estimate_frame(tooth.outer, centres_mm), crown=upper_tooth(tooth.fdi % 10))
+        return blend_shape(tooth, tooth_frame(tooth, viewpoints_mm(cameras)))
     return None
 
 
-def shape_covariance(known: Uncertainty) -> tuple[tuple[float, ...], ...]:
-    """Covariance of the blend weights; empty where they were not fitted."""
-    own = [k for k, coordinate in enumerate(known.domain.coordinates) if coordinate.kind == "shape"]
+def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
+    """The dentin's blend shape of a tooth with its canonical frame.
+
+    Raises:
+        MeshError: the mesh allows none.
+    """
+    from services.fit.anatomy.blend import dentin_blend_shape
+    from services.fit.anatomy.dimensions import upper_tooth
+
+    return dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
+
+
+def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
+    """The cameras' centres (N, 3)."""
+    return np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
+
+
+def shape_covariance(known: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:
+    """Covariance of the blend weights, of a jaw those of one tooth; empty where they were not fitted."""
+    own = [k for k, coordinate in enumerate(known.domain.coordinates) if coordinate.kind == "shape" and coordinate.tooth == tooth]
     return tuple(tuple(row) for row in known.covariance[np.ix_(own, own)].tolist())
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from services.core.errors import SettingsError
-from services.core.geometry import Camera, Mesh, Tooth
+from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
+from services.fit.anatomy.frame import ToothFrame
 from services.fit.attempt import Attempt
 from services.fit.blocks import GUMS
-from services.fit.driver import dentin_shape
+from services.fit.driver import blend_shape, viewpoints_mm
 from services.fit.executors import Executor
 from services.fit.jaw_report import JawFit, report
 from services.fit.jaw_schedule import JawSchedule
@@ -64,10 +65,9 @@ class JawDriver:
         if spec.lobes != 1:
             raise SettingsError("A jaw is fitted with one lobe per medium; set lobes to 1, or fit its teeth one by one with kind 'tooth'.")
         observations = read_observations(attempt.context.root, spec)
-        observations = replace(observations, teeth=tuple(fixed_dentin(tooth, observations.manifest.cameras, spec) for tooth in observations.teeth))
-        dentins = known_dentins(observations.teeth)
-        for tooth in observations.teeth if spec.dentin != "none" else ():
-            if tooth.dentin is None:
+        dentins = jaw_dentins(observations.teeth, observations.manifest.cameras, spec)
+        for tooth, dentin in zip(observations.teeth, dentins, strict=True) if spec.dentin != "none" else ():
+            if dentin is None:
                 attempt.log(f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh.")
         channels = []
         for name in spec.channels or observations.manifest.channels:
@@ -75,26 +75,38 @@ class JawDriver:
             channels.append(Channel(name, views, write_channel(attempt.inputs, channel_scene(observations, name, dentins, spec), name, views)))
         journal = attempt.journal(channel.files for channel in channels)
         begun, _ = journal.once("begun", lambda: started_s)
+
+        # The channel with the most signal goes first; where blend weights are fitted, the others take them from it.
+        order = sorted(channels, key=lambda channel: -channel.files.quality)
+        found: dict[str, JawFit] = {}
         with attempt.workers() as run_on:
-            fits = {c.name: _ChannelRun(attempt, observations, dentins, c, journal, run_on, (n, len(channels))).fit() for n, c in enumerate(channels)}
+            for number, channel in enumerate(order):
+                shapes = [tooth.shape for tooth in found[order[0].name].fit.tissue.teeth] if found else None
+                run = _ChannelRun(attempt, observations, dentins, channel, journal, run_on, (number, len(order)), shapes)
+                found[channel.name] = run.fit()
+        fits = {channel.name: found[channel.name] for channel in channels}
         attempt.write_records(journal, observations, {c: jaw.fit.evaluation for c, jaw in fits.items()}, {c: jaw.views for c, jaw in fits.items()})
-        return report(fits, observations, time.time() - begun)
+        return report(fits, order[0].name, dentins, observations, time.time() - begun)
 
 
-def fixed_dentin(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> Tooth:
-    """A jaw's tooth with its dentin: the given one if any, none, or where it would be fitted the blend shape that a single tooth's fit starts from.
+def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSpec) -> list[DentinShape | None]:
+    """The dentin of a jaw's teeth that the job asks for: the given ones, blend shapes made from the enamel, or none.
 
-    A tooth whose mesh allows no such shape is homogeneous.
+    A tooth without one, or whose mesh allows no such shape, is homogeneous.
     """
     if spec.dentin == "known":
-        return tooth
-    try:
-        shape = dentin_shape(tooth, cameras, spec)
-    except TOOTH_FAULTS:
-        shape = None
-    if shape is None:
-        return replace(tooth, dentin=None)
-    return replace(tooth, dentin=Mesh(shape.vertices_mm((SHAPE[0],) * len(shape.modes_mm)), shape.base.faces))
+        return known_dentins(teeth)
+    if spec.dentin == "none":
+        return [None for _ in teeth]
+    from services.fit.anatomy.jaw_frames import jaw_frames
+
+    def blended(tooth: Tooth, frame: ToothFrame) -> DentinShape | None:
+        try:
+            return blend_shape(tooth, frame)
+        except TOOTH_FAULTS:
+            return None
+
+    return [blended(tooth, frame) for tooth, frame in zip(teeth, jaw_frames(teeth, viewpoints_mm(cameras)), strict=True)]
 
 
 def known_dentins(teeth: Sequence[Tooth]) -> list[DentinShape | None]:
@@ -114,6 +126,8 @@ class _ChannelRun:
     run_on: Executor
     place: tuple[int, int]
     """Number of this channel, and of how many."""
+    shapes: Sequence[tuple[float, ...]] | None = None
+    """Known blend weights of each tooth; None where they are to be fitted."""
     steps: int = 0
 
     def fit(self) -> JawFit:
@@ -125,6 +139,8 @@ class _ChannelRun:
             if starts[-1].sentence:
                 self.attempt.log(f"{self.channel.name}: {starts[-1].sentence}")
         mouth = start_mouth(starts, self._gums(), has_cavity=observations.cavity is not None)
+        shapes = [() if start.drops_dentin else self._shape(k) for k, start in enumerate(starts)]
+        mouth = replace(mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True)))
 
         # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so the jaw's does not hold it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
@@ -145,12 +161,20 @@ class _ChannelRun:
             start=mouth,
             teeth=starts,
             dentin=tuple(dentin is not None for dentin in dentins),
+            fits_shape=self.shapes is None,
         )
         return JawFit(tuple(starts), tuple(schedule.dentin), schedule.run(), views)
 
     def _alone(self, k: int, views: tuple[ViewStack, ...]) -> Tissue:
         tooth = self.observations.teeth[k]
-        return self._start(f"{tooth.fdi}", replace(self.observations, teeth=(tooth,), gums=None, cavity=None), self.dentins[k], views, tooth.fdi)
+        alone = replace(self.observations, teeth=(tooth,), gums=None, cavity=None)
+        return self._start(f"{tooth.fdi}", alone, self.dentins[k], self._shape(k), views, tooth.fdi)
+
+    def _shape(self, k: int) -> tuple[float, ...]:
+        # A tooth's blend weights at the start.
+        # Known ones are none where another channel had to drop the dentin.
+        dentin, known = self.dentins[k], () if self.shapes is None else self.shapes[k]
+        return known or (() if dentin is None else (SHAPE[0],) * len(dentin.modes_mm))
 
     def _gums(self) -> Medium | None:
         # Gums alone are fitted like a tooth without dentin.
@@ -162,12 +186,14 @@ class _ChannelRun:
             return GUMS_START
         try:
             alone = replace(self.observations, teeth=(Tooth(0, gums),), gums=None, cavity=None)
-            return self._start("gums", alone, None, views, None).enamel
+            return self._start("gums", alone, None, (), views, None).enamel
         except TOOTH_FAULTS as problem:
             self.attempt.log(f"{self.channel.name}: gums start from the literature: {problem.message}")
             return GUMS_START
 
-    def _start(self, name: str, alone: Observations, dentin: DentinShape | None, views: tuple[ViewStack, ...], fdi: int | None) -> Tissue:
+    def _start(
+        self, name: str, alone: Observations, dentin: DentinShape | None, shape: tuple[float, ...], views: tuple[ViewStack, ...], fdi: int | None
+    ) -> Tissue:
         # The first stages of a single tooth's fit, on a scene of its own.
         channel, spec = self.channel.name, self.attempt.spec
         require_signal(views, f"Tooth {name}" if fdi is not None else "The picture of the gums")
@@ -181,6 +207,7 @@ class _ChannelRun:
             journal=self.journal,
             has_dentin=dentin is not None,
             modes=0,
+            shape=shape,
             report=self.attempt.teller(self.observations, self.channel.views, self.journal, self._done),
             pause=self.attempt.context.raise_if_cancelled,
             steps=self.steps,
@@ -192,5 +219,5 @@ class _ChannelRun:
             self.steps = schedule.steps
 
     def _done(self, step: int) -> float:
-        expected = START_STEPS * len(self.observations.teeth) + 2 * self.attempt.spec.max_steps
+        expected = START_STEPS * len(self.observations.teeth) + (3 if self.attempt.spec.dentin == "fit" else 2) * self.attempt.spec.max_steps
         return (self.place[0] + min(step / expected, 0.99)) / self.place[1]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from services.core.records import Estimate, FitReport, ToothReport
 from services.fit.alignment import offsets_told
+from services.fit.anatomy.thickness import thickness_map
 from services.fit.attempt import UNEXPLAINED, judge, worst_error
+from services.fit.driver import shape_covariance
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.identifiability import told
 from services.fit.jaw_starts import ToothStart
@@ -15,6 +19,7 @@ from services.fit.observations import Observations, ViewStack
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
 from services.fit.stages import ChannelFit
+from services.fit.transport.recipe import DentinShape
 
 STATES = ("fitted", "tied", "failed")
 
@@ -31,13 +36,18 @@ class JawFit:
     """What was fitted and judged."""
 
 
-def report(fits: Mapping[str, JawFit], observations: Observations, seconds: float) -> FitReport:
-    """The report of all channels."""
-    first = next(iter(fits.values()))
+def report(fits: Mapping[str, JawFit], shaped_by: str, dentins: Sequence[DentinShape | None], observations: Observations, seconds: float) -> FitReport:
+    """The report of all channels.
+
+    Args:
+        shaped_by: the channel in which blend weights were fitted, if any were.
+        dentins: of each tooth.
+    """
+    first = fits[shaped_by]
     converged, advice = judge({c: jaw.fit for c, jaw in fits.items()})
     misplaced = offsets_told(_evaluations(fits), {c: worst_error(jaw.fit) for c, jaw in fits.items()}, observations, _views(fits), "the jaw's meshes")
     advice = misplaced + advice
-    teeth = {str(start.fdi): _tooth(k, fits, None if misplaced else observations) for k, start in enumerate(first.starts)}
+    teeth = {str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced) for k, start in enumerate(first.starts)}
     unexplained = [fdi for fdi, tooth in teeth.items() if tooth.state == "fitted" and tooth.sentence]
     advice += [tooth.sentence for tooth in teeth.values() if tooth.state != "tied" and tooth.sentence]
     return FitReport(
@@ -64,18 +74,21 @@ def _views(fits: Mapping[str, JawFit]) -> dict[str, tuple[ViewStack, ...]]:
     return {channel: jaw.views for channel, jaw in fits.items()}
 
 
-def _tooth(k: int, fits: Mapping[str, JawFit], observations: Observations | None) -> ToothReport:
-    # The worst state of all channels, and what it says; whether it lies elsewhere is asked of the observations, if at all.
+def _tooth(k: int, fits: Mapping[str, JawFit], first: JawFit, dentin: DentinShape | None, observations: Observations, *, is_placed: bool) -> ToothReport:
+    # The worst state of all channels, and what it says; whether it lies elsewhere is asked only where the jaw as a whole lies where it should.
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)
     sentence = start.sentence
     if start.state == "fitted" and worst > UNEXPLAINED:
         sentence = f"Tooth {start.fdi} is still {100 * worst:.0f} % off in its images; check its mesh and its masks."
-        if observations is not None:
+        if is_placed:
             errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}
             sentence = " ".join([*offsets_told(_evaluations(fits), errors, observations, _views(fits), f"the mesh of tooth {start.fdi}", k), sentence])
-    tables = {c: _table(k, jaw) for c, jaw in fits.items()}
+    shape, covariance = first.fit.tissue.teeth[k].shape, shape_covariance(first.fit.known, k)
+    seen = shape, np.array(covariance) if covariance else None, observations.manifest.cameras[0]
+    thickness = None if dentin is None or not first.dentin[k] else thickness_map(observations.teeth[k].outer, dentin, *seen)
+    tables = {c: _table(k, jaw, first) for c, jaw in fits.items()}
     return ToothReport(
         state=start.state,
         sentence=sentence,
@@ -84,12 +97,15 @@ def _tooth(k: int, fits: Mapping[str, JawFit], observations: Observations | None
         parameters=tables,
         fit_error=fit_error,
         held_out_error=held_out_error,
+        shape=shape,
+        enamel_thickness=None if thickness is None else thickness.mean,
     )
 
 
-def _table(k: int, jaw: JawFit) -> dict[str, Estimate]:
-    parts = (f"{k}.enamel", f"{k}.dentin") if jaw.dentin[k] else (f"{k}.enamel",)
-    return {name.removeprefix(f"{k}."): estimate for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.known).items()}
+def _table(k: int, jaw: JawFit, first: JawFit) -> dict[str, Estimate]:
+    parts = (f"{k}.enamel", f"{k}.dentin", f"{k}.shape") if jaw.dentin[k] else (f"{k}.enamel",)
+    shaped = first.fit.known if shape_covariance(first.fit.known, k) else None
+    return {name.removeprefix(f"{k}."): estimate for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.known, shaped).items()}
 
 
 def _errors(evaluations: Mapping[str, Evaluation], k: int, kind: int) -> dict[str, float]:

@@ -6,6 +6,8 @@ stage      free                                                            media
 start.k    sigma, alpha of enamel and dentin of each tooth and of gums,    similar  two steps each; for each tooth
            the wall's reflectance, from several ratios of the media                 the least loss of its own
 joint      the same                                                        similar  converged, or max_steps
+shape      the same, the mean cosine of all enamel, and each tooth's       exact    converged, or max_steps; only where
+           blend weights                                                            blend weights are fitted
 exact      the same                                                        exact    converged, or max_steps
 =========  ==============================================================  =======  ===========================
 
@@ -26,10 +28,11 @@ import numpy as np
 
 from services.fit.closing import Held
 from services.fit.jaw_starts import ToothStart, typical
+from services.fit.neighbours import Neighbours
 from services.fit.optics.domain import Coordinate, Domain, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.optics.priors import WEAK, priors_of
-from services.fit.passes import Near, StackProblem
+from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
+from services.fit.passes import StackProblem
 from services.fit.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 from services.fit.stages import ChannelFit, Stages
 
@@ -49,6 +52,8 @@ class JawSchedule(Stages[Mouth]):
     teeth: Sequence[ToothStart]
     dentin: Sequence[bool]
     """Which teeth have dentin."""
+    fits_shape: bool = True
+    """Whether blend weights, where there are any, are fitted."""
 
     def run(self) -> ChannelFit[Mouth]:
         """Fit the channel."""
@@ -56,15 +61,17 @@ class JawSchedule(Stages[Mouth]):
         options = self.in_similar_media(self.options(self.files.coarse))
         mouth = self._best_starts() if any(self.dentin) else self.start
         mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
+        if self._shaped:
+            mouth, solution = self._iterate(self._problem(self._retied(mouth), "shape", None), self.options(self.files.coarse), solution.samples)
         options = self.at_full_resolution()
         exact = self._problem(self._retied(mouth), "exact", None)
         mouth, solution = self._iterate(exact, options, self.fewer(min(solution.samples, EXACT_SAMPLES * samples)))
         return self._finish(replace(exact, base=mouth, stage="final"), solution)
 
     def _problem(self, mouth: Mouth, stage: str, image_g: float | None) -> StackProblem[Mouth]:
-        domain = self._domain(mouth)
-        near = nearby([start.fdi for start in self.teeth], domain)
-        return StackProblem(self.passes, domain, mouth, stage, jacobian_g=SIMILAR_G, image_g=image_g, near=near)
+        domain = self._domain(mouth) if image_g is not None else self._exact_domain(mouth)
+        neighbours = Neighbours.of([start.fdi for start in self.teeth])
+        return StackProblem(self.passes, domain, mouth, stage, jacobian_g=SIMILAR_G, image_g=image_g, neighbours=neighbours)
 
     def _best_starts(self) -> Mouth:
         # Every ratio for all teeth at once; their losses are compared tooth by tooth, with the same seeds.
@@ -95,14 +102,16 @@ class JawSchedule(Stages[Mouth]):
         """See Stages."""
         return len(self.teeth)
 
-    def _held(self, domain: Domain) -> Held:  # noqa: ARG002 - a jaw's coordinates hold every mean cosine
+    def _held(self, domain: Domain) -> Held:
         # Media of one tissue are wrong alike: 29 of them, each on its own, would cost more than the fit.
         kinds = {"enamel": WEAK["enamel.g1"], "dentin": WEAK["dentin.g1"], "gums": WEAK["enamel.g1"]}
-        alike = {tuple(part for part in self.media if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()}
+        held = [part for part in self.media if part not in domain.cosines]
+        alike = {tuple(part for part in held if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()}
         return {parts: prior for parts, prior in alike.items() if parts}
 
     def _others(self, tissue: Mouth) -> dict[str, float]:
-        return {} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance}
+        shapes = {f"{k}.shape.{mode}": c for k, tooth in enumerate(tissue.teeth) for mode, c in enumerate(tooth.shape)}
+        return shapes | ({} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance})
 
     def _domain(self, mouth: Mouth) -> Domain:
         common = Mouth((self._typical(mouth),))
@@ -123,10 +132,23 @@ class JawSchedule(Stages[Mouth]):
             coordinates.append(Coordinate(("cavity.reflectance",), to_dual("reflectance", self.start.reflectance), WALL_SD))
         return Domain(tuple(coordinates))
 
+    def _exact_domain(self, mouth: Mouth) -> Domain:
+        # Enamel of one mouth has one mean cosine, which images of similar media would not show; tied teeth keep the blend weights of the start.
+        enamel = tuple(f"{k}.enamel.cosine" for k in range(len(mouth.teeth)))
+        weights = [f"{k}.shape.{mode}" for k in self._shaped for mode in range(len(mouth.teeth[k].shape))]
+        return Domain((*self._domain(mouth).coordinates, Coordinate(enamel, *COSINE), *(Coordinate((name,), *SHAPE) for name in weights)))
+
+    @property
+    def _shaped(self) -> list[int]:
+        # Teeth whose blend weights are fitted.
+        return [k for k, tooth in enumerate(self.start.teeth) if tooth.shape and self.fits_shape and self.teeth[k].state == "fitted"]
+
     def _retied(self, mouth: Mouth) -> Mouth:
         # Teeth that are tied start the next stage where the others now are.
         common = self._typical(mouth)
-        return replace(mouth, teeth=tuple(tooth if start.state == "fitted" else common for tooth, start in zip(mouth.teeth, self.teeth, strict=True)))
+        tied = (replace(common, shape=tooth.shape) for tooth in mouth.teeth)
+        chosen = (tooth if start.state == "fitted" else other for tooth, start, other in zip(mouth.teeth, self.teeth, tied, strict=True))
+        return replace(mouth, teeth=tuple(chosen))
 
     def _typical(self, mouth: Mouth) -> Tissue:
         return typical(self.teeth, mouth.teeth)
@@ -139,20 +161,3 @@ def _layered(ratio: tuple[float, float], tooth: Tissue, has_dentin: bool) -> Tis
         if has_dentin
         else tooth
     )
-
-
-def nearby(fdi: Sequence[int], domain: Domain) -> Near:
-    """For each tooth the coordinates of itself, its two neighbours along the arch, gums and wall."""
-    order = sorted(range(len(fdi)), key=lambda k: arch_place(fdi[k]))
-    near = []
-    for k in range(len(fdi)):
-        place = order.index(k)
-        teeth = {str(other) for other in order[max(place - 1, 0) : place + 2]} | {"gums", "cavity"}
-        near.append(tuple(n for n, name in enumerate(domain.parameters) if name.partition(".")[0] in teeth))
-    return tuple(near)
-
-
-def arch_place(fdi: int) -> int:
-    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4), positive for the left (2, 3)."""
-    quadrant, place = divmod(fdi, 10)
-    return -place if quadrant in {1, 4} else place

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera
 from services.core.records import Estimate
-from services.fit.blocks import Block, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
 from services.fit.engine_host import EngineHost
 from services.fit.identifiability import QUANTITIES, in_words
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import BlockTask, JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_with
 from services.fit.transport.recipe import SceneRecipe, View

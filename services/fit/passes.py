@@ -16,32 +16,28 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import Block, StoredFile, read_block
+from services.fit.blocks import Block, BlockTask, StoredFile, read_block
+from services.fit.derivatives import Differentiation, differentiation, slopes
 from services.fit.engine_host import EngineHost
 from services.fit.executors import Executor
-from services.fit.optics.domain import Domain, kind_of, natural_derivative, similar_tissue, to_natural
+from services.fit.neighbours import Neighbours
+from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.seeds import Seeds
 from services.fit.solve.adam import Gradient
 from services.fit.solve.normal_equations import LossChange, NormalEquations, Region, loss_change, normal_equations
-from services.fit.transport.recipe import JacobianEstimate, StackEstimate, View
+from services.fit.transport.recipe import StackEstimate
 
 Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]
 """For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
-
-WITHOUT_SCORES = frozenset({"shape", "cosine"})
-"""Kinds of coordinates whose derivatives are always differences."""
-SCORES_SHARE = 4
-"""Scores that are left where others became differences are quiet: they get so many times fewer paths."""
 
 
 @dataclass(frozen=True)
@@ -55,82 +51,6 @@ class TraceRow:
     start_s: float
     """Seconds since the epoch."""
     end_s: float
-
-
-@dataclass(frozen=True)
-class Reach:
-    """How far from a coordinate's value the images lie whose difference gives its derivative, and their share of a task's paths, one part in so many."""
-
-    below: float
-    above: float
-    share: int
-
-
-REACH: Mapping[str, Reach] = MappingProxyType({"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)})
-"""By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that a wide difference is no derivative."""
-
-SLOPE_REACH = Reach(0.35, 0.35, 4)
-"""Of a cosine in the closing measurement, where the derivative itself is wanted."""
-
-
-@dataclass(frozen=True)
-class BlockTask:
-    """What every task on a block is told."""
-
-    block: StoredFile
-    index: int
-    recipe: StoredFile
-    step: str
-    tissue: Tissue | Mouth
-    samples: int
-
-
-@dataclass(frozen=True)
-class Secant:
-    """The derivative to one coordinate as a difference of images: quieter than border terms or scores."""
-
-    coordinate: int
-    low: Tissue | Mouth
-    high: Tissue | Mouth
-    width: float
-    share: int
-
-
-@dataclass(frozen=True)
-class Differentiation:
-    """How a stage's images are differentiated: scores of some natural parameters, mapped to the coordinates, and secants."""
-
-    parameters: tuple[str, ...]
-    chain: Array
-    """d parameter / d x, (P, F)."""
-    secants: tuple[Secant, ...] = ()
-    share: int = 1
-    """Of the task's paths that scores get, one part in so many."""
-
-    def render(self, host: EngineHost, task: BlockTask, view: View, seed: int) -> Array:
-        """Derivatives (F, L N); scores are of the task's media."""
-        images: dict[tuple[int, int], Array] = {}
-
-        def image(tissue: Tissue | Mouth, samples: int) -> Array:
-            # What several secants share is rendered once.
-            key = id(tissue), samples
-            if key not in images:
-                images[key] = np.asarray(host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64).reshape(-1)
-            return images[key]
-
-        slopes: dict[int, Array] = {}
-        for secant in self.secants:
-            samples = max(task.samples // secant.share, 1)
-            slopes[secant.coordinate] = (image(secant.high, samples) - image(secant.low, samples)) / secant.width
-        if self.parameters:
-            samples = max(task.samples // self.share, 1)
-            estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed)
-            rows = np.asarray(self.chain.T @ np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1))
-        else:
-            rows = np.zeros((self.chain.shape[1], next(iter(slopes.values())).size))
-        for coordinate, slope in slopes.items():
-            rows[coordinate] = slope
-        return rows
 
 
 @dataclass(frozen=True)
@@ -209,9 +129,9 @@ def gradient_task(host: EngineHost, task: BlockTask, similar: Tissue, how: Diffe
     start, block = time.time(), read_block(task.block)
     stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0])
     residual, weight = stack.mean - block.reference, block.fit_weight
-    slopes = how.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1])
+    (rows,) = how.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1:], block.parts)
     loss = 0.5 * float((weight * (residual**2 - stack.variance)).sum())
-    return Gradient(slopes @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
+    return Gradient(rows @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
 
 
 def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
@@ -270,19 +190,20 @@ class StackProblem(Generic[Optics]):
     """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma, alpha and shape."""
     image_g: float | None = None
     """The same for images: a fit of similar media."""
-    near: Near | None = None
-    """Of a jaw, the coordinates between which the curvature's noise is known."""
+    neighbours: Neighbours | None = None
+    """Of a jaw's teeth: coordinates between which the curvature's noise is known, and which of them are told apart when moved at once."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
         run, label = self.passes.executor, f"{self._prefix}-{step}"
         tissue, similar, how = self.jacobian_media(x)
         seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
+        near = None if self.neighbours is None else self.neighbours.near(self.domain)
         pending = []
         for task in self.passes.tasks(label, tissue, samples):
             jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, seeds)
             image = run.submit(f"{label}-image-{task.index}", image_task, task, (self.seed(step, "image-1"), self.seed(step, "image-2")))
-            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, self.near))
+            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, near))
         products: list[Products] = run.gather(pending)
         self.passes.record([row for p in products for row in p.trace])
         total = products[0].equations
@@ -321,57 +242,11 @@ class StackProblem(Generic[Optics]):
         """Media of the image and of the derivatives, and how to differentiate."""
         tissue = self.domain.tissue_at(x, self.base)
         similar = tissue if self.jacobian_g is None else similar_tissue(tissue, self.jacobian_g)
-        secant = tuple(k for k, c in enumerate(self.domain.coordinates) if self._is_secant(c.kind))
-        own = tuple(target for k, c in enumerate(self.domain.coordinates) if k not in secant for target in c.targets)
-        names = own if self.jacobian_g is None else tuple(dict.fromkeys(n for p in own for n in _similar_parameters(p)))
-        chain = self.chain(x, names, self.jacobian_g)
-        secants = tuple(self._secant(x, k, tissue, REACH[self.domain.coordinates[k].kind]) for k in secant)
-        share = SCORES_SHARE if any(self.domain.coordinates[k].kind == "sigma" for k in secant) else 1
-        return self._image_media(x), similar, Differentiation(names, chain, secants, share)
-
-    @property
-    def scored(self) -> tuple[str, ...]:
-        """Parameters of the domain whose derivatives can be scores."""
-        return tuple(name for name in self.domain.parameters if kind_of(name) not in WITHOUT_SCORES)
+        return self._image_media(x), similar, differentiation(self.domain, x, self.base, self.jacobian_g, self.neighbours)
 
     def slopes(self, x: Array) -> Differentiation:
         """How to differentiate the images' own media, except to blend weights."""
-        tissue, cosines = self._image_media(x), [k for k, c in enumerate(self.domain.coordinates) if c.kind == "cosine"]
-        return Differentiation(self.scored, self.chain(x, self.scored, None), tuple(self._secant(x, k, tissue, SLOPE_REACH) for k in cosines))
-
-    def _is_secant(self, kind: str) -> bool:
-        # Scores of extinction are noisy, but in a jaw they are of all teeth at once.
-        return kind in WITHOUT_SCORES or (kind == "sigma" and self.jacobian_g is not None and isinstance(self.base, Tissue))
-
-    def chain(self, x: Array, names: tuple[str, ...], g: float | None) -> Array:
-        """Derivatives (P, F) of natural parameters to x, those of similar media of mean cosine g where it is given."""
-        if g is None and not self.domain.cosines:
-            return self.domain.chain(x)[[self.domain.parameters.index(name) for name in names]]
-
-        # The map is smooth and closed, so central differences of it are exact to rounding.
-        def values(at: Array) -> Array:
-            tissue = self.domain.tissue_at(at, self.base)
-            seen = tissue if g is None else similar_tissue(tissue, g)
-            return np.array([seen.value(name) for name in names])
-
-        shifts = 1e-5 * np.eye(len(x))
-        return np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
-
-    def _secant(self, x: Array, k: int, tissue: Optics, reach: Reach) -> Secant:
-        # One-sided where a bound is near. A cosine's media are the images' own, as it is what similar media do not have.
-        coordinate, (lower, upper) = self.domain.coordinates[k], (bound[k] for bound in self.domain.bounds)
-        low = float(np.clip(x[k] - reach.below, lower, upper))
-        high = max(float(np.clip(x[k] + reach.above, lower, upper)), low + 0.5 * (reach.below + reach.above))
-
-        def media(end: float) -> Optics:
-            moved = tissue if end == x[k] else self.domain.tissue_at(np.where(np.arange(len(x)) == k, end, x), self.base)
-            return moved if coordinate.kind == "cosine" or self.jacobian_g is None else similar_tissue(moved, self.jacobian_g)
-
-        # Images are linear in the cosine itself farther than in its coordinate.
-        width = high - low
-        if coordinate.kind == "cosine":
-            width = (to_natural("cosine", high) - to_natural("cosine", low)) / natural_derivative("cosine", float(x[k]))
-        return Secant(k, media(low), media(high), width, reach.share)
+        return slopes(self.domain, x, self.base, self.neighbours)
 
     @property
     def _prefix(self) -> str:
@@ -382,14 +257,10 @@ class StackProblem(Generic[Optics]):
         return self.passes.seeds(self.stage, step, *purpose)
 
 
-def _similar_parameters(name: str) -> tuple[str, ...]:
-    part, _, leaf = name.rpartition(".")
-    return (f"{part}.sigma", f"{part}.alpha") if leaf in {"sigma", "alpha"} else (name,)
-
-
 def _render_jacobians(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int]) -> tuple[Array, Array]:
-    view = read_block(task.block).fitted_view
-    return how.render(host, task, view, seeds[0]), how.render(host, task, view, seeds[1])
+    block = read_block(task.block)
+    first, second = how.render(host, task, block.fitted_view, seeds, block.parts)
+    return first, second
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.core.geometry import Mesh
-from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest
+from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 
 if TYPE_CHECKING:
     from services.core.geometry import Tooth
+    from services.fit.transport.recipe import DentinShape
 
 ENGINE = "services.fit.transport.engine:Engine"
 
@@ -122,16 +123,23 @@ def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpe
     """The teeth with the dentin surfaces the fit ended with."""
     from services.core.meshfiles import read_teeth
     from services.fit.driver import dentin_shape
-    from services.fit.jaw_driver import fixed_dentin
+    from services.fit.jaw_driver import jaw_dentins
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":
-        fitted = [fixed_dentin(tooth, prepared.cameras, spec) for tooth in teeth]
-        layered = {fdi for fdi, tooth in report.teeth.items() if all("dentin.sigma" in table for table in tooth.parameters.values())}
-        return tuple(tooth if str(tooth.fdi) in layered else replace(tooth, dentin=None) for tooth in fitted)
+        shapes = [(report.teeth[str(tooth.fdi)].shape, _is_layered(report.teeth[str(tooth.fdi)])) for tooth in teeth]
+        dentins = [dentin if layered else None for dentin, (_, layered) in zip(jaw_dentins(teeth, prepared.cameras, spec), shapes, strict=True)]
+        return tuple(_with_dentin(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True))
     (tooth,) = teeth
-    dentin = dentin_shape(tooth, prepared.cameras, spec)
-    return (replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(report.shape), dentin.base.faces)),)
+    return (_with_dentin(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape),)
+
+
+def _is_layered(tooth: ToothReport) -> bool:
+    return all("dentin.sigma" in table for table in tooth.parameters.values())
+
+
+def _with_dentin(tooth: Tooth, dentin: DentinShape | None, shape: tuple[float, ...]) -> Tooth:
+    return replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(shape), dentin.base.faces))
 
 
 def _source(spec: JobSpec) -> str:

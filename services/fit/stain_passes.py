@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.anatomy.stain_uv import StainLayout
-from services.fit.blocks import read_block
+from services.fit.blocks import BlockTask, read_block
 from services.fit.engine_host import EngineHost
 from services.fit.journal import Journal
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import BlockTask, Passes, TraceRow, compare_task, trace_row
+from services.fit.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.solve.normal_equations import LossChange
 from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
 from services.fit.transport.recipe import StackEstimate, StainGradient

@@ -2,9 +2,11 @@
 
 python -m tests.benchmarks.jaw_table --out jaw_table.json
 python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --out jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --out jaw_table.json
 
 Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the sensor and of the renderer, is part of
-every number: a medium's figure comes with its standard error, an image's with the error that this noise alone looks like in so few pixels.
+every number: a medium's figure comes with its standard error, an image's with the error that this noise alone looks like in so few pixels. Photographs by
+the project's engine have the sensor's noise alone: they tell what the fit adds, not whether the engine is right.
 """
 
 from __future__ import annotations
@@ -19,19 +21,27 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from services.core.records import FitReport, JobSpec
+import numpy as np
+
+from services.core.records import FitReport, JobSpec, PreparedManifest
 from services.core.store import open_stage
+from services.fit.anatomy.dimensions import upper_tooth
+from services.fit.anatomy.jaw import build_jaw
+from services.fit.anatomy.thickness import enamel_thickness_mm
 from services.fit.bench.jaw import prepared_jaw, reported_mouth
 from services.fit.bench.tooth_capture import PreparedTooth
 from services.fit.jaw_views import showing
 from services.fit.optics.parameters import Mouth
+from services.fit.stage import fitted_teeth
 from tests.benchmarks.fit_table import Figure
-from tests.support.jaw_truth import CHANNEL, JawTruth, read_jaw_truth, write_jaw_capture
+from tests.support.jaw_truth import CHANNEL, SUBJECT, JawTruth, by_engine, read_jaw_truth, write_jaw_capture
 
 IMAGE_MUST, ENAMEL_MUST, DENTIN_MUST = 0.05, 0.15, 0.10
 IMAGE_GOAL, ENAMEL_GOAL, DENTIN_GOAL = 0.02, 0.05, 0.04
 IMAGE = "image, held out"
+THICKNESS_MUST, THICKNESS_GOAL = 0.15, 0.08
 JUDGE_SAMPLES = 512
+PHOTOGRAPH_SAMPLES = 2048
 
 
 @dataclass(frozen=True)
@@ -59,23 +69,22 @@ class Cost:
     largest_process_mb: float
 
 
-def fit(folder: Path, options: dict[str, Any], workers: int) -> tuple[JawTruth, JobSpec, FitReport, Cost]:
-    """Fit the stored truth with sensor noise, on local workers."""
+def fit(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int) -> tuple[JobSpec, FitReport, Cost]:
+    """Fit the truth with sensor noise, on local workers."""
     from services.api.pipeline import run_job
 
-    truth = read_jaw_truth()
     write_jaw_capture(folder / "capture", truth, seed=1)
     spec = JobSpec.model_validate({"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | options)
     began, used = time.perf_counter(), _processor_s()
     run_job(spec, folder / "job", workers=workers)
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
     cost = Cost(_processor_s() - used, time.perf_counter() - began, workers, largest)
-    return truth, spec, open_stage(folder / "job", "fit", FitReport)[1], cost
+    return spec, open_stage(folder / "job", "fit", FitReport)[1], cost
 
 
-def figures(folder: Path, options: dict[str, Any], workers: int = 1) -> Iterator[JawFigure]:
+def figures(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int = 1) -> Iterator[JawFigure]:
     """Every visible tooth's numbers, those of all images together first."""
-    truth, spec, report, cost = fit(folder, options, workers)
+    spec, report, cost = fit(folder, truth, options, workers)
     images = judged(prepared_jaw(folder / "job", spec), reported_mouth(report, truth.mouth), JUDGE_SAMPLES)
     ended = f"{report.steps} steps, {'converged' if report.converged else 'not converged'}; {cost}"
     value, resolution = next(images)
@@ -93,6 +102,24 @@ def figures(folder: Path, options: dict[str, Any], workers: int = 1) -> Iterator
             found = 1 - estimate.value if name.endswith("alpha_reduced") else estimate.value
             known = note if estimate.determined else f"{note}, not determined"
             yield JawFigure("jaw", fdi, name, abs(found / right - 1), must, goal, cost.processor_s, known, (estimate.se or 0.0) / found)
+        if tooth.shape:
+            off_mm = thickness_off_mm(folder, truth, spec, report, int(fdi))
+            error = tooth.enamel_thickness.se if tooth.enamel_thickness else None
+            note = f"c = {', '.join(f'{c:.2f}' for c in tooth.shape)}"
+            yield JawFigure("jaw", fdi, "thickness, occlusal half, mm", off_mm, THICKNESS_MUST, THICKNESS_GOAL, cost.processor_s, note, error or 0.0)
+
+
+def thickness_off_mm(folder: Path, truth: JawTruth, spec: JobSpec, report: FitReport, fdi: int) -> float:
+    """Mean error of the enamel's thickness over the occlusal half of a tooth's crown."""
+    prepared, manifest = open_stage(folder / "job", "prepared", PreparedManifest)
+    (found,) = (tooth for tooth in fitted_teeth(prepared, manifest, spec, report) if tooth.fdi == fdi)
+    (true,) = (tooth for tooth in truth.jaw.teeth if tooth.fdi == fdi)
+    (standing,) = (tooth for tooth in build_jaw(SUBJECT).teeth if tooth.fdi == fdi)
+    assert found.dentin is not None
+    assert true.dentin is not None
+    height_mm = standing.frame.canonical_from_world(found.outer.vertices_mm)[:, 2]
+    points = found.outer.vertices_mm[height_mm > height_mm.max() - upper_tooth(fdi % 10).crown_length_mm / 2]
+    return float(np.abs(enamel_thickness_mm(points, found.dentin) - enamel_thickness_mm(points, true.dentin)).mean())
 
 
 def judged(prepared: PreparedTooth, mouth: Mouth, samples: int) -> Iterator[tuple[float, float]]:
@@ -115,11 +142,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--options", default="{}", help="options of the job, JSON")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--photographs", choices=("mitsuba", "engine"), default="mitsuba", help="stored ones by stock Mitsuba, or by the project's engine")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    truth = read_jaw_truth() if arguments.photographs == "mitsuba" else by_engine(read_jaw_truth(), PHOTOGRAPH_SAMPLES)
     with tempfile.TemporaryDirectory() as folder:
-        for one in figures(Path(folder), json.loads(arguments.options), arguments.workers):
+        for one in figures(Path(folder), truth, json.loads(arguments.options), arguments.workers):
             print(f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}): {one.reached}; {one.note}", flush=True)
             rows.append(asdict(one) | {"reached": one.reached})
             arguments.out.write_text(json.dumps(rows, indent=1) + "\n")

@@ -128,6 +128,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     page.goto("/")
     expect(page.locator(".job .badge")).to_have_text("running")
     expect(page.locator(".stages li", has_text="prepare").locator(".state")).to_have_text("finished")
+    expect(page.locator("#workers")).to_contain_text("Workers start with the next job. Done: 0 in the last hour, 0 in 24 h.")
     expect(page.locator(".remaining")).to_have_text("No time range: The size of its capture cannot be read, so it cannot be compared with other jobs.")
     for step in range(STEPS - 1):
         job.steps.release()

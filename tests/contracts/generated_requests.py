@@ -5,7 +5,7 @@ python -m tests.contracts.generated_requests --cases 10000 --seed 1 --json cases
 The description that the server itself gives is read; a part of the cases goes along the borders of what it allows, the others are drawn from it, half of
 them against it. They come with a token of every scope, with one that may only read, with a wrong one, or without any. An answer is good when its status,
 content type, headers and body are described, when what the description forbids is refused, when a refusal is a problem document with a known code, and when it
-is no failure of the server. In the end the server must be ready, run a further job, and have kept what was there before.
+is no failure of the server. The server has a simulated dome. In the end the server must be ready, run a further job, and have kept what was there before.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from tests.contracts.living import Living
 from tests.contracts.witnesses import finish_job, leave_witnesses
 from tests.support.guarded_server import make_token
 from tests.support.live_server import toy_server
+from tests.support.mouth import write_mouth
 from tests.support.postgres import new_database, postgres_server
 
 CHECKS = [
@@ -266,7 +267,8 @@ def served(folder: Path, database: str | None) -> Iterator[tuple[httpx.Client, A
     tokens |= {"wrong": f"dentine_{'0' * 12}_{'x' * 43}", "nobody": None}
     with (folder / "server.log").open("w") as log:
         more = {} if database is None else {"database": database}
-        with toy_server(data, log, access="tokens", private_webhooks=True, **more) as (client, process):
+        dome = {"address": "simulated", "watchdog_s": 60.0}
+        with toy_server(data, log, "tests.contracts.stages", access="tokens", private_webhooks=True, dome=dome, **more) as (client, process):
             client.headers["Authorization"] = f"Bearer {tokens['admin']}"
             yield client, process, tokens
 
@@ -276,7 +278,8 @@ def survey(folder: Path, cases: int, start: int, database: str | None = None, te
     began = time.monotonic()
     with served(folder, database) as (client, process, tokens):
         witnesses = leave_witnesses(client, folder / "data", folder / "capture")
-        living = Living(witnesses, folder / "data")
+        write_mouth(folder / "mouth", lights=2)
+        living = Living(witnesses, folder / "data", folder / "mouth")
         sender = Sender(str(client.base_url).rstrip("/"), tokens, living)
         sender.run(cases, start, tell)
         living.release()
@@ -320,6 +323,8 @@ def main() -> None:
         print(f"{name:10} {sum(answers.values()):6}  " + "  ".join(f"{kind} {times}" for kind, times in answers.items()))
     for fault in outcome.faults:
         print(f"\n{fault.operation}: {fault.kind}, {fault.times} times: {fault.sentence}\n{fault.example}")
+    if unanswered := [label for label, statuses in outcome.operations.items() if not any(200 <= status < 300 for status in statuses)]:
+        print(f"\nNever answered 2xx: {', '.join(unanswered)}.")
     print(f"\n{outcome.cases} cases in {outcome.seconds:.0f} s, jobs {outcome.jobs}, {len(outcome.faults)} kinds of fault.")
     raise SystemExit(bool(outcome.faults))
 

@@ -9,11 +9,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from schemathesis import Case, Response
 from schemathesis.core.parameters import ParameterLocation
 
+from services.api.mask_images import picture_of
 from services.api.presets import list_presets
 from services.api.tus import CHUNK_TYPE, format_metadata
+from services.core.geometry import Camera
 from tests.contracts.witnesses import Witnesses
 from tests.support.uploading import CAMERA, TUS, checksum, manifest_of
 
@@ -23,26 +26,30 @@ SPARED = 3
 """Newest things of a kind that are not deleted yet."""
 HOLD = "hold-fit"
 """Lets a toy job wait in its fit."""
+PNG_TYPE = "image/png"
+DOME_LIGHTS = 155
 NOWHERE = "http://127.0.0.1:9/"
 """Where nobody listens."""
 _ID_OF = {"/v1/jobs": "job_id", "/v1/captures": "capture", "/v1/tokens": "token_id", "/v1/webhooks": "webhook_id"}
 _FILE = "capture.json"
+_LIGHTS = ("l0", "l1", "all")
+_UNITS: dict[str, Any] = {"units": "mm", "channels": ["green"], "cameras": [CAMERA]}
 
 
 def content_of(choice: int) -> bytes:
     """The one file of a small capture, of which there are many."""
     light = {"name": "l0", "position_mm": [0, 0, -50], "intensity": [1.0]}
-    description = {"units": "mm", "channels": ["green"], "cameras": [CAMERA], "lights": [light]}
-    return json.dumps(description).encode() + b" " * (choice % 5000)
+    return json.dumps(_UNITS | {"lights": [light]}).encode() + b" " * (choice % 5000)
 
 
 class Living:
     """Parameters of paths that exist on the server. Those of the witnesses are not deleted."""
 
-    def __init__(self, witnesses: Witnesses, data: Path) -> None:
-        self._jobs, self._job_count = data / "jobs", 0
+    def __init__(self, witnesses: Witnesses, data: Path, mouth: Path) -> None:
+        self._jobs, self._mouth, self._job_count = data / "jobs", mouth, 0
         job, capture = {"job_id": witnesses.job["id"]}, {"capture": witnesses.capture["id"]}
         self._kept: list[dict[str, Any]] = [job, capture, *(job | {"path": path} for path in witnesses.artifacts)]
+        self._kept += [job | {"preview_id": preview} for preview in witnesses.previews]
         self._kept += [{"name": preset.name} for preset in list_presets()]
         self._made: list[dict[str, Any]] = []
         self._deleted: list[dict[str, Any]] = []
@@ -72,6 +79,16 @@ class Living:
                 case.body = manifest_of({_FILE: content_of(choice)})
             case "POST /v1/webhooks" | "PATCH /v1/webhooks/{webhook_id}":
                 case.body = case.body | {"url": NOWHERE}
+            case "PUT /v1/calibrations/{name}":
+                light = {"name": "l0", "position_mm": [0, 0, -50 - choice % 3], "intensity": [1.0]}
+                case.body = _UNITS | {"lights": [light]}
+            case "PUT /v1/jobs/{job_id}/masks/{camera}/{light}":
+                width, height = Camera.model_validate(CAMERA).size
+                case.body, case.media_type = picture_of(np.full((height, width), choice % 2, dtype=np.uint8)), PNG_TYPE
+            case "PUT /v1/dome/light":
+                case.body = {"light": choice % DOME_LIGHTS, "level": 0.001, "on_s": 0.2}
+            case "POST /v1/dome/preflight":
+                case.body = {"mouth": str(self._mouth)}
             case "POST /v1/uploads" if self._contents:
                 capture, content = list(self._contents.items())[choice % len(self._contents)]
                 case.headers.update(TUS | {"upload-length": str(len(content)), "upload-metadata": format_metadata({"capture": capture, "path": _FILE})})
@@ -98,6 +115,7 @@ class Living:
             made = response.json()["id"]
             self._made.append({name: made})
             if name == "job_id":
+                self._made += [{name: made, "camera": CAMERA["name"], "light": light} for light in _LIGHTS]
                 self._steer(made)
             if name == "capture":
                 self._made.append({"capture": made, "number": 0})

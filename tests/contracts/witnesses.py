@@ -21,6 +21,7 @@ class Witnesses:
     job: dict[str, Any]
     artifacts: dict[str, str]
     events: str
+    previews: list[int]
 
     @classmethod
     def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> Witnesses:
@@ -32,6 +33,7 @@ class Witnesses:
             client.get(f"/v1/jobs/{job}").raise_for_status().json(),
             {path: hashlib.sha256(client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content).hexdigest() for path in paths},
             client.get(f"/v1/jobs/{job}/events").raise_for_status().text,
+            [preview["id"] for preview in client.get(f"/v1/jobs/{job}/previews").raise_for_status().json()["previews"]],
         )
 
     def losses(self, client: httpx.Client, data: Path) -> list[str]:
@@ -40,9 +42,8 @@ class Witnesses:
             now = Witnesses.of(client, data, self.capture["id"], self.job["id"])
         except httpx.HTTPError as problem:
             return [f"the witnesses cannot be read: {problem}"]
-        return [
-            f"{name} of the witnesses changed" for name in ("capture", "contents", "job", "artifacts", "events") if getattr(now, name) != getattr(self, name)
-        ]
+        of = ("capture", "contents", "job", "artifacts", "events", "previews")
+        return [f"{name} of the witnesses changed" for name in of if getattr(now, name) != getattr(self, name)]
 
 
 def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> Witnesses:

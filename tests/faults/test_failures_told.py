@@ -1,10 +1,11 @@
-"""Four ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what was measured and what to do next."""
+"""Ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what was measured and what to do next."""
 
 from __future__ import annotations
 
+import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,13 @@ GIB = 2**30
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with engine_server(tmp_path_factory.mktemp("data")) as (client, _):
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def client(data: Path) -> Iterator[httpx.Client]:
+    with engine_server(data) as (client, _):
         yield client
 
 
@@ -61,6 +67,58 @@ def test_bad_input(client: httpx.Client, tmp_path: Path) -> None:
     failure = failure_of(client, tmp_path, "read")
     assert (failure["code"], failure["exit_status"]) == ("bad-capture", 2)
     assert failure["message"] == f"{tmp_path / 'capture.json'} does not exist; check the path."
+
+
+def held_after_preparation(client: httpx.Client, tmp_path: Path) -> tuple[Path, str]:
+    """A job whose preparation is published and whose fit waits until ``hold-prepare-end`` is gone from the folder that is returned with its id."""
+    steering = tmp_path / "steering"
+    steering.mkdir()
+    (steering / "hold-prepare-end").touch()
+    job = submit(client, tmp_path, "none")
+    while not (steering / "at-prepare-end").exists():
+        time.sleep(0.02)
+    return steering, job
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda shard: shard.write_text("9\n"), "by.txt of published stage prepared differs from its published checksum"),
+        (lambda shard: os.truncate(shard, 1), "by.txt of published stage prepared has 1 bytes instead of 2 (truncated?)"),
+        (Path.unlink, "by.txt is missing from published stage prepared"),
+        (lambda shard: os.truncate(shard.with_name("manifest.json"), 40), "manifest.json, the list of what stage prepared published, cannot be read"),
+    ],
+    ids=["altered", "truncated", "removed", "its list truncated"],
+)
+def test_a_shard_damaged_between_two_stages(client: httpx.Client, data: Path, tmp_path: Path, damage: Callable[[Path], object], told: str) -> None:
+    steering, job = held_after_preparation(client, tmp_path)
+    folder = data / "jobs" / job
+    damage(folder / "prepared" / "by.txt")
+    (steering / "hold-prepare-end").unlink()
+
+    ended = await_end(client, job)
+    assert (ended["state"], ended["failure"]["code"], ended["failure"]["stage"]) == ("FAILED", "store-corrupt", "fit")
+    assert ended["failure"]["message"] == f"{folder}/prepared/{told}; restore it, or retry the job, which then makes prepared anew."
+    assert (steering / "publications.txt").read_text().split() == ["prepare"]
+
+    client.post(f"/v1/jobs/{job}/retry").raise_for_status()
+    assert await_end(client, job)["state"] == "SUCCEEDED"
+    assert (steering / "publications.txt").read_text().split() == ["prepare", "prepare", "fit", "export"]
+    assert client.get(f"/v1/jobs/{job}/artifacts/report.html").status_code == 200
+
+
+def test_a_damaged_shard_that_is_restored_costs_no_preparation(client: httpx.Client, data: Path, tmp_path: Path) -> None:
+    steering, job = held_after_preparation(client, tmp_path)
+    shard = data / "jobs" / job / "prepared" / "by.txt"
+    good = shard.read_bytes()
+    shard.unlink()
+    (steering / "hold-prepare-end").unlink()
+    assert await_end(client, job)["failure"]["code"] == "store-corrupt"
+
+    shard.write_bytes(good)
+    client.post(f"/v1/jobs/{job}/retry").raise_for_status()
+    assert await_end(client, job)["state"] == "SUCCEEDED"
+    assert (steering / "publications.txt").read_text().split() == ["prepare", "fit", "export"]
 
 
 def test_a_cancel_in_mid_kernel_of_the_real_engine_leaves_the_worker_the_same_process(client: httpx.Client, tmp_path: Path) -> None:

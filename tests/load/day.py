@@ -71,7 +71,9 @@ def growth(curve: Sequence[Row]) -> Row:
         "seconds": curve[-1]["seconds"],
         "rss_start_bytes": curve[0]["rss_bytes"],
         "rss_warm_bytes": judged[0]["rss_bytes"],
+        "rss_middle_bytes": curve[len(curve) // 2]["rss_bytes"],
         "rss_end_bytes": judged[-1]["rss_bytes"],
+        "rss_bytes_by_hour": [row["rss_bytes"] for row in curve[3::4]],
         "growth_bytes_per_day": round(float(slope)),
         "growth_bytes_per_day_95": [round(float(low)), round(float(high))],
     }

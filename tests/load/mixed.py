@@ -45,14 +45,17 @@ def measure(work: Path, rounds: int, round_s: float, jobs: int, fitted: int, see
         for name, (served, books) in peers.items():
             run(_round(name, served, books, min(round_s, 5.0), random.Random(seed), "warm"))
         answers: dict[str, list[list[Answer]]] = {name: [] for name in peers}
+        cpu_s = dict.fromkeys(peers, 0.0)
         for number in range(rounds):
             for name, (served, books) in _turns(peers, number):
                 before = _Clocks.now(served)
                 found = run(_round(name, served, books, round_s, random.Random(f"{seed} {number}"), f"round-{number}"))
+                after = _Clocks.now(served)
                 answers[name].append(found)
-                yield {"benchmark": "load-mixed", "peer": name, "round": number} | before.until(_Clocks.now(served), len(found)) | _figures(found)
+                cpu_s[name] += after.server_s - before.server_s
+                yield {"benchmark": "load-mixed", "peer": name, "round": number} | before.until(after, len(found)) | _figures(found)
                 run(_drain(served))
-    yield from _summary(answers)
+    yield from _summary(answers, {name: cpu_s[name] / sum(map(len, rounds)) for name, rounds in answers.items()})
     yield from _kinds(answers)
 
 
@@ -127,8 +130,8 @@ def _p99(rounds: Sequence[Sequence[Answer]]) -> float:
     return float(np.quantile([answer.latency_s for one in rounds for answer in one], 0.99))
 
 
-def _summary(answers: Mapping[str, list[list[Answer]]]) -> Iterator[Row]:
-    """p99 over all rounds, its ratio to the bare route's, and that ratio's spread: over rounds, and by resampling them together."""
+def _summary(answers: Mapping[str, list[list[Answer]]], cpu_s_per_request: Mapping[str, float]) -> Iterator[Row]:
+    """p99 over all rounds, its ratio to the bare route's, and that ratio's spread: over rounds, and by resampling them together; and the processor's time."""
     rng = np.random.default_rng(1)
     bare = answers[BARE]
     draws = rng.integers(0, len(bare), (RESAMPLES, len(bare)))
@@ -141,10 +144,14 @@ def _summary(answers: Mapping[str, list[list[Answer]]]) -> Iterator[Row]:
             "benchmark": "load-mixed-summary",
             "peer": name,
             **_figures([answer for one in rounds for answer in one]),
+            "bare_p99_s": round(_p99(bare), 6),
             "p99_ratio": round(_p99(rounds) / _p99(bare), 3),
             "p99_ratio_95": [round(float(low), 3), round(float(high), 3)],
             "p99_ratio_of_rounds": [round(one, 3) for one in single],
             "p99_ratio_median": round(float(np.median(single)), 3),
+            "cpu_s_per_request": round(cpu_s_per_request[name], 6),
+            "bare_cpu_s_per_request": round(cpu_s_per_request[BARE], 6),
+            "cpu_ratio": round(cpu_s_per_request[name] / cpu_s_per_request[BARE], 3),
         }
 
 

@@ -142,7 +142,9 @@ def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: st
     assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
 
 
-def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str) -> None:
+@pytest.mark.parametrize("at_once", [1000, 5], ids=["at once", "block by block"])
+def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.artifacts.MOST_BYTES_AT_ONCE", at_once)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
     finish(client, job_id)
@@ -153,6 +155,8 @@ def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str
     part = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=10-19"})
     assert (part.status_code, part.content, part.headers["content-range"]) == (206, bytes(range(10, 20)), "bytes 10-19/100")
     assert client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=-5"}).content == bytes(range(95, 100))
+    several = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=0-1,90-"})
+    assert (several.status_code, several.headers["content-type"].partition(";")[0]) == (206, "multipart/byteranges")
     beyond = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=200-"})
     assert (beyond.status_code, beyond.json()["code"], beyond.headers["content-range"]) == (416, "range-unsatisfiable", "bytes */100")
     for unreadable in ("lines=1", "bytes", "bytes=", "bytes=9-1", "bytes=0-1,x", "bytes=--1", "bytes=-"):

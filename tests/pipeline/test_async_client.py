@@ -84,9 +84,10 @@ def test_a_job_is_submitted_followed_and_retried(server: httpx.Client, job: Tell
             detail = await client.get(created["id"])
             assert (detail["state"], detail["failure"]["code"]) == ("FAILED", "bad-capture")
             job.fails = False
-            assert (await client.retry(created["id"]))["state"] == "QUEUED"
+            assert (await client.retry(created["id"]))["id"] == created["id"]
             more = await followed(client, created["id"], events[-1].id)
             assert more[0].id > events[-1].id
+            assert [event.data["state"] for event in more if event.kind == "state"] == ["QUEUED", "RUNNING", "SUCCEEDED"]
             assert (await client.get(created["id"]))["state"] == "SUCCEEDED"
             with pytest.raises(JobStateError):
                 await client.cancel(created["id"])

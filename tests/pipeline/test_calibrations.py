@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,9 @@ import httpx
 import pytest
 
 from services.api.app import create_app
+from services.api.client import Client
 from services.api.events import EventAddress
-from services.core.errors import CaptureInputError
+from services.core.errors import CaptureInputError, UnknownCalibrationError
 from services.core.records import JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
@@ -125,6 +128,16 @@ def test_a_calibration_of_another_rig_is_refused(tmp_path: Path, mouth: Path, ca
     (tmp_path / "other.json").write_text(json.dumps(calibration))
     with pytest.raises(CaptureInputError, match=named):
         stage.run(JobSpec(capture=mouth, calibration=tmp_path / "other.json"), LocalContext(tmp_path / "job"))
+
+
+def test_the_command_line_names_a_stored_calibration(client: httpx.Client, tmp_path: Path, mouth: Path, calibration: dict[str, Any]) -> None:
+    option = client.put("/v1/calibrations/this-rig", json=calibration).json()["option"]
+    (tmp_path / "job.toml").write_text('capture = "mouth"')
+    command = [sys.executable, "-m", "services", "submit", str(tmp_path / "job.toml"), "--server", str(client.base_url), "--calibration"]
+    submitted = subprocess.run([*command, "this-rig"], capture_output=True, text=True, check=True)
+    assert client.get(f"/v1/jobs/{submitted.stdout.strip()}").json()["spec"]["calibration"] == option
+    with Client(str(client.base_url)) as typed, pytest.raises(UnknownCalibrationError, match="There is no calibration other-rig"):
+        typed.calibration("other-rig")
 
 
 @pytest.mark.parametrize("option", ["calibrations/none", "calibrations/" + 64 * "0", "relative.json", "/no/such.json"])

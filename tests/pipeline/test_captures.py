@@ -15,6 +15,7 @@ from services.api.events import EventAddress
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
+from tests.support.told_images import told_png
 from tests.support.uploading import announce, contents_of, create_upload, entry, manifest_of, patch, send, write_capture
 
 Serve = Callable[..., httpx.Client]
@@ -136,6 +137,16 @@ def test_an_image_bomb_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
     (fault,) = commit(client, capture).json()["files"]
     assert (fault["path"], fault["kind"]) == ("c0_l1.npy", "refused")
     assert "99999 x 99999 x 3" in fault["detail"]
+
+
+def test_an_image_with_metadata_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
+    client = serve()
+    contents = contents_of(write_capture(tmp_path / "mine")) | {"beauty.png": told_png()}
+    capture = announce(client, contents)
+    send_missing(client, capture, contents)
+    (fault,) = commit(client, capture).json()["files"]
+    assert (fault["path"], fault["kind"]) == ("beauty.png", "refused")
+    assert fault["detail"].startswith("Image beauty.png carries metadata (eXIf, iTXt, tEXt)")
 
 
 def test_a_deleted_capture_leaves_nothing_that_no_other_has(serve: Serve, tmp_path: Path) -> None:

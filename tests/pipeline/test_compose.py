@@ -21,8 +21,8 @@ from tests.support.small_system import free_port
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = ROOT / "deploy" / "compose.yaml"
+WITH_TLS = ROOT / "deploy" / "compose.tls.yaml"
 DENTINE = [sys.executable, "-m", "services"]
-PROGRAMS = {"dentine": DENTINE, "dask": [sys.executable, "-m", "dask"]}
 PATIENCE_S = 600.0
 JOB = """
 capture = "mouth"
@@ -42,11 +42,17 @@ def services() -> dict[str, dict[str, Any]]:
     return dict(yaml.safe_load(COMPOSE.read_text())["services"])
 
 
-def test_the_file_follows_the_compose_specification() -> None:
-    checked = subprocess.run(
-        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(COMPOSE)], capture_output=True, text=True, check=False
-    )
+def test_the_files_follow_the_compose_specification() -> None:
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(COMPOSE), str(WITH_TLS)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout
+
+
+def test_tls_is_one_setting_of_every_part_that_speaks_dask() -> None:
+    of_dask = {name for name, one in services().items() if "scheduler" in str(one.get("command")) or "DENTINE__SERVER__SCHEDULER" in one.get("environment", {})}
+    secured = yaml.safe_load(WITH_TLS.read_text())["services"]
+    assert secured.keys() == of_dask
+    assert all(one["environment"] == {"DENTINE__SERVER__TLS": "/run/tls"} for one in secured.values())
 
 
 def test_only_the_api_is_published_and_only_on_loopback() -> None:
@@ -57,6 +63,13 @@ def test_one_worker_alone_may_reach_the_dome() -> None:
     able = [name for name, one in services().items() if "DOME=1" in one.get("command", [])]
     assert able == ["rig"]
     assert "deploy" not in services()["rig"]
+
+
+def test_the_dome_is_reached_by_the_api_and_the_rig_alone() -> None:
+    composed = yaml.safe_load(COMPOSE.read_text())
+    assert composed["networks"]["dome"] == {"internal": True}
+    assert {name for name, one in services().items() if "dome" in one.get("networks", ["default"])} == {"api", "rig", "dome"}
+    assert services()["dome"]["networks"] == ["dome"]
 
 
 def test_every_service_is_checked_and_starts_again() -> None:
@@ -75,6 +88,7 @@ class Composition:
         self._names = {
             database: new_database(postgres, "composed"),
             "scheduler:": "127.0.0.1:",
+            "dome:": "127.0.0.1:",
             "/data": str(folder / "data"),
             "/tmp/dask": str(folder / "dask"),
         }
@@ -88,8 +102,9 @@ class Composition:
     def start(self, name: str) -> None:
         """Start a service by its own command."""
         program, *arguments = services()[name]["command"]
+        assert program == "dentine"
         with (self._folder / f"{name}.log").open("wb") as log:
-            command = [*PROGRAMS[program], *map(self._here, arguments)]
+            command = [*DENTINE, *map(self._here, arguments)]
             self._processes[name] = subprocess.Popen(command, env=self.environment(name), cwd=self._folder, stdout=log, stderr=log, start_new_session=True)
 
     def close(self) -> None:
@@ -160,5 +175,17 @@ def test_a_small_job_runs_through_what_the_file_starts(composition: Composition,
         assert client.get("/v1/health/ready", headers=headers).status_code == 200
         report = client.get(f"/v1/jobs/{job}/artifacts/report.html", headers=headers)
         assert "Tooth" in report.text
+        work_the_dome(client, dentine(tmp_path, environment, "token", "create", "operator", "--scope", "operate-dome"))
     for log in tmp_path.glob("*.log"):
         assert token not in log.read_text()
+
+
+def work_the_dome(client: httpx.Client, token: str) -> None:
+    """Status, a light and ALL OFF, by the API as composed."""
+    headers = {"Authorization": f"Bearer {token}"}
+    told = client.get("/v1/dome", headers=headers).json()
+    assert (told["capturing"], told["status"]["lit"], told["status"]["stopped"]) == ([], [], False)
+    assert client.put("/v1/dome/light", json={"light": 3, "level": 0.05, "on_s": 30}, headers=headers).json()["lit"] == [3]
+    dark = client.post("/v1/dome/off", headers=headers).json()["status"]
+    assert (dark["lit"], dark["stopped"]) == ([], True)
+    assert client.get("/v1/dome", headers=headers).json()["status"] == dark

@@ -8,6 +8,7 @@ from statistics import median
 import pytest
 
 from tests.benchmarks.jaw_table import ENAMEL_MUST, IMAGE, IMAGE_MUST, JawFigure, figures
+from tests.support.jaw_truth import read_jaw_truth
 
 
 def test_a_figure_is_judged_with_its_noise() -> None:
@@ -21,7 +22,7 @@ def test_a_figure_is_judged_with_its_noise() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(14400)
 def test_jaw_of_fourteen(tmp_path: Path) -> None:
-    found = list(figures(tmp_path, {"samples_per_pixel": 32, "max_samples_per_pixel": 512}))
+    found = list(figures(tmp_path, read_jaw_truth(), {"samples_per_pixel": 32, "max_samples_per_pixel": 512}))
     assert len(found) == 1 + 3 * 14
     # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43 honest numbers on its limit falls in 17 runs.
     missed = [f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}" for one in found if one.is_beyond_noise]

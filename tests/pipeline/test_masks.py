@@ -31,6 +31,7 @@ from services.preprocess import stage
 from tests.support import toy_stages
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth
+from tests.support.told_images import with_text
 
 WIDTH, HEIGHT = 24, 18
 Bits = NDArray[np.uint8]
@@ -237,6 +238,12 @@ def test_masks_of_other_programs_are_taken(client: httpx.Client, mouth: Path, da
     stage.run(JobSpec(capture=mouth), LocalContext(root, attempt=1000 + depth))
     assert ((stored(data, shared_job)[0, 0, :HEIGHT, :WIDTH] & MaskBit.MANUAL > 0) == (bits > 0)).all()
     assert not is_stale(root)
+
+
+def test_a_mask_is_kept_without_metadata(client: httpx.Client, shared_job: str) -> None:
+    told = with_text(mask(slice(2, 4)), b"Author\0A name")
+    assert put(client, shared_job, "c0/l1", told).status_code == 204
+    assert client.get(f"/v1/jobs/{shared_job}/masks/c0/l1").content == mask(slice(2, 4))
 
 
 def test_a_long_mask_is_refused_by_its_length(client: httpx.Client, shared_job: str) -> None:

@@ -19,6 +19,7 @@ from services.core.errors import CaptureInputError, CorruptUploadError, DiskFull
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import serving
+from tests.support.told_images import told_png
 from tests.support.uploading import contents_of, write_capture
 
 DENTINE = [sys.executable, "-m", "services"]
@@ -94,6 +95,13 @@ def test_a_folder_that_is_no_capture_is_refused_before_anything_is_sent(server: 
         (tmp_path / "other" / "capture.json").touch()
         with pytest.raises(CaptureInputError, match="empty"):
             client.upload(tmp_path / "other")
+    assert server.get("/v1/captures").json()["captures"] == []
+
+
+def test_an_image_with_metadata_never_leaves_this_machine(server: httpx.Client, folder: Path) -> None:
+    (folder / "beauty.png").write_bytes(told_png())
+    with Client(str(server.base_url)) as client, pytest.raises(UploadError, match=r"^Image beauty\.png carries metadata \(eXIf"):
+        client.upload(folder)
     assert server.get("/v1/captures").json()["captures"] == []
 
 

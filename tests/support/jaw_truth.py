@@ -6,7 +6,7 @@ Sensor noise is added when the capture is written.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,17 @@ def read_jaw_truth(stored: Path = STORED) -> JawTruth:
         assert np.allclose(arrays["moments"], _moments(jaw), rtol=1e-6), f"the phantom jaw is not the one of {stored.name}; render it again"
         mean, error = ([arrays[f"{kind}_{k}"].astype(np.float64) for k in range(CAMERAS)] for kind in ("mean", "standard_error"))
     return JawTruth(jaw, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights(), tuple(mean), tuple(one**2 for one in error))
+
+
+def by_engine(truth: JawTruth, samples: int) -> JawTruth:
+    """The same jaw as the project's own engine renders it, where the question is what a fit makes of photographs with less noise than stock Mitsuba affords."""
+    from services.fit.anatomy.phantom_render import render_engine
+    from services.fit.transport.engine import Engine
+
+    engine = Engine(truth.jaw.recipe(truth.lights, 0, "matched"))
+    whole = [(9001 + k, camera, np.ones(camera.size[::-1], dtype=bool)) for k, camera in enumerate(truth.cameras)]
+    stacks = [render_engine(engine, truth.mouth, camera, seen, samples, seed) for seed, camera, seen in whole]
+    return replace(truth, mean=tuple(mean for mean, _ in stacks), variance=tuple(variance for _, variance in stacks))
 
 
 def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool = True) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,7 @@ def write_prepared_jaw(
     fdi: tuple[int, ...] = FDI,
     *,
     dentin: bool = True,
+    shape: tuple[float, ...] = (),
     hidden: tuple[int, ...] = (),
     dark: tuple[int, ...] = (),
     samples: int = 1024,
@@ -90,11 +92,14 @@ def write_prepared_jaw(
     Args:
         engine: who makes the photographs, as ``module:class``.
         dentin: whether teeth have any.
+        shape: blend weights of every tooth, for an engine that knows them by a formula.
         hidden: teeth that are masked in all images.
         dark: teeth that are black in all photographs.
         noise: of the sensor, relative.
     """
     scene, rng = recipe(fdi, dentin=dentin), np.random.default_rng(seed)
+    mouth = true_mouth(fdi)
+    truth = replace(mouth, teeth=tuple(replace(tooth, shape=shape) for tooth in mouth.teeth))
     writer = StageWriter(root, "prepared", 1)
     shape = (2, len(LIGHTS_MM), SIZE, SIZE)
     store, axes = writer.folder / "prepared.zarr", ("camera", "light", "y", "x")
@@ -106,7 +111,7 @@ def write_prepared_jaw(
         shown = seen(camera, scene)
         black, masked = (np.isin(shown, [fdi.index(number) for number in numbers]) for numbers in (dark, hidden))
         pixels = np.argwhere(shown >= 0)[:, ::-1].astype(np.int32)
-        estimate = renderer.images(true_mouth(fdi), View(camera, pixels), samples=samples, seed=seed + c)
+        estimate = renderer.images(truth, View(camera, pixels), samples=samples, seed=seed + c)
         images = np.zeros(shape[1:])
         images[:, pixels[:, 1], pixels[:, 0]] = estimate.mean
         spread = np.maximum(noise * images, 1e-3 * images.max())

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from unittest.mock import patch
 
+from services.api.dask_tls import Certificates
 from services.api.events import EventAddress
 from services.api.pipeline import DOORS, run_job
 from services.api.server import serve
@@ -23,12 +24,13 @@ LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 
 def serve_doors(settings: ServerSettings, doors: Mapping[StageName, str]) -> None:
     """Serve with these stages on real workers."""
-    with Workers(settings.scheduler) as workers:
+    certificates = Certificates.of(settings.tls) if settings.tls is not None else None
+    with Workers(settings.scheduler, certificates) as workers:
 
         def run_toys(spec: JobSpec, folder: Path, events: EventAddress) -> None:
             run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True)
 
-        serve(settings, run_toys)
+        serve(settings, run_toys, workers)
 
 
 def main(settings: ServerSettings, stages: str = "tests.support.toy_stages") -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from services.core.errors import CaptureInputError, JobCancelledError
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import StageContext, StageEvent, StageName
-from services.core.store import StageWriter
+from services.core.store import StageWriter, require_intact
 
 DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("capture", "prepare", "fit", "export")}
 
@@ -73,8 +73,9 @@ def prepare(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
+    """Checks the preparation, reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
     _reach(spec, context, "fit", "start")
+    require_intact(context.root, "prepared")
     for step in range(10):
         data = {"channel": "green", "step": step, "loss": 0.5**step, "held_out_error": 0.6**step, "parameters": {"enamel.sigma": 4.0}}
         context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=(step + 1) / 10, data=data))

@@ -142,7 +142,18 @@ def test_a_name_has_one_living_token(table: Tokens, clock: Clock) -> None:
     assert issue(table)
 
 
-@pytest.mark.parametrize("name", ["", "local", "a b", "-x", "x" * 65, "dentine_0123456789ab_secret", "é"])
+def test_an_id_means_its_own_token_whatever_another_is_called(table: Tokens, engine: sql.Engine) -> None:
+    """As names were free once."""
+    issue(table, "first")
+    meant = table.list()[0].id
+    issue(table, "second")
+    with engine.begin() as connection:
+        connection.execute(token_table.update().where(token_table.c.name == "second").values(name=meant))
+    assert table.revoke(meant, make_deed()).name == "first"
+    assert {one.name: one.revoked_s is None for one in table.list()} == {"first": False, meant: True}
+
+
+@pytest.mark.parametrize("name", ["", "local", "0123456789ab", "a b", "-x", "x" * 65, "dentine_0123456789ab_secret", "é"])
 def test_malformed_names_are_refused(table: Tokens, name: str) -> None:
     with pytest.raises(InputError, match="Token name"):
         issue(table, name)

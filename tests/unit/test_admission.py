@@ -28,6 +28,7 @@ class World:
 def spec(tmp_path: Path) -> JobSpec:
     (tmp_path / "teeth").mkdir()
     (tmp_path / "teeth" / "a.npy").write_bytes(bytes(1 << 20))
+    (tmp_path / "capture.json").touch()
     (tmp_path / "link").symlink_to("/proc/kcore")
     return JobSpec(capture=tmp_path, workers=2)
 
@@ -37,6 +38,12 @@ def test_the_prediction_counts_what_lies_on_the_disk(spec: JobSpec) -> None:
     # Blocks of the file system round a file up by less than 64 KiB.
     assert 0 <= needs.disk_bytes - LEAST_DISK_BYTES - DISK_PER_CAPTURE * 2**20 <= DISK_PER_CAPTURE * 2**16
     assert needs.memory_bytes == 2 * WORKER_BYTES
+
+
+def test_a_folder_that_is_no_capture_is_not_walked_through(spec: JobSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "capture.json").unlink()
+    monkeypatch.setattr(Path, "rglob", lambda *_: pytest.fail("it was walked through"))
+    assert predict(spec).disk_bytes == LEAST_DISK_BYTES
 
 
 def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> None:

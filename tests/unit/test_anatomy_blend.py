@@ -35,7 +35,7 @@ def scanned_incisor() -> tuple[Mesh, ToothFrame]:
 
 def scanned_crown() -> tuple[Mesh, ToothFrame]:
     outer = read_mesh(shared_path("data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI=11.obj"))
-    return outer, estimate_frame(outer, np.array([[0.0, -1000.0, 0.0]]))
+    return outer, estimate_frame(outer, np.array([[0.0, 0.0, 1000.0]]))
 
 
 def procedural() -> tuple[Mesh, ToothFrame]:

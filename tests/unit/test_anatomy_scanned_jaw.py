@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh
 from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.fit.anatomy.jaw_frames import jaw_frames
 from services.fit.anatomy.patches import areas_mm2, boundary_loops, harmonic_rows, manifold_piece, touching_pieces
 from services.fit.anatomy.rays import RayScene
 from services.fit.anatomy.roots import STUB_MM, close_crown
@@ -264,6 +265,15 @@ def test_real_frames_follow_the_arch(jaw: ScannedJaw) -> None:
         assert frame.axes[1] @ (middle - np.array([0.0, -5.0, middle[2]])) > 10
     sides = {tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0, 0] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
     assert all((x > 0) == (fdi > 20) for fdi, x in sides.items())
+
+
+def test_matched_frames_agree_with_the_cervical_lines(jaw: ScannedJaw) -> None:
+    # Two ways that share no data but the arch's order: crowns' shapes, and the line where they leave the gums. Neither knows a tooth to better than some
+    # degrees; 7 of the occlusal axis and 7 of the buccal one were measured.
+    chosen = [k for k, tooth in enumerate(jaw.teeth) if tooth.fdi in (14, 15, 16, 17)]
+    matched = jaw_frames([jaw.teeth[k] for k in chosen], np.zeros((1, 3)))
+    for frame, k in zip(matched, chosen, strict=True):
+        assert (np.diag(frame.axes @ jaw.frames[k].axes.T) > np.cos(np.radians(12))).all(), jaw.teeth[k].fdi
 
 
 def test_real_teeth_show_their_outside(jaw: ScannedJaw) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from services.core.geometry import Camera
-from services.fit.blocks import StoredFile
+from services.fit.blocks import BlockTask, PixelParts, StoredFile
+from services.fit.derivatives import REACH, SCORES_SHARE, Differentiation
+from services.fit.neighbours import Neighbours
 from services.fit.optics.domain import Coordinate, Domain, natural_derivative, to_dual
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.passes import REACH, SCORES_SHARE, BlockTask, Differentiation, StackProblem
+from services.fit.passes import StackProblem
 from services.fit.transport.recipe import View
 
 TISSUE = Tissue(Medium(5.0, 0.997, g1=0.72), Medium(14.0, 0.995, g1=0.8))
@@ -54,7 +56,7 @@ class Linear:
 
 
 def rendered(how: Differentiation, tissue: Tissue, engine: Linear, samples: int = 1024) -> np.ndarray:
-    return how.render(engine, BlockTask(NOWHERE, 0, NOWHERE, "step", tissue, samples), VIEW, seed=1)[:, 0]
+    return how.render(engine, BlockTask(NOWHERE, 0, NOWHERE, "step", tissue, samples), VIEW, seeds=(1,))[0][:, 0]
 
 
 def slope(x: np.ndarray, k: int, engine: Linear) -> float:
@@ -89,23 +91,50 @@ def test_every_column_gets_its_share_of_the_paths_and_a_common_image_is_rendered
     assert len(x) == 5
 
 
-@pytest.mark.parametrize("jacobian_g", [0.0, None])
-def test_in_a_jaw_and_in_exact_media_extinction_has_scores(jacobian_g: float | None) -> None:
-    prefix = "" if jacobian_g is None else "0."
-    base: Tissue | Mouth = TISSUE if jacobian_g is None else Mouth((TISSUE, TISSUE))
-    domain = Domain(tuple(Coordinate((f"{prefix}{name}",)) for name in ("enamel.sigma", "enamel.alpha")))
-    how = problem(base, domain, jacobian_g).jacobian_media(domain.x_of(base))[2]
+def test_in_exact_media_extinction_has_scores() -> None:
+    domain = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha")))
+    how = problem(TISSUE, domain, None).jacobian_media(domain.x_of(TISSUE))[2]
     assert (how.secants, how.share) == ((), 1)
+
+
+class Teeth(Linear):
+    """A jaw's engine: a pixel for each tooth, brightened a little by both neighbours."""
+
+    def call(self, method: str, recipe: StoredFile, tissue: Mouth, view: View, names: tuple[str, ...] = (), *, samples: int, seed: int) -> Any:  # noqa: ARG002
+        self.asked.append((method, samples))
+        if method != "images":
+            return SimpleNamespace(jacobian=np.zeros((len(names), 1, len(tissue.teeth))))
+        own = np.array([self.value(tooth) for tooth in tissue.teeth])
+        return SimpleNamespace(mean=(own + 0.1 * np.append(own[1:], 0) + 0.1 * np.append(0, own[:-1]))[None])
+
+
+def test_teeth_that_stand_apart_are_moved_at_once_and_told_apart() -> None:
+    fdi = (12, 11, 21, 22, 23)
+    engine, mouth = Teeth(), Mouth(tuple(TISSUE.with_values({"enamel.sigma": 4.0 + k}) for k in range(len(fdi))))
+    names = [f"{k}.{leaf}" for k in range(len(fdi)) for leaf in ("dentin.cosine", "enamel.cosine")]
+    domain, neighbours = Domain(tuple(Coordinate((name,)) for name in names)), Neighbours.of(fdi)
+    x = domain.x_of(mouth)
+    _, similar, how = replace(problem(mouth, domain), neighbours=neighbours).jacobian_media(x)
+    places = np.arange(len(fdi), dtype=np.int16)
+    task = BlockTask(NOWHERE, 0, NOWHERE, "step", similar, 1024)
+    (rows,) = how.render(engine, task, VIEW, seeds=(1,), parts=PixelParts(places, places))
+
+    # Three colours of two cosines, one end each, and the image itself; what is beyond the neighbours is nobody's.
+    assert engine.asked == [("images", 1024 // REACH["cosine"].share)] * 7
+    beside = np.abs(places[:, None] - places) <= 1
+    slope = 3 * natural_derivative("cosine", float(x[1]))
+    np.testing.assert_allclose(rows[1::2], slope * np.where(places[:, None] == places, 1.0, np.where(beside, 0.1, 0.0)), rtol=1e-9, atol=1e-9)
+    assert not rows[::2].any()
 
 
 def test_a_secant_keeps_inside_the_bounds() -> None:
     low, _ = (bound[4] for bound in DOMAIN.bounds)
     x = DOMAIN.x_of(TISSUE)
     x[4] = low
-    (secant,) = (one for one in problem().jacobian_media(x)[2].secants if one.coordinate == 4)
+    (secant,) = (one for one in problem().jacobian_media(x)[2].secants if one.coordinates == (4,))
     ends = [to_dual("cosine", medium.enamel.mean_cosine) for medium in (secant.low, secant.high)]
     np.testing.assert_allclose(ends, [low, low + 0.5], atol=1e-9)
-    assert secant.width > 0
+    assert secant.widths[0] > 0
 
 
 def test_the_closing_measurement_takes_slopes_of_the_images_own_media() -> None:

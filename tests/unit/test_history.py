@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from services.api.events import EventLog, event_table, folder_events
-from services.api.history import read_history
+from services.api.history import Histories, History, read_history
 from services.core.stage import StageEvent
 
 
@@ -45,6 +45,21 @@ def test_a_later_attempt_replaces_the_steps_that_it_repeats(log: EventLog) -> No
     for number in range(2, 6):
         log.append(2, step(number, loss=2.0))
     assert read_history(log, 500).series[0].loss == [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]
+
+
+def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads = []
+    monkeypatch.setattr("services.api.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked))
+    histories = Histories(most_bytes=2000)
+    for number in range(3):
+        log.append(1, step(number))
+        for _ in range(2):
+            assert History.model_validate_json(histories.read(log, 500)) == read_history(log, 500)
+    assert len(reads) == 3
+    for points in range(3, 30):
+        histories.read(log, points)
+    histories.read(log, 500)
+    assert len(reads) == 3 + 27 + 1  # the others have pushed it out
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import sqlalchemy as sql
 
 from services.api.database import sqlite_url
 from services.api.events import JobEvent
@@ -178,4 +179,31 @@ def test_an_interrupted_stage_has_no_range_and_the_next_one_has(tmp_path: Path) 
             repository.lose()
             assert told().reason == "It was interrupted; the next stage will tell a time again."
     assert told().low_s is not None
+    repository.close()
+
+
+def test_a_long_queue_is_asked_for_at_once(tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "capture")
+    repository = Repository(sqlite_url(tmp_path / DATABASE_FILE))
+    remember_runs(tmp_path, str(capture), (900.0, 950.0, 1000.0, 1050.0, 1100.0))
+    ranges = TimeRanges(repository, lambda spec: spec, lambda _: None, machine_class())
+    asked = 0
+
+    @sql.event.listens_for(repository.engine, "checkout")
+    def _count(*_: object) -> None:
+        nonlocal asked
+        asked += 1
+
+    def questions() -> int:
+        job = repository.create(JobSpec(capture=capture), key=None).job
+        before = asked
+        told = ranges.of(job)
+        assert told is not None
+        assert told.high_s is not None
+        return asked - before
+
+    alone = questions()
+    for _ in range(20):
+        repository.create(JobSpec(capture=capture), key=None)
+    assert questions() == alone
     repository.close()

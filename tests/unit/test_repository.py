@@ -13,7 +13,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from services.api import audit, capture_table, tokens, webhook_tables
-from services.api.database import metadata, open_database, patiently, sqlite_url, writing
+from services.api.database import Query, metadata, open_database, patiently, sqlite_url, writing
 from services.api.events import event_table
 from services.api.lifecycle import JobState, Trigger
 from services.api.migrations import FIRST, upgrade
@@ -261,3 +261,10 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: Postg
     assert len(tries) == 2
     for engine in (silent, other):
         engine.dispose()
+
+
+def test_a_query_that_the_database_does_not_answer_is_told_as_such(tmp_path: Path) -> None:
+    engine = open_database(sqlite_url(tmp_path / "empty.sqlite"))
+    with pytest.raises(sql.exc.OperationalError, match="no such table"):
+        Query(sql.select(job_table)).rows(engine)
+    engine.dispose()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from functools import cache
 from importlib import resources
 from typing import Any
 
@@ -20,8 +21,9 @@ class Preset(Record):
     options: dict[str, Any] = Field(description="as in POST /v1/jobs; what is left out keeps its default")
 
 
+@cache
 def list_presets() -> list[Preset]:
-    """All of them, by name."""
+    """All of them, by name; read once, as they belong to the package."""
     files = (file for file in resources.files(__name__).iterdir() if file.name.endswith(".toml"))
     return sorted((Preset(name=file.name.removesuffix(".toml"), **tomllib.loads(file.read_text())) for file in files), key=lambda preset: preset.name)
 

@@ -42,6 +42,10 @@ MIDDLE_FRACTION = 0.75
 PROXIMAL_FRACTION = 0.48
 """Of half the width at that height: below a half, what is further out stays further out."""
 STEP_MM = 0.05
+UNFOLDING_ROUNDS = 12
+"""In which vertices of faces that turn over move less and less; what is left then are slivers."""
+CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
+"""Of the weights, but for the base's."""
 SLICES = 20
 """Of the tooth's height, in which its width is taken."""
 
@@ -69,11 +73,13 @@ def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, crown: T
     proximal = _side(base.vertices_mm @ axes.T) * np.sqrt(height)
     drop = (FULL_DROP_MM - BASE_DEPTH_MM) * height**2
     share = np.ones(len(height))
-    for _ in range(40):
+    for attempt in range(40):
         along = (share * buccal * (inward @ axes[1]), -share * proximal, -share * drop)
         moved = [_kept_inside(base.vertices_mm + np.outer(length, axes[axis]), grid) for length, axis in zip(along, MODE_AXES, strict=True)]
         modes = np.stack(moved) - base.vertices_mm
         short = _shallowest_corner_mm(base.vertices_mm, modes, grid) < CORNER_DEPTH_MM
+        if attempt < UNFOLDING_ROUNDS:
+            short[np.unique(base.faces[_turned_over(base, modes)])] = True
         if not short.any():
             return DentinShape(base, modes)
         share = _smooth_below(base, np.where(short, 0.8 * share, share))
@@ -150,6 +156,20 @@ def _shallowest_corner_mm(start: NDArray[np.float64], modes: NDArray[np.float64]
     # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the lingual hollow.
     weights = np.stack(np.meshgrid(*[(0.0, 0.5, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
     return np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0)
+
+
+def _turned_over(base: Mesh, modes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    # Faces that some corner of the weights' box turns over.
+    before = _normals(base.vertices_mm, base.faces)
+    turned = np.zeros(len(before), dtype=bool)
+    for c in CORNERS:
+        turned |= (before * _normals(base.vertices_mm + np.tensordot(c, modes, axes=1), base.faces)).sum(axis=1) <= 0
+    return turned
+
+
+def _normals(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    a, b, c = (vertices_mm[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
 
 
 def _neighbour_mean(mesh: Mesh) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from services.core.errors import CaptureInputError
+
 Status = Literal["Wheeler", "from memory"]
 """``Wheeler``: Wheeler's table of averages (Wheeler's Dental Anatomy, Physiology and Occlusion); ``from memory``: the same table, recalled."""
 
@@ -43,5 +45,11 @@ UPPER_TEETH = (
 
 
 def upper_tooth(position: int) -> ToothDimensions:
-    """Dimensions of the tooth at a place 1 to 8 from the midline."""
+    """Dimensions of the tooth at a place 1 to 8 from the midline.
+
+    Raises:
+        CaptureInputError: no tooth has this place.
+    """
+    if not 1 <= position <= len(UPPER_TEETH):
+        raise CaptureInputError(f"No tooth stands at place {position} from the midline; FDI numbers end in 1 to {len(UPPER_TEETH)}, so renumber the tooth.")
     return UPPER_TEETH[position - 1]

@@ -29,6 +29,11 @@ class ToothFrame:
         """For meshes that are in the canonical frame already."""
         return ToothFrame(np.eye(3), np.zeros(3))
 
+    @staticmethod
+    def centred(axes: NDArray[np.float64], mesh: Mesh) -> ToothFrame:
+        """Of axes (3, 3) as rows, with the origin at the middle of the mesh's box."""
+        return ToothFrame(axes, -axes @ (mesh.vertices_mm.min(axis=0) + mesh.vertices_mm.max(axis=0)) / 2)
+
     @property
     def axes(self) -> NDArray[np.float64]:
         """(3, 3): rows are the mesial, buccal and occlusal directions in world coordinates."""
@@ -44,12 +49,12 @@ class ToothFrame:
 
 
 def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFrame:
-    """Canonical frame of an incisor, canine or premolar from its shape and from where it is seen.
+    """Canonical frame of an incisor, canine or premolar whose FDI number is not known, from its shape and from where it is seen.
 
     The occlusal axis is the mesh's long axis where there is a root: away from the end to which a whole root tapers, or from the blunter end, which is
     that of a root cut short. For a bare crown it points from the centre of volume to that of the outline, because a front tooth thins towards its edge.
-    Molars are not known by it. Buccal is the direction of the cameras across that axis. Mesial is y × z, which for the other half of the jaw is distal;
-    the blend modes do not tell them apart.
+    Molars are not known by it; ``jaw_frames`` knows all by their numbers. Buccal is the direction of the cameras across that axis. Mesial is y × z, which
+    for the other half of the jaw is distal; the blend modes do not tell them apart.
 
     Args:
         viewpoints_mm: camera centres (N, 3).
@@ -76,8 +81,7 @@ def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFram
         axis /= np.linalg.norm(axis)
     buccal = view - (view @ axis) * axis
     buccal /= np.linalg.norm(buccal)
-    rotation = np.stack([np.cross(buccal, axis), buccal, axis])
-    return ToothFrame(rotation, -rotation @ centre)
+    return ToothFrame.centred(np.stack([np.cross(buccal, axis), buccal, axis]), outer)
 
 
 def _leads_to_the_crown(offsets_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:

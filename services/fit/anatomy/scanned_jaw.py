@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
+from services.fit.anatomy.average_arch import nominal_places, side_of_front
 from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.patches import (
     areas_mm2,
@@ -31,8 +32,6 @@ STEEPEST_TILT_DEG = 25.0
 """Of a tooth's axis off the arch's normal: upper front teeth lean about so far to the front."""
 FLAT = 0.2
 """Spread of the crowns across their line, relative to that along it, above which their middles span the occlusal plane."""
-NOMINAL_MM = np.array([(4.2, 0.0), (11.6, -2.0), (18.0, -6.5), (22.0, -12.5), (24.5, -19.5), (27.0, -28.0), (29.5, -37.5), (31.0, -47.0)])
-"""Middles of the teeth 1 to 8 of a quadrant in an average arch; they serve to tell front from back and left from right."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
     teeth = tuple(Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}")) for number in scan.teeth)
     deepest = min(float(tooth.outer.vertices_mm[:, 2].min()) for tooth in teeth)
     gums = gums_solid(surface, labels == GINGIVA, np.array([0.0, 0.0, 1.0]), deepest)
-    frames = tuple(_centred(axes[tooth.fdi], tooth.outer) for tooth in teeth)
+    frames = tuple(ToothFrame.centred(axes[tooth.fdi], tooth.outer) for tooth in teeth)
     return ScannedJaw(teeth, frames, gums, np.block([[rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
 
 
@@ -110,7 +109,7 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     side = np.linalg.svd(occlusal[None])[2][1]
     across = np.stack([side, np.cross(occlusal, side)])
     seen = (middles - middles.mean(axis=0)) @ across.T
-    nominal = np.array([NOMINAL_MM[number % 10 - 1] * (_right_of_front(number), 1) for number in teeth])
+    nominal = nominal_places(teeth)[0][:, :2]
     nominal -= nominal.mean(axis=0)
     seen_plane, nominal_plane = seen @ (1, 1j), nominal @ (1, 1j)
     match, mirrored = np.vdot(nominal_plane, seen_plane), np.vdot(nominal_plane.conj(), seen_plane)
@@ -121,13 +120,8 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     return np.stack([x, np.cross(occlusal, x), occlusal])
 
 
-def _right_of_front(number: int) -> int:
-    # Sign of x = y × z: upper teeth point down and lower ones up, so x is the patient's left in one jaw and right in the other.
-    return 1 if number // 10 in (2, 4) else -1
-
-
 def _tooth_axes(teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArray[np.float64]) -> dict[int, NDArray[np.float64]]:
-    order = sorted(range(len(teeth)), key=lambda k: _right_of_front(teeth[k]) * (teeth[k] % 10))
+    order = sorted(range(len(teeth)), key=lambda k: side_of_front(teeth[k]) * (teeth[k] % 10))
     tangents = np.gradient(middles[order], axis=0)
     upward, axes = np.array([0.0, 0.0, 1.0]), {}
     for k, tangent in zip(order, tangents, strict=True):
@@ -140,11 +134,6 @@ def _tooth_axes(teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArra
         buccal = _unit(np.cross(occlusal, tangent))
         axes[teeth[k]] = np.stack([np.cross(buccal, occlusal), buccal, occlusal])
     return axes
-
-
-def _centred(axes: NDArray[np.float64], mesh: Mesh) -> ToothFrame:
-    centre = (mesh.vertices_mm.min(axis=0) + mesh.vertices_mm.max(axis=0)) / 2
-    return ToothFrame(axes, -axes @ centre)
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -128,7 +128,7 @@ def write_photographs(folder: Path, case: Case) -> None:
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel shows."""
-    from services.fit.jaw_driver import known_dentins
+    from services.fit.jaw_driver import jaw_dentins
     from services.fit.jaw_views import label_views
     from services.fit.observations import channel_scene, read_channel, read_observations
     from services.fit.transport.engine import Engine
@@ -136,7 +136,8 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     if not is_published(job, "prepared"):
         prepare(job, spec)
     observations = read_observations(job, spec)
-    scene = channel_scene(observations, CHANNEL, known_dentins(observations.teeth), spec)
+    dentins = jaw_dentins(observations.teeth, observations.manifest.cameras, spec)
+    scene = channel_scene(observations, CHANNEL, dentins, spec)
     return PreparedTooth(job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene))
 
 
@@ -169,7 +170,8 @@ def mouth_of(values: Mapping[str, float], like: Mouth) -> Mouth:
         like: a mouth of the same parts.
     """
     one = Medium(1.0, 0.5)
-    mouth = Mouth(tuple(Tissue(one, one) for _ in like.teeth), None if like.gums is None else one, like.reflectance)
+    shapes = [tuple(value for name, value in values.items() if name.startswith(f"{k}.shape.")) for k in range(len(like.teeth))]
+    mouth = Mouth(tuple(Tissue(one, one, shape) for shape in shapes), None if like.gums is None else one, like.reflectance)
     known = {name: value for name, value in values.items() if name.rpartition(".")[2] in {*MEDIUM_FIELDS, "reflectance"}}
     for k in range(len(like.teeth)):
         if f"{k}.dentin.sigma" not in known:

@@ -138,6 +138,8 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
     for fdi, tooth in report.teeth.items():
         for channel, own in tooth.parameters.items():
             tables[channel] |= {f"{fdi}.{name}": estimate for name, estimate in own.items()}
+            if tooth.enamel_thickness is not None:
+                tables[channel][f"{fdi}.enamel.thickness"] = tooth.enamel_thickness
     if report.enamel_thickness is not None:
         for table in tables.values():
             table["enamel.thickness"] = report.enamel_thickness

@@ -119,6 +119,12 @@ class Coordinate:
         """Key into the tables of this module."""
         return kind_of(self.targets[0])
 
+    @property
+    def tooth(self) -> int | None:
+        """The one tooth of a jaw that it belongs to, by its position; None for any other."""
+        owners = {target.partition(".")[0] for target in self.targets}
+        return int(owner) if len(owners) == 1 and (owner := owners.pop()).isdigit() else None
+
 
 @dataclass(frozen=True)
 class Domain:
@@ -156,9 +162,8 @@ class Domain:
 
     @property
     def relation(self) -> NDArray[np.int_]:
-        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums or wall, 2 of two teeth. All 0 for a tooth alone."""
-        owners = [name.partition(".")[0] for name in (c.targets[0] for c in self.coordinates)]
-        tooth = np.array([int(owner) if owner.isdigit() else -1 for owner in owners])
+        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two teeth. All 0 for a tooth alone."""
+        tooth = np.array([-1 if c.tooth is None else c.tooth for c in self.coordinates])
         if (tooth < 0).all():
             return np.zeros((len(tooth), len(tooth)), dtype=int)
         shared = (tooth < 0)[:, None] | (tooth < 0)
@@ -167,7 +172,7 @@ class Domain:
     @property
     def cosines(self) -> tuple[str, ...]:
         """Parts whose mean cosine is a coordinate. Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity."""
-        return tuple(part for c in self.coordinates if c.kind == "cosine" for part in [c.targets[0].rpartition(".")[0]])
+        return tuple(target.rpartition(".")[0] for c in self.coordinates if c.kind == "cosine" for target in c.targets)
 
     def x_of(self, tissue: Optics) -> NDArray[np.float64]:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""

@@ -190,7 +190,7 @@ def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, s
 
     Args:
         tissue: the solution.
-        parts: ``enamel``, ``dentin``, of a mouth ``3.enamel``, ``gums`` or ``cavity``; a single tooth's blend weights follow ``tissue.shape``.
+        parts: ``enamel``, ``dentin``, ``shape``, of a mouth ``3.enamel``, ``3.shape``, ``gums`` or ``cavity``.
         known: uncertainty of the coordinates that were fitted; None where nothing was.
         shape_known: uncertainty of the blend weights where another channel's fit gave them.
     """
@@ -200,6 +200,10 @@ def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, s
         if part == "cavity":
             out["cavity.reflectance"] = _raw(tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None)
             continue
+        if part.rpartition(".")[2] == "shape":
+            names = [f"{part}.{k}" for k in range(len(_weights(tissue, part)))]
+            out |= {name: _raw(tissue, name, known if name in fitted else shape_known) for name in names}
+            continue
         for leaf in MEDIUM_FIELDS:
             name = f"{part}.{leaf}"
             if f"{part}.cosine" in fitted and leaf in {"sigma", "alpha", "g1"}:
@@ -208,10 +212,12 @@ def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, s
                 out[name] = _raw(tissue, name, known if name in fitted else None)
         for leaf, (unit, quantity) in DERIVED.items():
             out[f"{part}.{leaf}"] = _derived(tissue, known, part, quantity, unit)
-    for k in range(len(tissue.shape) if isinstance(tissue, Tissue) else 0):
-        name = f"shape.{k}"
-        out[name] = _raw(tissue, name, known if name in fitted else shape_known)
     return out
+
+
+def _weights(tissue: Optics, part: str) -> tuple[float, ...]:
+    # Blend weights of a tooth, ``shape`` or ``3.shape``.
+    return tissue.shape if isinstance(tissue, Tissue) else tissue.teeth[int(part.partition(".")[0])].shape
 
 
 def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:

@@ -6,11 +6,16 @@ everywhere in the cell: a flight shorter than that meets nothing, exactly and no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from services.core.geometry import Mesh
 
 CELL_MM = 0.1
 MOST_CELLS = 6_000_000
@@ -19,6 +24,8 @@ SPACING_PER_CELL = 0.3
 """Surfaces are sampled so densely that no surface point is farther than this from a sample, over the size of a cell."""
 REBUILD_MM = 0.1
 """A border that moved less than this only lowers the bound; one that moved more is measured again."""
+MARGIN_MM = 1.5
+"""Of several inner surfaces each is measured so far around its box, and taken to be just as far from all other places."""
 
 
 def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float) -> NDArray[np.float64]:
@@ -35,6 +42,15 @@ def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], 
     return np.concatenate(points)
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """The distance to one inner surface, about where it was at some time."""
+
+    vertices_mm: NDArray[np.float64]
+    window: tuple[slice, ...]
+    bound: NDArray[np.float64]
+
+
 class Clearance:
     """Lower bound of the distance to any surface, inside solids."""
 
@@ -45,32 +61,47 @@ class Clearance:
         self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MOST_CELLS)))
         self._shape = np.ceil(extent / self._cell_mm).astype(int) + 1
         self._corner = low
-        self._outer = self._distance(outer_vertices_mm, outer_faces)
-        self._inner: NDArray[np.float64] | None = None
-        self._measured_mm: NDArray[np.float64] | None = None
+        self._outer = self._distance(outer_vertices_mm, outer_faces, self._window(None))
+        self._inner: dict[int, _Measured] = {}
         self._low = dr.opaque(mi.Point3f, low.tolist())
         self._upload(self._outer)
 
-    def move_inner(self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
-        """Account for the inner surface at its present place."""
-        moved = np.inf if self._measured_mm is None else float(np.linalg.norm(vertices_mm - self._measured_mm, axis=1).max())
-        if moved > REBUILD_MM:
-            self._inner, self._measured_mm, moved = self._distance(vertices_mm, faces), vertices_mm, 0.0
-        assert self._inner is not None
-        self._upload(np.minimum(self._outer, self._inner - moved))
+    def move_inner(self, surfaces: Sequence[Mesh]) -> None:
+        """Account for the inner surfaces at their present places."""
+        bound = self._outer.copy() if len(surfaces) == 1 else np.minimum(self._outer, MARGIN_MM - REBUILD_MM)
+        for k, surface in enumerate(surfaces):
+            known = self._inner.get(k)
+            moved = np.inf if known is None else float(np.linalg.norm(surface.vertices_mm - known.vertices_mm, axis=1).max())
+            if known is None or moved > REBUILD_MM:
+                window = self._window(surface.vertices_mm if len(surfaces) > 1 else None)
+                known, moved = _Measured(surface.vertices_mm, window, self._distance(surface.vertices_mm, surface.faces, window)), 0.0
+                self._inner[k] = known
+            bound[known.window] = np.minimum(bound[known.window], known.bound - moved)
+        self._upload(bound)
 
-    def _distance(self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-        empty = np.ones(self._shape, dtype=bool)
+    def _window(self, vertices_mm: NDArray[np.float64] | None) -> tuple[slice, ...]:
+        # Cells within the margin of a surface's box; all cells for None.
+        if vertices_mm is None:
+            return tuple(slice(0, int(count)) for count in self._shape)
+        low = np.floor((vertices_mm.min(axis=0) - MARGIN_MM - self._corner) / self._cell_mm).astype(int)
+        high = np.ceil((vertices_mm.max(axis=0) + MARGIN_MM - self._corner) / self._cell_mm).astype(int) + 1
+        return tuple(slice(max(int(a), 0), max(int(b), 0)) for a, b in zip(low, np.minimum(high, self._shape), strict=True))
+
+    def _distance(self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]) -> NDArray[np.float64]:
+        first = np.array([one.start for one in window])
+        empty = np.ones([max(one.stop - one.start, 0) for one in window], dtype=bool)
         spacing = SPACING_PER_CELL * self._cell_mm
-        cells = np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int)
-        kept = ((cells >= 0) & (cells < self._shape)).all(axis=1)
+        cells = np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int) - first
+        kept = ((cells >= 0) & (cells < empty.shape)).all(axis=1)
         empty[tuple(cells[kept].T)] = False
+        if empty.all():
+            return np.zeros(empty.shape)
         # From cell centre to cell centre; a sample may sit in its cell's corner.
         between_centres = ndimage.distance_transform_edt(empty, sampling=self._cell_mm)
-        return np.asarray(between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing).reshape(-1)
+        return np.asarray(between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing)
 
     def _upload(self, bound: NDArray[np.float64]) -> None:
-        self._table = mi.Float(bound.astype(np.float32))
+        self._table = mi.Float(bound.reshape(-1).astype(np.float32))
         dr.eval(self._table)
 
     def __call__(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:

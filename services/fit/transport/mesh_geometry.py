@@ -72,8 +72,7 @@ class MeshGeometry:
         moved = [dentin.vertices_mm(shapes[k]) for k, dentin in self._dentins.items()]
         points = np.concatenate([self._fixed_mm, *moved])
         if moved:
-            inner = self._faces[self.fixed_faces :].astype(np.int32) - len(self._fixed_mm)
-            self._clearance.move_inner(points[len(self._fixed_mm) :], inner)
+            self._clearance.move_inner([Mesh(vertices, dentin.base.faces) for vertices, dentin in zip(moved, self._dentins.values(), strict=True)])
         if self._border is not None:
             self._border.move(*self._dentin_now(moved))
         positions = mi.Float(points.reshape(-1).astype(np.float32))

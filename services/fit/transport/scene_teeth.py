@@ -116,7 +116,5 @@ def _clearance(outer: list[Mesh], inner: list[Mesh], other_boxes: list[Any]) -> 
         return None
     grid = Clearance(outer[0].vertices_mm, outer[0].faces)
     if inner:
-        first = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in inner[:-1]])
-        faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(inner, first, strict=True)])
-        grid.move_inner(np.concatenate([mesh.vertices_mm for mesh in inner]), faces.astype(np.int32))
+        grid.move_inner(inner)
     return grid

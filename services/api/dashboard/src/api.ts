@@ -68,17 +68,59 @@ export interface JobPage {
   next_before: number | null;
 }
 
+export interface Worker {
+  name: string;
+  host: string;
+  /** Stages that it runs or will run next. */
+  tasks: { stage: string; job: string }[];
+  memory_bytes: number;
+  memory_limit_bytes: number | null;
+}
+
+export interface Workers {
+  workers: Worker[];
+  /** How many there are, or why there are none yet. */
+  sentence: string;
+  succeeded_last_hour: number;
+  succeeded_last_day: number;
+}
+
 export interface Session {
   name: string;
   scopes: string[];
   is_open: boolean;
 }
 
+export interface DomeStatus {
+  firmware: string;
+  light_count: number;
+  interlock_closed: boolean;
+  emergency_stop: boolean;
+  supply_on: boolean;
+  /** ALL OFF holds: no light goes on until somebody starts anew. */
+  stopped: boolean;
+  faults: string[];
+  /** Lights that emit now. */
+  lit: number[];
+  /** Of each bank. */
+  temperature_degc: number[];
+  /** Of each bank. */
+  current_ma: number[];
+}
+
+export interface DomeState {
+  address: string;
+  status: DomeStatus;
+  /** Jobs whose capture is under way. */
+  capturing: string[];
+}
+
 /** The server does not know who asks; a token is needed. */
 export class Unauthenticated extends Error {}
 
-async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}): Promise<T> {
-  const answer = await fetch(`/v1${path}`, { method, headers });
+async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
+  const sent = body ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) } : { method, headers };
+  const answer = await fetch(`/v1${path}`, sent);
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
     throw new (answer.status === 401 ? Unauthenticated : Error)(problem?.detail ?? `The server answered ${answer.status}.`);
@@ -91,9 +133,15 @@ export const signIn = (token: string): Promise<Session> => ask("/session", "POST
 export const signOut = (): Promise<void> => ask("/session", "DELETE");
 
 export const listJobs = (before: number | null): Promise<JobPage> => ask(`/jobs?limit=50${before === null ? "" : `&before=${before}`}`);
+export const listWorkers = (): Promise<Workers> => ask("/workers");
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
+export const getDome = (): Promise<DomeState> => ask("/dome");
+export const allOff = (): Promise<{ status: DomeStatus; stopped: string[] }> => ask("/dome/off", "POST");
+export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> => ask("/dome/light", "PUT", {}, { light, level, on_s });
+export const darken = (): Promise<DomeStatus> => ask("/dome/light", "DELETE");
+export const preflight = (mouth: string): Promise<{ findings: string[] }> => ask("/dome/preflight", "POST", {}, { mouth });
 export const listArtifacts = (id: string): Promise<Artifact[]> => ask(`/jobs/${id}/artifacts`);
 export const getParameters = (id: string): Promise<Parameters> => ask(`/jobs/${id}/artifacts/parameters.json`);
 

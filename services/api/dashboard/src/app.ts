@@ -1,19 +1,25 @@
-/** The page: a list of jobs and the job that the address names; a form for a token where the server asks for one. */
+/** The page: a list of jobs and the job that the address names, or the dome; a form for a token where the server asks for one. */
 
 import { getSession, signOut, Unauthenticated } from "./api";
+import { DomeView } from "./domeView";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
 import { JobView } from "./jobView";
 import { SignIn } from "./signIn";
+import { WorkerList } from "./workerList";
 
 const REFRESH_MS = 3000;
+const DOME = "#/dome";
 
 const main = find("main");
 const jobs = find("jobs");
 const account = find("account");
 const connection = find("connection");
+const domeLink = find<HTMLAnchorElement>("dome");
 const list = new JobList(jobs);
-let view: JobView | null = null;
+const workers = find("workers");
+const workerList = new WorkerList(workers);
+let view: JobView | DomeView | null = null;
 let isSignedOut = false;
 
 function showConnection(open: boolean): void {
@@ -36,7 +42,10 @@ async function open(): Promise<void> {
   if (!id || isSignedOut) return;
   view?.stop();
   list.select(id);
-  view = new JobView(id, () => void refreshList(), showConnection);
+  const isDome = location.hash === DOME;
+  if (isDome) domeLink.setAttribute("aria-current", "page");
+  else domeLink.removeAttribute("aria-current");
+  view = isDome ? new DomeView(showConnection) : new JobView(id, () => void refreshList(), showConnection);
   main.replaceChildren(view.root);
   try {
     await view.start();
@@ -52,6 +61,8 @@ function askForToken(): void {
   view?.stop();
   view = null;
   jobs.hidden = true;
+  domeLink.hidden = true;
+  workers.hidden = true;
   account.replaceChildren();
   const form = new SignIn(() => void start());
   main.replaceChildren(form.root);
@@ -60,6 +71,7 @@ function askForToken(): void {
 
 async function showAccount(): Promise<void> {
   const session = await getSession();
+  domeLink.hidden = !session.is_open && !["admin", "operate-dome"].some((scope) => session.scopes.includes(scope));
   if (session.is_open) return;
   const button = element("button", { type: "button" }, "Sign out");
   button.addEventListener("click", () => void signOut().finally(() => location.reload()));
@@ -69,10 +81,12 @@ async function showAccount(): Promise<void> {
 async function start(): Promise<void> {
   isSignedOut = false;
   jobs.hidden = false;
+  workers.hidden = false;
   main.replaceChildren();
   await refreshList();
   if (isSignedOut) return;
   void showAccount();
+  void workerList.refresh();
   await open();
 }
 
@@ -83,6 +97,8 @@ window.addEventListener("unhandledrejection", (event) => {
   askForToken();
 });
 setInterval(() => {
-  if (!document.hidden && !isSignedOut) void refreshList();
+  if (document.hidden || isSignedOut) return;
+  void refreshList();
+  void workerList.refresh();
 }, REFRESH_MS);
 void start();

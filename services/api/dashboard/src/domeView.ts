@@ -1,0 +1,162 @@
+/** The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again every second. */
+
+import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, Unauthenticated } from "./api";
+import { element } from "./element";
+import { LightGrid } from "./lightGrid";
+
+const ASK_AGAIN_MS = 1000;
+const LONGEST_LIGHT_S = 30;
+
+export class DomeView {
+  readonly root = element("article", { class: "dome" });
+  private readonly state = element("span", { class: "badge", role: "status" });
+  private readonly address = element("span", { class: "soft" });
+  private readonly off = element("button", { type: "button", class: "all-off" }, "ALL OFF");
+  private readonly done = element("p", { class: "done", role: "status" });
+  private readonly refusal = element("p", { class: "failure", role: "alert" });
+  private readonly facts = element("dl", { class: "facts" });
+  private readonly capturing = element("p", { class: "soft" });
+  private readonly level = numberInput("level", 5, 1, 100);
+  private readonly seconds = numberInput("seconds", 10, 1, LONGEST_LIGHT_S);
+  private readonly dark = element("button", { type: "button" }, "Switch it off");
+  private readonly grid = new LightGrid((light) => void this.light(light));
+  private readonly mouth = element("input", { id: "mouth", type: "text", required: "", spellcheck: "false", autocomplete: "off" });
+  private readonly look = element("button", {}, "Run the preflight");
+  private readonly findings = element("ul", { class: "findings", role: "status" });
+  private timer = 0;
+  private isStopped = false;
+
+  constructor(private readonly onConnection: (open: boolean) => void) {
+    this.refusal.hidden = true;
+    this.off.addEventListener("click", () => void this.allOff());
+    this.dark.addEventListener("click", () => void this.act(async () => this.show(await darken())));
+  }
+
+  /** Fill the view, ALL OFF first of all, and follow the dome until `stop`. */
+  async start(): Promise<void> {
+    const rig = element("form", { class: "fields" }, labelled("Folder of the rig on the server", this.mouth), this.look);
+    rig.addEventListener("submit", (event) => {
+      event.preventDefault();
+      void this.preflight();
+    });
+    this.root.replaceChildren(
+      element("header", {}, element("h2", {}, "Dome"), this.state, this.address),
+      this.off,
+      element("p", { class: "soft" }, "Every light goes dark at once and every capture is stopped. It is no emergency stop: that one is a switch."),
+      this.done,
+      this.refusal,
+      section("One light, for alignment", this.capturing, this.fields(), this.grid.root),
+      section("Preflight", element("p", { class: "soft" }, "Every light for a moment, black level and clipping; takes seconds."), rig, this.findings),
+      section("Controller", this.facts),
+    );
+    await this.askAgain();
+  }
+
+  stop(): void {
+    this.isStopped = true;
+    window.clearTimeout(this.timer);
+  }
+
+  private fields(): HTMLElement {
+    return element("div", { class: "fields" }, labelled("Level, %", this.level), labelled(`Seconds, ${LONGEST_LIGHT_S} at most`, this.seconds), this.dark);
+  }
+
+  private async allOff(): Promise<void> {
+    await this.act(async () => {
+      const { status, stopped } = await allOff();
+      this.show(status);
+      this.done.textContent = `All is dark. ${stopped.length ? `Stopped: ${stopped.join(", ")}.` : "No job was capturing."}`;
+    });
+  }
+
+  private async light(light: number): Promise<void> {
+    for (const input of [this.level, this.seconds]) if (!input.reportValidity()) return;
+    await this.act(async () => this.show(await lightUp(light, this.level.valueAsNumber / 100, this.seconds.valueAsNumber)));
+  }
+
+  private async preflight(): Promise<void> {
+    this.look.disabled = true;
+    this.findings.replaceChildren(element("li", {}, "The dome is being looked at."));
+    let found: string[] = [];
+    await this.act(async () => {
+      const { findings } = await preflight(this.mouth.value.trim());
+      found = findings.length ? findings : ["All is well."];
+    });
+    this.findings.replaceChildren(...found.map((finding) => element("li", {}, finding)));
+    this.look.disabled = false;
+  }
+
+  /** Do something by hand; what is refused is told, and so is nothing else than the newest. */
+  private async act(deed: () => Promise<void>): Promise<void> {
+    this.refusal.hidden = true;
+    this.done.textContent = "";
+    try {
+      await deed();
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.tell(problem);
+    }
+  }
+
+  private askLater(): void {
+    if (this.isStopped) return;
+    this.timer = window.setTimeout(() => void this.askAgain(), ASK_AGAIN_MS);
+  }
+
+  private async askAgain(): Promise<void> {
+    try {
+      if (!document.hidden) this.take(await getDome());
+      this.onConnection(true);
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      if (problem instanceof TypeError) this.onConnection(false);
+      this.state.textContent = "unknown";
+      this.state.dataset["state"] = "FAILED";
+      if (!(problem instanceof TypeError)) this.tell(problem);
+    }
+    this.askLater();
+  }
+
+  private take(dome: DomeState): void {
+    this.show(dome.status);
+    this.address.textContent = dome.address;
+    this.capturing.hidden = dome.capturing.length === 0;
+    const jobs = dome.capturing.flatMap((id) => [" ", element("a", { href: `#/${id}` }, id)]);
+    this.capturing.replaceChildren("The dome captures, so no light goes on by hand. Job", ...jobs);
+  }
+
+  private show(status: DomeStatus): void {
+    const [first] = status.lit;
+    this.state.textContent = first === undefined ? (status.stopped ? "dark, ALL OFF" : "dark") : status.lit.length === 1 ? `light ${first} is on` : `${status.lit.length} lights are on`;
+    this.state.dataset["state"] = first === undefined ? "SUCCEEDED" : "RUNNING";
+    this.grid.show(status.light_count, status.lit);
+    const rows: [string, string][] = [
+      ["Lights", `${status.light_count}`],
+      ["Interlock", status.interlock_closed ? "closed" : "open"],
+      ["Emergency stop", status.emergency_stop ? "pressed" : "not pressed"],
+      ["LED supply", status.supply_on ? "on" : "off"],
+      ["ALL OFF", status.stopped ? "holds until somebody starts anew" : "does not hold"],
+      ["Faults", status.faults.join(", ") || "none"],
+      ["Banks", status.temperature_degc.map((degc, bank) => `${degc.toFixed(1)} °C, ${status.current_ma[bank] ?? 0} mA`).join(" · ")],
+      ["Firmware", status.firmware],
+    ];
+    this.facts.replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+  }
+
+  private tell(problem: unknown): void {
+    this.refusal.hidden = false;
+    this.refusal.textContent = problem instanceof Error ? problem.message : String(problem);
+  }
+}
+
+function section(title: string, ...content: HTMLElement[]): HTMLElement {
+  return element("section", {}, element("h3", {}, title), ...content);
+}
+
+function labelled(text: string, input: HTMLInputElement): HTMLElement {
+  return element("label", { for: input.id }, text, input);
+}
+
+function numberInput(id: string, value: number, least: number, most: number): HTMLInputElement {
+  return element("input", { id, type: "number", min: `${least}`, max: `${most}`, step: "1", value: `${value}`, required: "" });
+}

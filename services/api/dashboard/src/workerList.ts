@@ -1,0 +1,36 @@
+/** The workers, what each is doing, and how many jobs they get done. */
+
+import { listWorkers, type Worker } from "./api";
+import { element } from "./element";
+import { bytes } from "./format";
+
+export class WorkerList {
+  private readonly sentence = element("p", { class: "soft" });
+  private readonly items = element("ul");
+
+  constructor(root: HTMLElement) {
+    root.append(element("h2", {}, "Workers"), this.sentence, this.items);
+  }
+
+  async refresh(): Promise<void> {
+    try {
+      const found = await listWorkers();
+      const done = `Done: ${found.succeeded_last_hour} in the last hour, ${found.succeeded_last_day} in 24 h.`;
+      this.sentence.textContent = `${found.sentence} ${done}`;
+      const focused = this.items.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
+      this.items.replaceChildren(...found.workers.map(item));
+      if (focused) this.items.querySelector<HTMLElement>(`a[href="${focused}"]`)?.focus();
+    } catch (problem) {
+      this.sentence.textContent = problem instanceof Error ? problem.message : String(problem);
+      this.items.replaceChildren();
+    }
+  }
+}
+
+function item(worker: Worker): HTMLElement {
+  const task = worker.tasks[0];
+  const doing = task ? element("a", { href: `#/${task.job}` }, task.stage) : "idle";
+  const limit = worker.memory_limit_bytes === null ? "" : ` of ${bytes(worker.memory_limit_bytes)}`;
+  const memory = element("span", { class: "soft" }, `${worker.host}, ${bytes(worker.memory_bytes)}${limit}`);
+  return element("li", {}, element("strong", {}, `Worker ${worker.name}`), " ", doing, memory);
+}

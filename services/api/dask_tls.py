@@ -1,0 +1,68 @@
+"""How the parts of Dask prove to each other who they are: one folder of certificates, which API, scheduler and every worker have."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from services.core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from distributed import Security
+
+
+@dataclass(frozen=True)
+class Certificates:
+    """Whoever shows a certificate of the authority is let in, and nobody else; so the authority signs for this system alone. Host names are not compared."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+    @classmethod
+    def of(cls, folder: Path) -> Certificates:
+        """The files of a folder, named as Kubernetes names them: ``ca.crt``, ``tls.crt``, ``tls.key``.
+
+        Raises:
+            SettingsError: one of them is absent, or they do not belong together.
+        """
+        found = cls(folder / "ca.crt", folder / "tls.crt", folder / "tls.key")
+        for path in (found.authority, found.certificate, found.key):
+            if not path.is_file():
+                raise SettingsError(f"Setting DENTINE__SERVER__TLS: {path} does not exist; the folder needs ca.crt, tls.crt and tls.key.")
+        try:
+            found.context()
+        except OSError as problem:
+            what = f"Setting DENTINE__SERVER__TLS: the certificates in {folder} cannot be used ({problem})"
+            raise SettingsError(f"{what}; tls.key must be the key of tls.crt and readable, and all must be PEM.") from problem
+        return found
+
+    def context(self) -> ssl.SSLContext:
+        """For a connection to the scheduler."""
+        context = ssl.create_default_context(cafile=self.authority)
+        context.check_hostname = False
+        context.load_cert_chain(self.certificate, self.key)
+        return context
+
+    def security(self) -> Security:
+        """What Dask's own client takes."""
+        from distributed import Security
+
+        files = {
+            f"tls_{role}_{part}": str(path) for role in ("client", "scheduler", "worker") for part, path in (("cert", self.certificate), ("key", self.key))
+        }
+        return Security(tls_ca_file=str(self.authority), require_encryption=True, **files)
+
+    def arguments(self) -> tuple[str, ...]:
+        """What Dask's commands take."""
+        return (
+            *("--protocol", "tls", "--tls-ca-file", str(self.authority)),
+            *("--tls-cert", str(self.certificate), "--tls-key", str(self.key)),
+        )
+
+
+def scheduler_address(address: str, certificates: Certificates | None) -> str:
+    """An address as Dask takes it: the setting says whether by TLS, not the address."""
+    return address.replace("tcp://", "tls://", 1) if certificates is not None else address

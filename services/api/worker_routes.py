@@ -1,0 +1,23 @@
+"""Route that tells what workers do. Annotations are evaluated here, because FastAPI reads them."""
+
+from fastapi import APIRouter
+
+from services.api.answers import in_json
+from services.api.guard import needs
+from services.api.problems import refusals
+from services.api.repository import Repository
+from services.api.worker_states import WorkerList, list_workers
+from services.api.workers import Workers
+
+
+def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:
+    """Routes over the given workers."""
+    router = APIRouter(prefix="/v1", tags=["workers"], responses=refusals())
+
+    @router.get("/workers", dependencies=[needs("read")])
+    @in_json
+    def every() -> WorkerList:
+        """The workers, what each is doing, and how many jobs they got done; 503 where their scheduler does not answer."""
+        return list_workers(workers, repository)
+
+    return router

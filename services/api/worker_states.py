@@ -1,0 +1,93 @@
+"""What the workers of jobs do, as their scheduler tells it, and how many jobs they got done."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any, get_args
+
+import sqlalchemy as sql
+from pydantic import Field
+
+from services.api.database import Query
+from services.api.lifecycle import JobState
+from services.api.repository import Repository, job_table
+from services.api.workers import Workers
+from services.core.geometry import Record
+from services.core.stage import StageName
+
+HOUR_S, DAY_S = 3600.0, 86400.0
+_TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}")
+"""Key of a stage's task; see ``pipeline``."""
+_SUCCEEDED = Query(
+    sql.select(sql.func.count(), sql.func.coalesce(sql.func.sum(sql.case((job_table.c.changed_s > sql.bindparam("hour_ago_s"), 1), else_=0)), 0)).where(
+        job_table.c.state == JobState.SUCCEEDED.value, job_table.c.changed_s > sql.bindparam("day_ago_s")
+    )
+)
+
+
+class WorkerTask(Record):
+    """A stage that a worker runs."""
+
+    stage: StageName
+    job: str = Field(description="id")
+
+
+class WorkerState(Record):
+    """One worker process."""
+
+    name: str = Field(description="as its scheduler calls it")
+    host: str = Field(description="where it runs")
+    threads: int = Field(description="tasks that it takes on at once; renderers are processes beside it")
+    tasks: tuple[WorkerTask, ...] = Field(description="stages that it runs or will run next")
+    memory_bytes: int = Field(description="resident size of its process, renderers not counted")
+    memory_limit_bytes: int | None = Field(description="beyond it its tasks are stopped; null where it has none")
+    has_dome: bool = Field(description="whether captures may run there")
+    heard_s: float = Field(description="Unix time of its last sign of life")
+
+
+class WorkerList(Record):
+    """The workers of a server and what they get done."""
+
+    workers: tuple[WorkerState, ...] = Field(description="by name")
+    sentence: str = Field(description="how many there are, or why there are none yet")
+    succeeded_last_hour: int = Field(description="jobs, of every server of the database")
+    succeeded_last_day: int = Field(description="jobs in 24 h")
+
+
+def list_workers(workers: Workers, repository: Repository) -> WorkerList:
+    """Ask the scheduler and the database.
+
+    Raises:
+        SchedulerLostError: the scheduler does not answer.
+    """
+    seen = workers.look()
+    found = () if seen is None else tuple(sorted(_states(seen.workers, seen.processing), key=lambda one: one.name))
+    now_s = time.time()
+    in_day, in_hour = _SUCCEEDED.rows(repository.engine, hour_ago_s=now_s - HOUR_S, day_ago_s=now_s - DAY_S)[0]
+    return WorkerList(workers=found, sentence=_sentence(found, is_started=seen is not None), succeeded_last_hour=in_hour, succeeded_last_day=in_day)
+
+
+def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, Iterable[Any]]) -> Iterable[WorkerState]:
+    for address, worker in workers.items():
+        keys = (_TASK.fullmatch(str(key)) for key in processing.get(address, ()))
+        yield WorkerState(
+            name=str(worker["name"]),
+            host=str(worker["host"]),
+            threads=worker["nthreads"],
+            tasks=tuple(WorkerTask.model_validate({"stage": key[1], "job": key[2]}) for key in keys if key is not None),
+            memory_bytes=worker["metrics"].get("memory", 0),
+            memory_limit_bytes=worker["memory_limit"] or None,
+            has_dome=bool(worker["resources"].get("DOME")),
+            heard_s=worker["last_seen"],
+        )
+
+
+def _sentence(found: tuple[WorkerState, ...], *, is_started: bool) -> str:
+    if not is_started:
+        return "Workers start with the next job."
+    if not found:
+        return "The scheduler has no workers; start some, jobs wait for them."
+    busy = sum(bool(one.tasks) for one in found)
+    return f"{len(found)} worker{'s' if len(found) > 1 else ''}, {busy} busy."

@@ -1,0 +1,162 @@
+"""Where an average crown lies in the mesh of a tooth: closest points iterated from many turns at once (Besl and McKay 1992), with normals.
+
+Only the average's crown is looked for, so that it does not matter how much root the mesh has. Its size is free within limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+from services.fit.anatomy.average_arch import side_of_front
+from services.fit.anatomy.crown import build_tooth
+from services.fit.anatomy.dimensions import upper_tooth
+
+Array = NDArray[np.float64]
+
+NORMAL_MM = 2.0
+"""What a difference of one radian between normals counts as: it keeps a crown's walls apart, which are some millimetres from each other."""
+FARTHEST_MM = 3.0
+"""A point that is farther than this from the other surface counts as this far: it is of something that the other does not have."""
+SOFT_MM = 1.0
+"""Distance at which a point has half its weight in the next step."""
+SCALES = (0.8, 1.25)
+"""Of a tooth's size to the average's: real teeth differ by 10 to 20 %; an upper average stands for the smaller lower incisors too."""
+NECK = 0.12
+"""Share of the crown's length above its neck in which the mesh is not compared: its cervical line, or where it was cut and closed, is elsewhere."""
+MESH_POINTS, CROWN_POINTS = 3000, 2500
+"""Of the mesh and of the average, in which closest points are looked for: 0.3 mm apart."""
+REVERSE_STEP = 4
+"""Every so many of the mesh's points are compared with the average."""
+LEAST_REVERSE_POINTS = 20
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on a surface with its outward normals, (N, 3) each."""
+
+    points_mm: Array
+    normals: Array
+
+    @property
+    def features(self) -> Array:
+        """(N, 6): places and normals as lengths."""
+        return np.concatenate([self.points_mm, NORMAL_MM * self.normals], axis=1)
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Similarities of the average crown to a mesh, G of them."""
+
+    axes: Array
+    """(G, 3, 3): rows are the canonical axes in world coordinates."""
+    centres_mm: Array
+    """(G, 3): of the average crown's box."""
+    scales: Array
+    """(G,)"""
+    misfits_mm: Array
+    """(G,): mean distance, with normals, of the crown's points from the mesh."""
+
+    def of(self, chosen: NDArray[np.int64]) -> Placements:
+        """Some of them."""
+        return Placements(self.axes[chosen], self.centres_mm[chosen], self.scales[chosen], self.misfits_mm[chosen])
+
+
+class CrownMatch:
+    """An average crown of the tooth's kind and side beside its mesh."""
+
+    def __init__(self, fdi: int, outer: Mesh) -> None:
+        """Sample both surfaces.
+
+        Args:
+            fdi: a lower tooth is compared with the upper one of its kind.
+            outer: closed enamel surface, with any part of the root or none.
+        """
+        from scipy.spatial import cKDTree
+
+        average = build_tooth(upper_tooth(fdi % 10))
+        crown = average.outer.faces[average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm]
+        # x is mesial on the patient's right above and on the left below; on the other sides the average is a mirror image.
+        self._mirror = np.array([-float(side_of_front(fdi)), 1.0, 1.0])
+        self._crown = Mesh(average.outer.vertices_mm, crown)
+        self._middle = (average.outer.vertices_mm[crown].min(axis=(0, 1)) + average.outer.vertices_mm[crown].max(axis=(0, 1))) / 2
+        self._mesh, self._average = _sampled(outer, MESH_POINTS), self._crown_points(CROWN_POINTS)
+        self._mesh_tree, self._average_tree = cKDTree(self._mesh.features), cKDTree(self._average.features)
+
+    def settled(self, axes: Array, points: int, rounds: int) -> Placements:
+        """Turned, moved and scaled onto the mesh from canonical axes (G, 3, 3), the crown's top at the mesh's.
+
+        Args:
+            points: of the crown, that are compared.
+            rounds: of closest points.
+        """
+        crown = self._crown_points(points)
+        placed = self._begun(axes, crown.points_mm)
+        for _ in range(rounds):
+            placed = self._step(placed, crown)
+        _, distance = self._closest(placed, crown)
+        return Placements(placed.axes, placed.centres_mm, placed.scales, np.minimum(distance, FARTHEST_MM).mean(axis=1))
+
+    def reverse_misfits_mm(self, placed: Placements) -> Array:
+        """Mean distance (G,), with normals, of the mesh's points from the average crown, above its neck."""
+        points, normals = self._mesh.points_mm[::REVERSE_STEP], self._mesh.normals[::REVERSE_STEP]
+        low, high = self._average.points_mm[:, 2].min(), self._average.points_mm[:, 2].max()
+        misfits = np.full(len(placed.axes), FARTHEST_MM)
+        for g, (axes, centre, scale) in enumerate(zip(placed.axes, placed.centres_mm, placed.scales, strict=True)):
+            seen = SurfacePoints((points - centre) @ axes.T / scale, normals @ axes.T).features
+            seen = seen[seen[:, 2] > low + NECK * (high - low)]
+            if len(seen) >= LEAST_REVERSE_POINTS:
+                misfits[g] = np.minimum(self._average_tree.query(seen)[0], FARTHEST_MM).mean()
+        return misfits
+
+    def _crown_points(self, count: int) -> SurfacePoints:
+        found = _sampled(self._crown, count)
+        return SurfacePoints((found.points_mm - self._middle) * self._mirror, found.normals * self._mirror)
+
+    def _begun(self, axes: Array, crown_mm: Array) -> Placements:
+        along = np.einsum("gkj,nj->gkn", axes, self._mesh.points_mm)
+        length, top = float(np.ptp(crown_mm[:, 2])), along[:, 2].max(axis=1)
+        within = (along[:, 2] > (top - length)[:, None])[:, None]
+        low, high = np.where(within, along, np.inf).min(axis=2), np.where(within, along, -np.inf).max(axis=2)
+        middle = (low + high) / 2
+        middle[:, 2] = top - length / 2
+        ones = np.ones(len(axes))
+        return Placements(axes, np.einsum("gkj,gk->gj", axes, middle), ones, ones)
+
+    def _closest(self, placed: Placements, crown: SurfacePoints) -> tuple[Array, Array]:
+        # The mesh's point closest to each of the crown's (G, N, 3), and its distance (G, N).
+        points = placed.scales[:, None, None] * np.einsum("gkj,nk->gnj", placed.axes, crown.points_mm) + placed.centres_mm[:, None]
+        normals = np.einsum("gkj,nk->gnj", placed.axes, crown.normals)
+        distance, nearest = self._mesh_tree.query(np.concatenate([points, NORMAL_MM * normals], axis=2).reshape(-1, 6))
+        return self._mesh.points_mm[nearest].reshape(points.shape), np.asarray(distance.reshape(points.shape[:2]))
+
+    def _step(self, placed: Placements, crown: SurfacePoints) -> Placements:
+        # The similarity that brings the crown's points nearest to the mesh's (Umeyama 1991), far ones counting less.
+        target, distance = self._closest(placed, crown)
+        weight = 1 / (1 + (distance / SOFT_MM) ** 2)[..., None]
+        total = weight.sum(axis=1)
+        from_middle, to_middle = (weight * crown.points_mm).sum(axis=1) / total, (weight * target).sum(axis=1) / total
+        offset = crown.points_mm - from_middle[:, None]
+        left, size, right = np.linalg.svd(np.einsum("gni,gnj->gij", weight * offset, target - to_middle[:, None]))
+        signs = np.ones_like(size)
+        signs[:, 2] = np.sign(np.linalg.det(left @ right))
+        axes = np.einsum("gik,gk,gkj->gij", left, signs, right)
+        scales = np.clip((size * signs).sum(axis=1) / (weight * offset**2).sum(axis=(1, 2)), *SCALES)
+        return Placements(axes, to_middle - scales[:, None] * np.einsum("gkj,gk->gj", axes, from_middle), scales, placed.misfits_mm)
+
+
+def _sampled(mesh: Mesh, count: int) -> SurfacePoints:
+    # Evenly by area, the same for the same mesh.
+    random = np.random.default_rng(0)
+    corners = mesh.vertices_mm[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    twice = np.linalg.norm(normals, axis=1)
+    reached = np.cumsum(twice)
+    chosen = np.searchsorted(reached, (np.arange(count) + 0.5) / count * reached[-1])
+    u, v = random.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (corners[chosen, k] for k in range(3))
+    return SurfacePoints(a + u[:, None] * (b - a) + v[:, None] * (c - a), normals[chosen] / twice[chosen, None])

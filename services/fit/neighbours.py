@@ -1,0 +1,54 @@
+"""Which teeth of a jaw stand beside which, and so which of its coordinates act on which pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.blocks import PixelParts
+from services.fit.optics.domain import Domain
+
+COLOURS = 3
+"""Teeth of one colour have at least two others between them: what is seen of any tooth tells which one of them was changed."""
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Teeth, by their positions in the scene, in the order in which they stand along the arch."""
+
+    order: tuple[int, ...]
+
+    @staticmethod
+    def of(fdi: Sequence[int]) -> Neighbours:
+        """Those of some teeth by their numbers."""
+        return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: arch_place(fdi[k]))))
+
+    def colour(self, tooth: int) -> int:
+        """One of COLOURS, in turn along the arch."""
+        return self.order.index(tooth) % COLOURS
+
+    def beside(self, tooth: int) -> tuple[int, ...]:
+        """A tooth and its one or two neighbours: those that stand nearer to it than to any other of its colour."""
+        place = self.order.index(tooth)
+        return self.order[max(place - 1, 0) : place + 2]
+
+    def pixels(self, tooth: int, parts: PixelParts) -> NDArray[np.bool_]:
+        """Which pixels (N,) show a tooth or its neighbours, or gums and wall nearest to them."""
+        return np.isin(parts.tooth, self.beside(tooth))
+
+    def near(self, domain: Domain) -> tuple[tuple[int, ...], ...]:
+        """For each tooth the coordinates of itself, its neighbours, and what belongs to no one tooth."""
+        found = []
+        for tooth in range(len(self.order)):
+            teeth = {None, *self.beside(tooth)}
+            found.append(tuple(n for n, coordinate in enumerate(domain.coordinates) if coordinate.tooth in teeth))
+        return tuple(found)
+
+
+def arch_place(fdi: int) -> int:
+    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4), positive for the left (2, 3)."""
+    quadrant, place = divmod(fdi, 10)
+    return -place if quadrant in {1, 4} else place

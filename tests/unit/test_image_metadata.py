@@ -1,0 +1,91 @@
+"""What images say beside their pixels, against writers of their formats, and that pictures made here say nothing."""
+
+from __future__ import annotations
+
+import struct
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.api.image_metadata import metadata_fault, plain_png
+from services.fit.export.pictures import png16_bytes, png_bytes
+from services.preprocess.quality import write_picture
+from tests.support.told_images import XMP, Image, PngInfo, exif, told_png, with_text, written
+from tests.unit.test_image_headers import exr, exr_part
+
+
+def fault(tmp_path: Path, suffix: str, content: bytes) -> str | None:
+    path = tmp_path / "content"
+    path.write_bytes(content)
+    return metadata_fault(path, f"c0{suffix}", suffix)
+
+
+def text(value: bytes) -> tuple[str, bytes]:
+    return "string", value
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "named"),
+    [
+        (".png", told_png(), "eXIf, iTXt, tEXt"),
+        (".png", written(".png") + b"more", "4 bytes after its end"),
+        (".tif", written(".tif", exif=exif()), "EXIF, GPS, Make"),
+        (".tif", written(".tif", tiffinfo={700: XMP.encode()}), "XMP"),
+        (".tif", written(".tif", tiffinfo={50735: "0123456"}), "tag 50735"),
+        (".exr", exr(exr_part(4, 3, "BGR") | {"owner": text(b"A name"), "latitude": ("float", bytes(4))}), "latitude, owner"),
+        (".exr", exr(exr_part(4, 3, "Z"), exr_part(4, 3, "Y") | {"capDate": text(b"2026:11:22")}), "capDate"),
+    ],
+)
+def test_metadata_is_named(tmp_path: Path, suffix: str, content: bytes, named: str) -> None:
+    remedy = "which may say whose teeth these are; export it without metadata, or leave it out."
+    assert fault(tmp_path, suffix, content) == f"Image c0{suffix} carries metadata ({named}), {remedy}"
+
+
+def test_metadata_of_a_second_image_in_a_tiff_is_named(tmp_path: Path) -> None:
+    stream, second = BytesIO(), Image.new("L", (7, 5))
+    second.encoderinfo = {"tiffinfo": {315: "A name"}}
+    Image.new("L", (7, 5)).save(stream, format="TIFF", save_all=True, append_images=[second])
+    assert "(Artist)" in (fault(tmp_path, ".tif", stream.getvalue()) or "")
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "I;16", "P"])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_plain_images_pass(tmp_path: Path, suffix: str, mode: str) -> None:
+    software = PngInfo()
+    software.add_text("Software", "a program")
+    options: dict[str, Any] = {"pnginfo": software} if suffix == ".png" else {"software": "a program", "compression": "tiff_lzw"}
+    assert fault(tmp_path, suffix, written(suffix, mode, **options)) is None
+
+
+def test_a_plain_exr_passes(tmp_path: Path) -> None:
+    assert fault(tmp_path, ".exr", exr(exr_part(4, 3, "BGR") | {"pixelAspectRatio": ("float", struct.pack("<f", 1))})) is None
+    assert metadata_fault(tmp_path / "absent", "a.npy", ".npy") is None
+
+
+@given(st.sampled_from([(".png", told_png()), (".tif", written(".tif", exif=exif()))]), st.integers(0, 400), st.binary(max_size=8))
+def test_damage_is_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: tuple[str, bytes], at: int, noise: bytes) -> None:
+    suffix, content = row
+    try:
+        told = fault(tmp_path_factory.mktemp("damaged"), suffix, content[:at] + noise + content[at + len(noise) :] if noise else content[:at])
+    except ValueError as problem:
+        told = str(problem)
+    assert told is None or told
+
+
+def test_a_png_is_stripped_and_shows_the_same(tmp_path: Path) -> None:
+    before = png_bytes(np.random.default_rng(1).integers(0, 255, (6, 8, 3), dtype=np.uint8))
+    told = with_text(before, b"Author\0A name")
+    assert "(tEXt)" in (fault(tmp_path, ".png", told) or "")
+    assert plain_png(told + b"more") == before
+
+
+def test_pictures_made_here_say_nothing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    write_picture(tmp_path / "quality.png", rng.random((12, 8, 3), dtype=np.float32), np.zeros((12, 8), np.uint16))
+    for content in (png_bytes(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)), png16_bytes(rng.random((6, 8))), (tmp_path / "quality.png").read_bytes()):
+        assert fault(tmp_path, ".png", content) is None
