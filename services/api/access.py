@@ -35,10 +35,12 @@ class Access:
             scheme, _, presented = authorization.partition(" ")
             if scheme.lower() != "bearer":
                 raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
-            return Caller.of(await asyncio.to_thread(self.tokens.authenticate, presented.strip()))
+            token = self.tokens.trusted(presented=(presented := presented.strip()))
+            return Caller.of(token or await asyncio.to_thread(self.tokens.authenticate, presented))
         if (cookie := request.cookies.get(COOKIE)) is not None:
             token_id = self.sessions.token_id(cookie)
-            return Caller.of(await asyncio.to_thread(self.tokens.living, token_id), by_session=True)
+            token = self.tokens.trusted(session_of=token_id)
+            return Caller.of(token or await asyncio.to_thread(self.tokens.living, token_id), by_session=True)
         raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
 
     @staticmethod

@@ -8,8 +8,9 @@ id it saw misses none.
 from __future__ import annotations
 
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +22,8 @@ from services.core.errors import PlatformError, SettingsError
 
 BUSY_MS = 5000
 """How long a writer waits for another one before it gives up."""
+MOST_CONNECTIONS = 64
+"""Kept open to a file: as many as a server has threads that ask."""
 WRITER_LOCK = 0x64656E74
 """Number of the advisory lock, "dent"."""
 MOST_ID = 2**31 - 1
@@ -117,7 +120,8 @@ class Query:
 @contextmanager
 def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
     """A transaction that keeps other writers out from its first statement."""
-    with engine.connect() as connection, connection.execution_options(writes=True).begin():
+    turn = engine.get_execution_options().get("turn", nullcontext())
+    with turn, engine.connect() as connection, connection.execution_options(writes=True).begin():
         if engine.dialect.name == "postgresql":
             connection.execute(sql.select(sql.func.pg_advisory_xact_lock(WRITER_LOCK)))
         yield connection
@@ -135,7 +139,9 @@ def _watchful(url: sql.URL) -> dict[str, Any]:
 
 
 def _sqlite(url: sql.URL) -> sql.Engine:
-    engine = sql.create_engine(url, hide_parameters=True)  # errors end in logs
+    # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take turns before they ask it. Connections
+    # stay open, as opening one costs more than most questions. Errors end in logs, so they hide what was asked.
+    engine = sql.create_engine(url, hide_parameters=True, pool_size=MOST_CONNECTIONS, execution_options={"turn": threading.Lock()})
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:

@@ -9,6 +9,11 @@ from functools import cached_property
 from http import HTTPStatus
 from typing import TYPE_CHECKING
 
+import anyio
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.requests import HTTPConnection
+from starlette.responses import Response
+
 from services.api.access import Access
 from services.api.audit import AuditLog, Deed
 from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
@@ -20,8 +25,6 @@ from services.core.errors import PlatformError, RateError, ScopeError, Unauthent
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
-    from starlette.requests import HTTPConnection
-    from starlette.responses import Response
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 RECHECK_S = 5.0
@@ -36,8 +39,6 @@ class Gate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        from starlette.requests import HTTPConnection
-
         if scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
             return
@@ -91,9 +92,6 @@ class Gate:
         return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
 
     async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
-        import anyio
-        from sqlalchemy.exc import SQLAlchemyError
-
         scope = request.scope
         is_audited = scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
         known_at, is_over = time.monotonic(), False
@@ -156,8 +154,6 @@ def _too_many(who: str, wait_s: int, path: str) -> Response:
 
 
 def _nothing_there(found: Found, path: str, method: str) -> Response:
-    from starlette.responses import Response
-
     if found.allowed_methods:
         allowed = ", ".join(sorted(found.allowed_methods))
         problem = Problem.of(HTTPStatus.METHOD_NOT_ALLOWED, "method-not-allowed", f"{path} does not take {method}; it takes {allowed}.", path)

@@ -8,6 +8,8 @@ import secrets
 import time
 from typing import TYPE_CHECKING
 
+from starlette.datastructures import Headers, MutableHeaders
+
 from services.api.logs import bind_request
 from services.api.metrics import RequestMetrics
 
@@ -29,8 +31,6 @@ class RequestLog:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        from starlette.datastructures import Headers, MutableHeaders
-
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app
+from services.api.collector import leave_alone_what_is_loaded
 from services.api.logs import configure_logs
 from services.api.runner import RunJob
 from services.api.workers import Workers
@@ -51,6 +52,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
         server = uvicorn.Server(config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
+        leave_alone_what_is_loaded()
         server.run(sockets=[listener])
 
 

@@ -5,31 +5,31 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from http import HTTPStatus
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
 
 from services.api.problems import MEDIA_TYPE, Problem
 
 if TYPE_CHECKING:
-    from starlette.datastructures import Headers
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-_ALWAYS = MappingProxyType(
-    {
-        "Content-Security-Policy": PAGE_POLICY,
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
-        "Cross-Origin-Opener-Policy": "same-origin",
-        "Cross-Origin-Resource-Policy": "same-origin",
-        "Permissions-Policy": "camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()",
-    }
+_ALWAYS = (
+    (b"content-security-policy", PAGE_POLICY.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"permissions-policy", b"camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()"),
 )
-_YEAR_S = 365 * 86400
+_BY_TLS_ONLY = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
+_NOT_KEPT = (b"cache-control", b"no-store")
 
 
 class Shield:
@@ -40,26 +40,21 @@ class Shield:
     """
 
     def __init__(self, app: ASGIApp, *, names: Iterable[str], secure: bool) -> None:
-        self._app, self._names, self._secure = app, frozenset(name.strip("[] ").lower() for name in names), secure
+        self._app, self._names = app, frozenset(name.strip("[] ").lower() for name in names)
+        self._headers = (*_ALWAYS, *((_BY_TLS_ONLY,) if secure else ()))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request; ``secure`` servers tell browsers to come by TLS only."""
-        from starlette.datastructures import Headers, MutableHeaders
-        from starlette.responses import Response
-
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
 
         async def send_shielded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in _ALWAYS.items():
-                    headers.setdefault(name, value)
-                if self._secure:
-                    headers.setdefault("Strict-Transport-Security", f"max-age={_YEAR_S}")
-                if scope["path"].startswith("/v1/"):
-                    headers["Cache-Control"] = "no-store"
+                is_api = scope["path"].startswith("/v1/")
+                own = [one for one in message["headers"] if not (is_api and one[0] == b"cache-control")]
+                set_already = {name for name, _ in own}
+                message["headers"] = [*own, *(one for one in self._headers if one[0] not in set_already), *([_NOT_KEPT] if is_api else [])]
             await send(message)
 
         asked, refusal = Headers(scope=scope), None

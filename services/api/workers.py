@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
+from services.api.collector import leave_alone_what_is_loaded
 from services.api.dask_tls import Certificates, scheduler_address
 from services.core.errors import SchedulerLostError
 
@@ -28,6 +29,7 @@ WORKER_CONFIG: Mapping[str, Any] = MappingProxyType(
         "distributed.admin.tick.interval": "500ms",
         "distributed.admin.low-level-log-length": 50,
         "distributed.admin.log-length": 500,
+        "distributed.admin.system-monitor.interval": "10s",
         "distributed.admin.system-monitor.log-length": 120,
     }
 )
@@ -114,6 +116,7 @@ class Workers:
         import dask
         from distributed import Client, LocalCluster
 
+        leave_alone_what_is_loaded()
         dask.config.set(WORKER_CONFIG)  # for good, as connections that are made later read it too
         if self._scheduler is not None:
             try:
