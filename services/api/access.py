@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from starlette.requests import HTTPConnection
 
+    from services.api.clerks import Clerks
+
 
 class Access:
     """The callers of one server; ``sessions`` is None where access is open."""
@@ -35,12 +37,15 @@ class Access:
             scheme, _, presented = authorization.partition(" ")
             if scheme.lower() != "bearer":
                 raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
-            token = self.tokens.trusted(presented=(presented := presented.strip()))
-            return Caller.of(token or await asyncio.to_thread(self.tokens.authenticate, presented))
+            presented = presented.strip()
+            if (token := self.tokens.trusted(presented=presented)) is None:
+                token = await asyncio.to_thread(self.tokens.authenticate, presented)
+            return Caller.of(token)
         if (cookie := request.cookies.get(COOKIE)) is not None:
             token_id = self.sessions.token_id(cookie)
-            token = self.tokens.trusted(session_of=token_id)
-            return Caller.of(token or await asyncio.to_thread(self.tokens.living, token_id), by_session=True)
+            if (token := self.tokens.trusted(session_of=token_id)) is None:
+                token = await asyncio.to_thread(self.tokens.living, token_id)
+            return Caller.of(token, by_session=True)
         raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
 
     @staticmethod
@@ -62,8 +67,8 @@ def refuse_open_network(settings: ServerSettings) -> None:
         )
 
 
-def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine) -> None:
-    """Add the routes of tokens, sessions and audit, and the gate in front of all routes."""
+def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks) -> None:
+    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write."""
     from services.api.access_routes import build_access_router
     from services.api.body_limit import BodyLimit
     from services.api.gate import Gate
@@ -73,4 +78,4 @@ def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine) -> None:
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
     app.include_router(build_access_router(access, audit, secure=not settings.is_loopback))
     app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
-    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit)
+    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors)

@@ -37,6 +37,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
     from services.api import access, problems
     from services.api.calibration_routes import build_calibrations_router
     from services.api.captures_routes import build_captures_router
+    from services.api.clerks import Clerks
     from services.api.dome import Dome
     from services.api.dome_routes import build_dome_router
     from services.api.feed import EventFeed
@@ -61,8 +62,9 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
 
     jobs = Jobs(settings, run_in_turn)
     dome = Dome(settings.dome, jobs)
-    feed = EventFeed(jobs.repository)
-    observation = Observation(jobs, settings, certificates)
+    readers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1)
+    feed = EventFeed(jobs.repository, readers.ask)
+    observation = Observation(jobs, settings, readers, certificates)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -75,20 +77,22 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.to_thread(readers.close)
+            await asyncio.to_thread(auditors.close)
             await asyncio.to_thread(dome.close)
             await asyncio.to_thread(jobs.close)
             await asyncio.to_thread(workers.close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)
-    app.include_router(build_router(jobs, feed))
+    app.include_router(build_router(jobs, feed, readers))
     app.include_router(build_captures_router(jobs.captures))
     app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
     app.include_router(build_masks_router(jobs, Masks(jobs)))
     app.include_router(build_dome_router(dome))
     app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
-    access.install(app, settings, jobs.repository.engine)
+    access.install(app, settings, jobs.repository.engine, auditors)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
     names = {"127.0.0.1", "localhost", "::1", settings.host, *settings.names.split(",")} - {""}
     app.add_middleware(Shield, names=names, secure=not settings.is_loopback)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -60,10 +61,14 @@ class Turn:
 
 
 class EventFeed:
-    """Follows the event table while ``run`` runs. Made before the first stream, so that no event falls between what that has read and what is looked for."""
+    """Follows the event table while ``run`` runs. Made before the first stream, so that no event falls between what that has read and what is looked for.
 
-    def __init__(self, repository: Repository) -> None:
-        self._repository, self._newest = repository, repository.newest_event()
+    Args:
+        ask: calls a reader in a thread.
+    """
+
+    def __init__(self, repository: Repository, ask: Callable[[Callable[[], Chapter]], Coroutine[Any, Any, Chapter]] = asyncio.to_thread) -> None:
+        self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
         self._turn = Turn()
 
     async def run(self) -> None:
@@ -117,7 +122,7 @@ class EventFeed:
         """Read what happened up to this turn at least; whoever asks the same in the same turn shares the read."""
         key = (job_id, after)
         if key not in turn.reads:
-            turn.reads[key] = asyncio.create_task(asyncio.to_thread(_read, self._repository, job_id, after))
+            turn.reads[key] = asyncio.create_task(self._ask(partial(_read, self._repository, job_id, after)))
             turn.reads[key].add_done_callback(lambda _: turn.reads.pop(key))
         return await asyncio.shield(turn.reads[key])
 

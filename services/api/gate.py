@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Sequence
 from functools import cached_property
@@ -16,6 +15,7 @@ from starlette.responses import Response
 
 from services.api.access import Access
 from services.api.audit import AuditLog, Deed
+from services.api.clerks import Clerks
 from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
 from services.api.problems import MEDIA_TYPE, Problem, response_of
 from services.api.rates import Rates, network_of
@@ -34,8 +34,9 @@ RECHECK_S = 5.0
 class Gate:
     """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
 
-    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog) -> None:
-        self._app, self._owner, self._access, self._rates, self._audit = app, owner, access, rates, audit
+    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks) -> None:
+        self._app, self._owner, self._access, self._rates = app, owner, access, rates
+        self._audit, self._auditors = audit, auditors
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -73,7 +74,7 @@ class Gate:
         try:
             found.route.admit(caller)
         except ScopeError as problem:
-            await asyncio.to_thread(self._audit.append, deed, HTTPStatus.FORBIDDEN)
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.FORBIDDEN)
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
             return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
         request.scope["caller"], request.scope["deed"] = caller, deed
@@ -85,9 +86,9 @@ class Gate:
         deed.token = public_id(credential) if credential else None
         if wait_s := self._rates.count_refusal(network_of(deed.address)):
             if self._rates.is_worth_telling(network_of(deed.address)):
-                await asyncio.to_thread(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+                await self._auditors.ask(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
             return _too_many(f"Address {deed.address} was refused", wait_s, request.scope["path"])
-        await asyncio.to_thread(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
+        await self._auditors.ask(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
         challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
         return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
 
@@ -103,7 +104,7 @@ class Gate:
             if message["type"] == "http.response.start" and is_audited:
                 deed.ids |= _made(message)
                 try:
-                    await asyncio.to_thread(self._audit.append, deed, message["status"])
+                    await self._auditors.ask(self._audit.append, deed, message["status"])
                 except SQLAlchemyError:
                     is_over = True
                     full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
@@ -122,7 +123,7 @@ class Gate:
                 await self._app(scope, receive, send_audited)
             except Exception:
                 if is_audited:
-                    await asyncio.to_thread(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                    await self._auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
                 raise
 
     async def _is_still_known(self, request: HTTPConnection) -> bool:

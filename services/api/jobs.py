@@ -84,6 +84,8 @@ class Jobs:
             SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
             JobStateError: the key belongs to another job.
         """
+        if key is not None and (earlier := self.repository.submitted(spec, key)) is not None:
+            return Creation(earlier, is_new=False)
         if spec.capture is not None and not is_uploaded(spec.capture):
             require_server_path("capture", spec.capture)
         if spec.rig is not None:

@@ -9,6 +9,7 @@ from fastapi.responses import StreamingResponse
 from services.api.answers import JSON, in_json
 from services.api.archive import stream_zip
 from services.api.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
+from services.api.clerks import Clerks
 from services.api.database import MOST_ID
 from services.api.events import EventLog
 from services.api.guard import needs
@@ -22,7 +23,7 @@ from services.core.stage import StageName
 After = Annotated[int, Query(ge=0, le=MOST_ID, description="id of the last one that is known already")]
 
 
-def build_observe_router(jobs: Jobs) -> APIRouter:
+def build_observe_router(jobs: Jobs, readers: Clerks) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
     histories = Histories()
@@ -31,6 +32,7 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         return jobs.repository.events_of(jobs.repository.get(job_id).id)
 
     @router.get("/jobs/{job_id}/logs", tags=["jobs"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def logs(
         job_id: str,
@@ -43,11 +45,13 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         return read_log(events_of(job_id), after, limit, stage, attempt)
 
     @router.get("/jobs/{job_id}/history", response_model=History, tags=["jobs"], dependencies=[needs("read")])
+    @readers.answering
     def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> Response:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
         return Response(histories.read(events_of(job_id), points, channel), media_type=JSON)
 
     @router.get("/jobs/{job_id}/previews", tags=["artifacts"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def previews(job_id: str, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
         """Pictures that the fit has made so far, oldest first."""
@@ -86,12 +90,14 @@ def build_observe_router(jobs: Jobs) -> APIRouter:
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
 
     @router.get("/presets", tags=["options"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def presets() -> list[Preset]:
         """Named sets of options."""
         return list_presets()
 
     @router.get("/presets/{name}", tags=["options"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def preset(name: str) -> Preset:
         """One set of options, to merge into a job's own."""

@@ -140,7 +140,7 @@ class Lease:
 _IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)
 _JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields))  # built once, as what follows: building a query takes longer than asking it
 _ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
-_WITH_KEY = _JOBS.where(job_table.c.key == sql.bindparam("of_key"))
+_WITH_KEY = Query(_JOBS.where(job_table.c.key == sql.bindparam("of_key")))
 _NEWEST_EVENTS = Query(
     sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > sql.bindparam("after")).group_by(event_table.c.job)
 )
@@ -182,10 +182,8 @@ class Repository:
         """
         options = spec.model_dump_json()
         with writing(self.engine) as connection:
-            if key is not None and (earlier := connection.execute(_WITH_KEY, {"of_key": key}).first()):
-                if earlier.spec != options:
-                    raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
-                return Creation(self._job(earlier), is_new=False)
+            if key is not None and (earlier := connection.execute(_WITH_KEY.statement, {"of_key": key}).first()):
+                return Creation(self._same(earlier, spec, key), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
             row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
             row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture)}
@@ -193,6 +191,15 @@ class Repository:
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
             return Creation(self._find(connection, job_id), is_new=True)
+
+    def submitted(self, spec: JobSpec, key: str) -> Job | None:
+        """The job that was submitted with this idempotency key, if there is one.
+
+        Raises:
+            JobStateError: the key was used for other options.
+        """
+        rows = _WITH_KEY.rows(self.engine, of_key=key)
+        return self._same(rows[0], spec, key) if rows else None
 
     def get(self, job_id: str) -> Job:
         """One job.
@@ -348,6 +355,12 @@ class Repository:
         if not rows:
             raise UnknownJobError(f"There is no job {job_id}; list the jobs to see their ids.")
         return self._job(rows[0])
+
+    def _same(self, row: Sequence[Any], spec: JobSpec, key: str) -> Job:
+        job = self._job(row)
+        if job.spec != spec:
+            raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
+        return job
 
     def _jobs(self, rows: Iterable[Any]) -> list[Job]:
         return [self._job(row) for row in rows]

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from services.api.answers import in_json
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
+from services.api.clerks import Clerks
 from services.api.database import MOST_ID
 from services.api.feed import EVENT_ANSWERS, EventFeed
 from services.api.guard import needs
@@ -41,7 +42,7 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
+def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
@@ -59,6 +60,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return creation.job
 
     @router.get("/jobs", tags=["jobs"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def page(
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
@@ -75,6 +77,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def get(job_id: str) -> JobDetail:
         """One job with its stages."""
@@ -96,6 +99,7 @@ def build_router(jobs: Jobs, feed: EventFeed) -> APIRouter:
         return jobs.delete(job_id)
 
     @router.get("/deletions/{job_id}", tags=["jobs"], dependencies=[needs("read")])
+    @readers.answering
     @in_json
     def deletion(job_id: str) -> Deletion:
         """The receipt of a deleted job."""

@@ -19,6 +19,7 @@ from fastapi import FastAPI
 from services.api import access, problems
 from services.api.captures import Captures
 from services.api.captures_routes import build_captures_router
+from services.api.clerks import Clerks
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
 from tests.support.uploading import TUS, announce, checksum, create_upload, offset_of, patch, upgraded
@@ -59,7 +60,7 @@ def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
     app.include_router(build_captures_router(captures))
-    access.install(app, ServerSettings(data=tmp_path), engine)
+    access.install(app, ServerSettings(data=tmp_path), engine, Clerks(1))
     with serving(app) as connected:
         yield connected
     engine.dispose()

@@ -132,6 +132,39 @@ def test_a_revoked_token_ends_at_once_and_stays_listed(table: Tokens) -> None:
         table.revoke("rig-1", make_deed())
 
 
+def test_a_token_that_was_found_is_trusted_for_a_second(table: Tokens, engine: sql.Engine, clock: Clock) -> None:
+    token = issue(table)
+    assert table.trusted(presented=token) is None
+    found = table.authenticate(token)
+    clock.now_s += tokens.TRUSTED_S - 0.01
+    assert table.trusted(presented=token) == found
+    Tokens(engine, clock).revoke(found.id, make_deed())  # another process
+    clock.now_s += 0.02
+    assert table.trusted(presented=token) is None
+    with pytest.raises(UnauthenticatedError):
+        table.authenticate(token)
+
+
+def test_trust_ends_with_the_token(table: Tokens, clock: Clock) -> None:
+    token = issue(table, days=1)
+    clock.now_s += DAY_S - 0.5
+    found = table.authenticate(token)
+    clock.now_s += 0.5
+    assert table.trusted(presented=token) is None
+    token = issue(table, "rig-2")
+    found = table.authenticate(token)
+    table.revoke(found.id, make_deed())
+    assert table.trusted(presented=token) is None
+
+
+def test_an_id_never_passes_for_a_token(table: Tokens) -> None:
+    found = table.authenticate(token := issue(table))
+    table.living(found.id)
+    assert [one.id for one in (table.trusted(session_of=found.id), table.trusted(presented=token)) if one] == [found.id, found.id]
+    assert table.trusted(presented=found.id) is None
+    assert table.trusted(session_of=token) is None
+
+
 def test_a_name_has_one_living_token(table: Tokens, clock: Clock) -> None:
     issue(table, days=1)
     with pytest.raises(InputError, match="'rig-1' is in use"):

@@ -263,6 +263,29 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: Postg
         engine.dispose()
 
 
+def test_writers_of_one_process_take_turns_before_they_ask_sqlite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.database.BUSY_MS", 0)  # so that whoever asks out of turn is refused at once
+    engine = open_database(sqlite_url(tmp_path / "jobs.sqlite"))
+    upgrade(engine)
+    written: list[bool] = []
+
+    def write() -> None:
+        with writing(engine) as connection:
+            connection.execute(sql.text("UPDATE job SET changed_s = 0"))
+            written.append(True)
+
+    with writing(engine):
+        others = [threading.Thread(target=write) for _ in range(4)]
+        for other in others:
+            other.start()
+        others[0].join(0.2)
+        assert not written
+    for other in others:
+        other.join()
+    assert len(written) == len(others)
+    engine.dispose()
+
+
 def test_a_query_that_the_database_does_not_answer_is_told_as_such(tmp_path: Path) -> None:
     engine = open_database(sqlite_url(tmp_path / "empty.sqlite"))
     with pytest.raises(sql.exc.OperationalError, match="no such table"):

@@ -1,0 +1,46 @@
+"""Threads that do short work in order: what only asks the database, and what only appends to it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from functools import partial, wraps
+from typing import Any, ParamSpec, Self, TypeVar
+
+import sqlalchemy as sql
+
+MOST_READERS = 8
+"""Of a database over a network, where most of the time is waiting."""
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Clerks:
+    """So many threads, begun when there is work. What may take long, or waits for others, belongs elsewhere."""
+
+    def __init__(self, count: int) -> None:
+        self._pool = ThreadPoolExecutor(count, "clerk")
+
+    @classmethod
+    def reading(cls, engine: sql.Engine) -> Self:
+        """One where the database is a file: it answers sooner than threads wrest the interpreter from each other, which each of them must after every query."""
+        return cls(1 if engine.dialect.name == "sqlite" else MOST_READERS)
+
+    async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
+        """What the work returns."""
+        return await asyncio.get_running_loop().run_in_executor(self._pool, partial(copy_context().run, work, *arguments, **options))
+
+    def answering(self, handler: Callable[P, R]) -> Callable[P, Coroutine[Any, Any, R]]:
+        """Let a handler be called here, where FastAPI would call it in one of forty threads."""
+
+        @wraps(handler)
+        async def answer(*arguments: P.args, **options: P.kwargs) -> R:
+            return await self.ask(handler, *arguments, **options)
+
+        return answer
+
+    def close(self) -> None:
+        """Wait for what is under way."""
+        self._pool.shutdown()
