@@ -145,7 +145,7 @@ _NEWEST_EVENTS = Query(
     sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > sql.bindparam("after")).group_by(event_table.c.job)
 )
 _UNFINISHED = Query(_JOBS.where(_IS_UNFINISHED).order_by(job_table.c.number))
-_BEGUN = Query(latest_of_stages(event_table.c.job.in_(sql.select(job_table.c.id).where(_IS_UNFINISHED))))
+_BEGUN = Query(latest_of_stages(sql.select(job_table.c.id).where(_IS_UNFINISHED)))
 _INSERT = job_table.insert()
 
 

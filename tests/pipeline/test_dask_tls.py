@@ -80,6 +80,7 @@ def test_a_job_runs_by_tls_and_strangers_are_refused(tmp_path: Path, monkeypatch
             job = client.post("/v1/jobs", json={"capture": str(tmp_path), "workers": 1}).json()["id"]
             client.get(f"/v1/jobs/{job}/events")
             assert client.get(f"/v1/jobs/{job}").json()["state"] == "SUCCEEDED"
+            assert client.get("/v1/workers").json()["sentence"] == "1 worker, 0 busy."
 
 
 def test_a_folder_that_lacks_a_file_or_mixes_two_is_a_sentence(tmp_path: Path) -> None:
