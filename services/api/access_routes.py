@@ -14,6 +14,7 @@ from services.api.sessions import COOKIE
 from services.api.tokens import NAME, Caller, IssuedToken, Scope, Token
 from services.core.errors import UnauthenticatedError
 from services.core.geometry import Record
+from services.core.records import Number
 
 
 class TokenRequest(Record):
@@ -21,7 +22,7 @@ class TokenRequest(Record):
 
     name: str = Field(description="who or what uses it", json_schema_extra={"pattern": f"^{NAME}$"})
     scopes: tuple[Scope, ...] = Field(description="what it may do", json_schema_extra={"minItems": 1})
-    expires_days: float | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
+    expires_days: Number | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
 
 
 class Session(Record):

@@ -7,12 +7,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
 from services.core.geometry import Camera, Light, Record, Vector3
 
-Unit = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
+Number = Annotated[float, Strict()]
+"""A number, and neither a text nor true or false for one, so that no light burns at full level because somebody wrote "level": true."""
+Unit = Annotated[Number, Field(ge=0, le=1)]
+Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
@@ -58,7 +60,7 @@ class SimulatedCameraSpec(Record):
     black_level: int = Field(default=64, description="counts without light")
     noise_relative: Unit = Field(default=0.01, description="noise, fraction of the value")
     noise_floor: Unit = Field(default=0.002, description="noise, fraction of full scale")
-    motion_px: float = Field(default=0.0, ge=0, description="largest displacement of the subject between frames, pixels")
+    motion_px: Number = Field(default=0.0, ge=0, description="largest displacement of the subject between frames, pixels")
     seed: int = 0
 
 
@@ -70,10 +72,10 @@ class RigSpec(Record):
     mouth: Path = Field(description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see")
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
     exposure_s: Positive = Field(default=0.05, description="exposure time")
-    settle_s: float = Field(default=0.002, ge=0, description="wait between light on and exposure")
+    settle_s: Number = Field(default=0.002, ge=0, description="wait between light on and exposure")
     tracking_every: int = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
     black_frames: int = Field(default=2, ge=1, description="frames without light")
-    watchdog_s: float = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
+    watchdog_s: Number = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
     light_exposure_limit_s: Positive = Field(default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment")
     total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
@@ -91,7 +93,7 @@ class JobSpec(Record):
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     calibration: Path | None = Field(default=None, description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>")
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
-    ior: float = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
+    ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(
         default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
     )
