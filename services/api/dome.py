@@ -15,7 +15,7 @@ from services.api.jobs import Jobs, require_server_path
 from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError, UnknownDomeError
 from services.core.geometry import Record
-from services.core.records import Number, RigSpec, Unit
+from services.core.records import Number, RigSpec, Unit, Whole
 from services.core.settings import DomeSettings
 
 ANSWER_S = 30.0
@@ -29,7 +29,7 @@ LONGEST_LIGHT_S = 30.0
 class LightRequest(Record):
     """One light to switch on, all others off."""
 
-    light: int = Field(ge=0, lt=2**15, description="index of the light, from 0")
+    light: Whole = Field(ge=0, lt=2**15, description="index of the light, from 0")
     level: Unit = Field(default=0.05, description="LED level, fraction of full scale")
     on_s: Number = Field(default=10.0, gt=0, le=LONGEST_LIGHT_S, description="it goes dark by itself after this time; ask again to keep it on")
 

@@ -5,14 +5,24 @@ from __future__ import annotations
 from enum import IntFlag
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
+from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Record, Vector3
 
+
+def _no_stand_in(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        raise PydanticCustomError("int_type", "give a number, neither a text nor true or false")
+    return value
+
+
 Number = Annotated[float, Strict()]
-"""A number, and neither a text nor true or false for one, so that no light burns at full level because somebody wrote "level": true."""
+"""Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level": true."""
+Whole = Annotated[int, BeforeValidator(_no_stand_in)]
+"""The same, but 2.0 is whole too."""
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
@@ -57,11 +67,11 @@ class SimulatedCameraSpec(Record):
     """What the simulated cameras add to the virtual mouth they look at."""
 
     bits: Literal[8, 10, 12, 14, 16] = Field(default=12, description="analogue-to-digital resolution")
-    black_level: int = Field(default=64, description="counts without light")
+    black_level: Whole = Field(default=64, description="counts without light")
     noise_relative: Unit = Field(default=0.01, description="noise, fraction of the value")
     noise_floor: Unit = Field(default=0.002, description="noise, fraction of full scale")
     motion_px: Number = Field(default=0.0, ge=0, description="largest displacement of the subject between frames, pixels")
-    seed: int = 0
+    seed: Whole = 0
 
 
 class RigSpec(Record):
@@ -73,8 +83,8 @@ class RigSpec(Record):
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
     exposure_s: Positive = Field(default=0.05, description="exposure time")
     settle_s: Number = Field(default=0.002, ge=0, description="wait between light on and exposure")
-    tracking_every: int = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
-    black_frames: int = Field(default=2, ge=1, description="frames without light")
+    tracking_every: Whole = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
+    black_frames: Whole = Field(default=2, ge=1, description="frames without light")
     watchdog_s: Number = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
     light_exposure_limit_s: Positive = Field(default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment")
     total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
@@ -100,23 +110,23 @@ class JobSpec(Record):
     held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
     loss: Loss = Field(default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders")
     solver: Literal["gauss-newton", "adam"] = Field(default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples")
-    adam_steps: int = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
+    adam_steps: Whole = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
     adam_rate: Positive = Field(default=0.05, description="learning rate of solver = adam, in lengths over which images are about linear")
     prior: Literal["weak", "literature"] = Field(default="weak", description="literature: media are drawn towards measured teeth where the images say little")
     stains: bool = Field(default=False, description="fit a texture of stains on the enamel after the media")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
     held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
     channels: tuple[str, ...] | None = Field(default=None, description="channels to fit; default: all")
-    seed: int = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
-    pixel_step: int = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
-    samples_per_pixel: int = Field(default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs")
-    max_samples_per_pixel: int = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
-    max_steps: int = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
-    search_candidates: int = Field(default=50_000, ge=100, description="table-search points per channel")
+    seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
+    pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
+    samples_per_pixel: Whole = Field(default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs")
+    max_samples_per_pixel: Whole = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
+    max_steps: Whole = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
+    search_candidates: Whole = Field(default=50_000, ge=100, description="table-search points per channel")
     advise: bool = Field(default=True, description="say at the end which further light or view would help most")
     sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
-    workers: int = Field(default=2, ge=1, le=1024, description="processes of a local run")
+    workers: Whole = Field(default=2, ge=1, le=1024, description="processes of a local run")
     device: Device = Field(default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker")
 
     @model_validator(mode="after")

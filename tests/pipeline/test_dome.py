@@ -153,6 +153,7 @@ def test_all_off_holds_until_somebody_starts_anew(client: httpx.Client, observer
         ({"light": 1, "on_s": 31}, "'on_s'"),
         ({"light": 1, "level": 1.5}, "'level'"),
         ({"light": 1, "level": True}, "'level'"),
+        ({"light": "1"}, "'light'"),
         ({}, "'light'"),
     ],
 )
