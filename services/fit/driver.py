@@ -107,7 +107,8 @@ class FitDriver:
         misplaced = offsets_told(
             evaluations, {c: worst_error(fit) for c, fit in fits.items()}, observations, views, f"the mesh of tooth {observations.teeth[0].fdi}"
         )
-        converged, advice = converged and not misplaced, misplaced + advice
+        misnumbered = [told_number] if (told_number := self._number_told(observations.teeth[0])) else []
+        converged, advice = converged and not misplaced and not misnumbered, misnumbered + misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance)
@@ -125,6 +126,11 @@ class FitDriver:
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )
+
+    def _number_told(self, tooth: Tooth) -> str:
+        from services.fit.anatomy.jaw_frames import number_told
+
+        return number_told(tooth) if self.attempt.spec.dentin == "fit" else ""
 
     def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:
         parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")

@@ -17,7 +17,7 @@ from services.fit.anatomy.crown import build_tooth
 from services.fit.anatomy.dimensions import upper_tooth
 from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.jaw import Jaw, build_jaw
-from services.fit.anatomy.jaw_frames import jaw_frames, tooth_frame
+from services.fit.anatomy.jaw_frames import jaw_frames, number_told, tooth_frame
 from tests.support.shared_data import shared_path
 
 Axes = NDArray[np.float64]
@@ -63,6 +63,13 @@ PHANTOM_BOUNDS_DEG = np.array([8.0, 8.0, 3.0])
 def test_a_phantom_jaw_is_known_whole_or_in_part_in_any_pose(subject: Jaw, numbers: tuple[int, ...]) -> None:
     errors = phantom_errors_deg(subject, numbers, len(numbers))
     assert (errors <= PHANTOM_BOUNDS_DEG).all(), dict(zip(numbers, errors.round(1).tolist(), strict=True))
+
+
+def test_a_tooth_with_another_kinds_number_is_told(subject: Jaw) -> None:
+    premolar, incisor = subject.tooth(24), subject.tooth(11)
+    sentence = number_told(Tooth(11, premolar.outer))
+    assert sentence.startswith("Tooth 11 is shaped like a first premolar and not like a central incisor; give its right FDI number")
+    assert number_told(Tooth(24, premolar.outer)) == number_told(Tooth(11, incisor.outer)) == ""
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Tooth
 from services.fit.anatomy.average_arch import arch_from_middles, is_upper, nominal_places
+from services.fit.anatomy.dimensions import upper_tooth
 from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.matching import CrownMatch
 from services.fit.anatomy.patches import areas_mm2
@@ -37,6 +38,12 @@ ARCH_SHARE = 0.25
 FREE_DRIFT_DEG = 15.0
 """By which a tooth's match may turn away from the arch's at no cost: half a step between turns, and how teeth stand in an arch."""
 DRIFT_MM_PER_DEG = 1 / 30
+DOUBTFUL_MM, MUCH_LESS = 0.8, 0.5
+"""Misfit, both ways, from which a tooth's number is doubted, and the share of it that another kind must come to. Phantom teeth come to 0.3 by their own
+kind and to 1.1 to 1.5 by another family's; real bare crowns to 1.6 whichever kind they are compared with, and nothing can be said of them."""
+KINDS = (1, 3, 4, 6)
+"""Places from the midline that stand for their families."""
+KEPT_OF_KIND = 8
 LARGEST_OWN_TURN_DEG = 40.0
 """Of a tooth's own match against the arch: upper incisors lean by 20 degrees, last molars by 30; beyond, the arch is believed."""
 
@@ -57,6 +64,27 @@ def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
     close = match.settled(coarse.axes[np.argsort(coarse.misfits_mm)[:KEPT]], *CLOSE)
     misfits = close.misfits_mm + match.reverse_misfits_mm(close) + VIEW_MM * (1 - close.axes[:, 1] @ view) / 2
     return ToothFrame.centred(close.axes[misfits.argmin()], tooth.outer)
+
+
+def number_told(tooth: Tooth) -> str:
+    """A sentence where a tooth clearly has the shape of another kind than its FDI number says; else nothing."""
+    own_mm = _misfit_mm(tooth, tooth.fdi)
+    if own_mm < DOUBTFUL_MM:
+        return ""
+    place = tooth.fdi % 10
+    misfits_mm = {other: _misfit_mm(tooth, tooth.fdi - place + other) for other in KINDS if other != place}
+    likest = min(misfits_mm, key=lambda other: misfits_mm[other])
+    if misfits_mm[likest] > MUCH_LESS * own_mm:
+        return ""
+    shape, named = upper_tooth(likest).name, upper_tooth(place).name
+    return f"Tooth {tooth.fdi} is shaped like a {shape} and not like a {named}; give its right FDI number, as dentin's shape follows from it."
+
+
+def _misfit_mm(tooth: Tooth, fdi: int) -> float:
+    match = CrownMatch(fdi, tooth.outer)
+    coarse = match.settled(_even_turns(TURNS), *COARSE)
+    close = match.settled(coarse.axes[np.argsort(coarse.misfits_mm)[:KEPT_OF_KIND]], *CLOSE)
+    return float((close.misfits_mm + match.reverse_misfits_mm(close)).min())
 
 
 def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame, ...]:
