@@ -42,6 +42,8 @@ class FitDriver:
         observations = read_observations(attempt.context.root, spec)
         (tooth,) = observations.teeth
         dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
+        if misnumbered := _number_told(tooth, spec):
+            attempt.log(misnumbered)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
         layout = stain_layout(tooth.outer, texel_edge_mm(pixel_edge_mm(tooth, observations.manifest.cameras, spec))) if spec.stains else None
@@ -69,6 +71,8 @@ class FitDriver:
         if layout is not None and textures:
             keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
         report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+        if misnumbered:
+            report = report.model_copy(update={"converged": False, "advice": f"{misnumbered} {report.advice}".strip(), "told": NOTHING})
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
         return report.model_copy(update={"next_capture": where + next_capture})
 
@@ -107,8 +111,7 @@ class FitDriver:
         misplaced = offsets_told(
             evaluations, {c: worst_error(fit) for c, fit in fits.items()}, observations, views, f"the mesh of tooth {observations.teeth[0].fdi}"
         )
-        misnumbered = [told_number] if (told_number := self._number_told(observations.teeth[0])) else []
-        converged, advice = converged and not misplaced and not misnumbered, misnumbered + misplaced + advice
+        converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance)
@@ -126,11 +129,6 @@ class FitDriver:
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )
-
-    def _number_told(self, tooth: Tooth) -> str:
-        from services.fit.anatomy.jaw_frames import number_told
-
-        return number_told(tooth) if self.attempt.spec.dentin == "fit" else ""
 
     def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:
         parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")
@@ -151,6 +149,12 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
 
         return blend_shape(tooth, tooth_frame(tooth, viewpoints_mm(cameras)))
     return None
+
+
+def _number_told(tooth: Tooth, spec: JobSpec) -> str:
+    from services.fit.anatomy.jaw_frames import number_told
+
+    return number_told(tooth) if spec.dentin == "fit" else ""
 
 
 def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
