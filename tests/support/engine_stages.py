@@ -56,7 +56,8 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
         "crash": ("die", int(signal.SIGSEGV)),
         "render": ("render", str(spec.capture / "started")),
     }.get(call, ("answer", 1))
-    with executor(context.root / CANCEL_FLAG, REAL if call == "render" else BROKEN) as run_on:
+    prefix = f"{context.root.name}-{context.attempt}"  # as every fit has its own: Dask answers for a key that it still knows with the old result
+    with executor(context.root / CANCEL_FLAG, REAL if call == "render" else BROKEN, prefix) as run_on:
         run_on.gather([run_on.submit(call, ask, write_recipe(context.root, recipe()), method, *arguments)])
     return toy_stages.fit(spec, context)
 
