@@ -139,8 +139,7 @@ class Runner:
             is_begun = True
             self._run(self._locate(job.spec), folder, self._repository.address_of(lease))
         except JobCancelledError:
-            state = patiently(lambda: self._repository.get(job.id).state)
-            trigger = Trigger.STOPPED if state is JobState.CANCELLING else Trigger.LOSE
+            trigger = self._after_cancel(job)
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
@@ -170,6 +169,15 @@ class Runner:
             withdraw_cancel(folder)
             if self._closing.is_set() or self._is_cancelled(lease):
                 request_cancel(folder)
+
+    def _after_cancel(self, job: Job) -> Trigger:
+        # A user's, this server's end, or nobody's: whoever cancels tasks in Dask itself finds the job going on, but not at once and over and over.
+        if patiently(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
+            return Trigger.STOPPED
+        if self._closing.is_set():
+            return Trigger.LOSE
+        self._admission.pause(job.id, SchedulerLostError("The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself."))
+        return Trigger.PAUSE
 
     def _is_cancelled(self, lease: Lease) -> bool:
         return self._repository.get(lease.job.id).state is JobState.CANCELLING

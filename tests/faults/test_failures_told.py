@@ -12,9 +12,12 @@ from typing import Any
 import httpx
 import pytest
 
+from services.api.app import create_app
+from services.core.errors import JobCancelledError
+from services.core.settings import ServerSettings
 from tests.benchmarks.cancel_in_kernel import POLL_S, await_end, cancel_once, submit, worker_of_next
 from tests.support.engine_server import MEMORY_BYTES, MIB, engine_server
-from tests.support.live_server import toy_server
+from tests.support.live_server import serving, toy_server
 from tests.support.store_disk import store_disk
 
 pytestmark = pytest.mark.timeout(900)
@@ -126,6 +129,25 @@ def test_a_cancel_in_mid_kernel_of_the_real_engine_leaves_the_worker_the_same_pr
     cancelled = cancel_once(client, tmp_path / "cancelled")
     assert cancelled.seconds < LONGEST_CANCEL_S
     assert (cancelled.worker, worker_of_next(client, tmp_path / "after")) == (before, before)
+
+
+def test_tasks_cancelled_by_nobody_here_hold_the_job_back_instead_of_starting_it_over_and_over(tmp_path: Path) -> None:
+    attempts = []
+
+    def run(*_: object) -> None:
+        attempts.append(True)
+        raise JobCancelledError("Cancelled in Dask.")
+
+    (tmp_path / "capture").mkdir()
+    with serving(create_app(ServerSettings(data=tmp_path / "data"), run)) as client:
+        job = client.post("/v1/jobs", json={"capture": str(tmp_path / "capture")}).json()["id"]
+        while (told := client.get(f"/v1/jobs/{job}").json())["waits_for"] is None:
+            assert len(attempts) <= 1
+        assert (told["state"], told["waits_for"]) == (
+            "QUEUED",
+            "Waits for workers: The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself.",
+        )
+        assert len(attempts) == 1
 
 
 def test_a_want_of_disk_refuses_what_never_fits_and_loses_nothing_of_what_will(tmp_path: Path) -> None:
