@@ -214,13 +214,15 @@ def phantom(
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     outer: Annotated[Path | None, typer.Option(help="Enamel surface to use instead of the procedural one.")] = None,
     dentin: Annotated[Path | None, typer.Option(help="Dentin surface to use instead of the procedural one.")] = None,
+    fdi: Annotated[int | None, typer.Option(help="FDI number of the tooth that --outer gives; default: 11. A fit takes dentin's shape from it.")] = None,
     highlights: Annotated[bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")] = False,
     gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
     of_jaw = {"--scan": scan is not None}
-    of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--highlights": highlights, "--gums": gums, "--stains": stains}
+    of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--fdi": fdi is not None}
+    of_tooth |= {"--highlights": highlights, "--gums": gums, "--stains": stains}
     for option, given in (of_tooth if jaw else of_jaw).items():
         if given:
             raise InputError(f"Option {option} is for one tooth; leave out either it or --jaw." if jaw else f"Option {option} is for a jaw; add --jaw.")
@@ -233,7 +235,7 @@ def phantom(
     else:
         from services.fit.anatomy.phantom import write_phantom
 
-        write_phantom(out, outer=outer, dentin=dentin, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
+        write_phantom(out, outer=outer, dentin=dentin, fdi=fdi, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
     print(f"phantom: {out}")
 
 

@@ -122,6 +122,15 @@ def submit(page: Page) -> str:
     return str(answer.json()["id"])
 
 
+def test_an_address_that_names_nothing_says_so_until_a_job_is_chosen(page: Page) -> None:
+    submit(page)
+    page.goto("/#/jobs/nothing")
+    expect(page.get_by_role("alert")).to_have_text("No job has the address #/jobs/nothing; choose one from the list.")
+    page.locator("#jobs a").click()
+    expect(page.locator(".job .badge")).to_be_visible()
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
 @pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
 def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, request: pytest.FixtureRequest) -> None:
     submit(page)

@@ -27,6 +27,8 @@ from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, single_tooth
 
 FDI = 11
+"""Of the procedural incisor."""
+FDI_NUMBERS = tuple(10 * quadrant + place for quadrant in range(1, 5) for place in range(1, 9))
 IOR = 1.631
 TRUE_TISSUE = {
     "red": Tissue(Medium(4.2, 0.9980, g1=0.80), Medium(11.0, 0.9965, g1=0.75)),
@@ -48,6 +50,7 @@ def write_phantom(
     samples: int = 1024,
     outer: Path | None = None,
     dentin: Path | None = None,
+    fdi: int | None = None,
     renderer: Renderer = "engine",
     highlights: bool = False,
     gums: bool = False,
@@ -55,7 +58,7 @@ def write_phantom(
     held_out: int | None = None,
     subject: int | None = None,
 ) -> None:
-    """Write a folder capture (``capture.json``, images with variance, ``teeth/11``) and ``truth.json`` with its optics.
+    """Write a folder capture (``capture.json``, images with variance, ``teeth/<FDI>``) and ``truth.json`` with its optics.
 
     Args:
         pixel_mm: size of a pixel at the tooth.
@@ -63,6 +66,7 @@ def write_phantom(
         samples: paths per pixel.
         outer: another tooth's enamel surface, in the canonical frame (x mesial, y buccal, z occlusal) or near it; default the procedural incisor.
         dentin: its dentin surface, given with ``outer``.
+        fdi: its number, given with ``outer``; default ``FDI``.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
         highlights: add the surface's reflection of each light; also written alone to ``highlights/<camera>_<light>.npy``.
         gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
@@ -73,9 +77,9 @@ def write_phantom(
     Raises:
         InputError: impossible combination of options.
     """
-    _require_possible(boundary, outer, dentin, highlights, gums)
+    _require_possible(boundary, outer, dentin, fdi, highlights, gums)
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
-    tooth, collar = _tooth(outer, dentin)
+    tooth, collar = _tooth(outer, dentin, FDI if fdi is None else fdi)
     shown_gums = collar if gums else None
     names = CHANNELS[channels]
     tissues = TRUE_TISSUE if subject is None else subject_tissues(subject, names)
@@ -107,20 +111,24 @@ def write_phantom(
     write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
-def _require_possible(boundary: Boundary, outer: Path | None, dentin: Path | None, highlights: bool, gums: bool) -> None:
+def _require_possible(boundary: Boundary, outer: Path | None, dentin: Path | None, fdi: int | None, highlights: bool, gums: bool) -> None:
     if dentin is not None and outer is None:
         raise InputError("A dentin mesh was given without its enamel's outer mesh; give both.")
+    if fdi is not None and outer is None:
+        raise InputError(f"The procedural incisor is tooth {FDI}; leave out the FDI number, or give the outer mesh that it names.")
+    if fdi is not None and fdi not in FDI_NUMBERS:
+        raise InputError(f"{fdi} is no tooth's FDI number; give one of 11 to 18, 21 to 28, 31 to 38 or 41 to 48.")
     if outer is not None and gums:
         raise InputError("Gums are made for the procedural incisor only; leave out either the gums or the outer mesh.")
     if highlights and boundary == "matched":
         raise InputError("An index-matched surface has no highlights; choose boundary thin or leave the highlights out.")
 
 
-def _tooth(outer: Path | None, dentin: Path | None) -> tuple[Tooth, Mesh]:
+def _tooth(outer: Path | None, dentin: Path | None, fdi: int) -> tuple[Tooth, Mesh]:
     # Other people's meshes are moved to the origin: single precision is best there.
     incisor = build_incisor()
     if outer is None:
-        return Tooth(FDI, incisor.outer, incisor.dentin), incisor.gums
+        return Tooth(fdi, incisor.outer, incisor.dentin), incisor.gums
     shell = read_mesh(outer)
     shell.require_solid(str(outer))
     centre = (shell.vertices_mm.min(axis=0) + shell.vertices_mm.max(axis=0)) / 2
@@ -129,7 +137,7 @@ def _tooth(outer: Path | None, dentin: Path | None) -> tuple[Tooth, Mesh]:
         core = read_mesh(dentin)
         core.require_solid(str(dentin))
         core = Mesh(core.vertices_mm - centre, core.faces)
-    return Tooth(FDI, Mesh(shell.vertices_mm - centre, shell.faces), core), incisor.gums
+    return Tooth(fdi, Mesh(shell.vertices_mm - centre, shell.faces), core), incisor.gums
 
 
 def _write_meshes(out: Path, tooth: Tooth, gums: Mesh | None) -> None:

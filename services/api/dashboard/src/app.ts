@@ -38,21 +38,30 @@ async function refreshList(): Promise<void> {
 }
 
 async function open(): Promise<void> {
-  const id = location.hash.match(/^#\/(\w+)$/)?.[1];
-  if (!id || isSignedOut) return;
+  if (!location.hash || isSignedOut) return;
   view?.stop();
-  list.select(id);
+  view = null;
+  const id = location.hash.match(/^#\/(\w+)$/)?.[1] ?? "";
   const isDome = location.hash === DOME;
+  list.select(id);
   if (isDome) domeLink.setAttribute("aria-current", "page");
   else domeLink.removeAttribute("aria-current");
+  if (!id) {
+    showProblem(`No job has the address ${location.hash}; choose one from the list.`);
+    return;
+  }
   view = isDome ? new DomeView(showConnection) : new JobView(id, () => void refreshList(), showConnection);
   main.replaceChildren(view.root);
   try {
     await view.start();
   } catch (problem) {
     if (problem instanceof Unauthenticated) askForToken();
-    else main.replaceChildren(element("p", { class: "failure", role: "alert" }, problem instanceof Error ? problem.message : String(problem)));
+    else showProblem(problem instanceof Error ? problem.message : String(problem));
   }
+}
+
+function showProblem(sentence: string): void {
+  main.replaceChildren(element("p", { class: "failure", role: "alert" }, sentence));
 }
 
 function askForToken(): void {
