@@ -31,7 +31,7 @@ class ErrorSums:
     reference_squared: float = 0.0
     reference_variance: float = 0.0
     product_noise: float = 0.0
-    """Monte Carlo variance of ``product``."""
+    """Monte Carlo variance of ``product``; the lights of a pixel share their walks, so their errors are summed before they are squared."""
 
     def __add__(self, other: ErrorSums) -> ErrorSums:
         return ErrorSums(
@@ -69,10 +69,10 @@ class ErrorSums:
 
 
 def error_sums(first: Array, second: Array, reference: Array, variance: Array, chosen: NDArray[np.bool_]) -> ErrorSums:
-    """Sums over the chosen measurements of two independent renders against a reference; all arrays of one shape."""
-    a, b, r, v = (values[chosen] for values in (first, second, reference, variance))
-    spread = (a - b) * (0.5 * (a + b) - r)
-    return ErrorSums(float((a - r) @ (b - r)), float(r @ r), float(v.sum()), float(spread @ spread))
+    """Sums over the chosen measurements of two independent renders against a reference; all arrays (L, N), or (N,) of one light."""
+    a, b, r, v = (np.where(chosen, values, 0.0) for values in (first, second, reference, variance))
+    spread = np.atleast_2d((a - b) * (0.5 * (a + b) - r)).sum(axis=0)
+    return ErrorSums(float(((a - r) * (b - r)).sum()), float((r * r).sum()), float(v.sum()), float(spread @ spread))
 
 
 Shown = tuple[tuple[str, int], ...]

@@ -13,7 +13,6 @@ from distributed import WorkerPlugin
 from services.fit.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
 
 Task = Callable[..., Any]
-ALLOWED_RETRIES = 3
 
 
 class Executor(Protocol):
@@ -50,9 +49,12 @@ class DaskExecutor:
         client.register_plugin(_EnginePlugin(factory), name=self._plugin)
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
-        """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own."""
+        """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own.
+
+        A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it again.
+        """
         own = f"{self._prefix}-{next(self._submitted)}-{key}"
-        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False, retries=ALLOWED_RETRIES)
+        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False)
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """See Executor."""

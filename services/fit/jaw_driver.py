@@ -59,11 +59,10 @@ class JawDriver:
         """Fit all channels; files land in the stage's folder, the report is returned.
 
         Raises:
-            SettingsError: more than one lobe was asked for. CaptureInputError, StoreError: what was prepared is no jaw that can be fitted.
+            SettingsError: an option that only a tooth alone has. CaptureInputError, StoreError: what was prepared is no jaw that can be fitted.
         """
         attempt, spec = self.attempt, self.attempt.spec
-        if spec.lobes != 1:
-            raise SettingsError("A jaw is fitted with one lobe per medium; set lobes to 1, or fit its teeth one by one with kind 'tooth'.")
+        require_jaw_options(spec)
         observations = read_observations(attempt.context.root, spec)
         dentins = jaw_dentins(observations.teeth, observations.manifest.cameras, spec)
         for tooth, dentin in zip(observations.teeth, dentins, strict=True) if spec.dentin != "none" else ():
@@ -87,6 +86,17 @@ class JawDriver:
         fits = {channel.name: found[channel.name] for channel in channels}
         attempt.write_records(journal, observations, {c: jaw.fit.evaluation for c, jaw in fits.items()}, {c: jaw.views for c, jaw in fits.items()})
         return report(fits, order[0].name, dentins, observations, time.time() - begun)
+
+
+def require_jaw_options(spec: JobSpec) -> None:
+    """Refuse what a jaw's fit would not do.
+
+    Raises:
+        SettingsError: names the option and what it must be.
+    """
+    for option, usual in (("lobes", 1), ("held", {}), ("stains", False), ("solver", "gauss-newton"), ("loss", "l2")):
+        if (asked := getattr(spec, option)) != usual:
+            raise SettingsError(f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one with kind 'tooth'.")
 
 
 def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSpec) -> list[DentinShape | None]:
@@ -199,7 +209,7 @@ class _ChannelRun:
         require_signal(views, f"Tooth {name}" if fdi is not None else "The picture of the gums")
         folder = self.attempt.inputs / name
         scene = channel_scene(alone, channel, (dentin,), spec)
-        files = write_channel(folder, scene if fdi is not None else replace(scene, ior=scene.gums_ior), channel, views, spec.loss)
+        files = write_channel(folder, scene if fdi is not None else replace(scene, ior=scene.gums_ior), channel, views)
         schedule = ChannelSchedule(
             files=files,
             passes=self.attempt.passes(self.run_on, files, f"{channel}/{name}"),

@@ -29,7 +29,7 @@ import numpy as np
 from services.fit.closing import Held
 from services.fit.jaw_starts import ToothStart, typical
 from services.fit.neighbours import Neighbours
-from services.fit.optics.domain import Coordinate, Domain, similar_tissue, to_dual
+from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
 from services.fit.passes import StackProblem
@@ -144,8 +144,10 @@ class JawSchedule(Stages[Mouth]):
         return [k for k, tooth in enumerate(self.start.teeth) if tooth.shape and self.fits_shape and self.teeth[k].state == "fitted"]
 
     def _retied(self, mouth: Mouth) -> Mouth:
-        # Teeth that are tied start the next stage where the others now are.
+        # Teeth that are tied start the next stage where the others now are, at the cosine that their enamel shares.
         common = self._typical(mouth)
+        cosine = next(tooth.enamel.mean_cosine for tooth, start in zip(mouth.teeth, self.teeth, strict=True) if start.state == "fitted")
+        common = replace(common, enamel=similar_medium(common.enamel, cosine))
         tied = (replace(common, shape=tooth.shape) for tooth in mouth.teeth)
         chosen = (tooth if start.state == "fitted" else other for tooth, start, other in zip(mouth.teeth, self.teeth, tied, strict=True))
         return replace(mouth, teeth=tuple(chosen))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from services.core.errors import InputError, MeshError, NonFiniteError
-from services.fit.optics.domain import HELD_G, to_dual, to_natural
+from services.fit.optics.domain import HELD_G, similar_tissue, to_dual, to_natural
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 
@@ -54,7 +54,7 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
 
 
 def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
-    """Median of the front teeth that were fitted, coordinate by coordinate; of all that were where no front tooth was.
+    """Median of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; of all that were where no front tooth was.
 
     Args:
         teeth: present optics of each tooth, None where there are none yet.
@@ -63,7 +63,7 @@ def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tis
         InputError: no tooth was fitted.
     """
     fitted = [(start, tissue) for start, tissue in zip(starts, teeth, strict=True) if start.state == "fitted" and tissue is not None]
-    chosen = [tissue for start, tissue in fitted if start.is_front] or [tissue for _, tissue in fitted]
+    chosen = [similar_tissue(tissue, HELD_G) for start, tissue in fitted if start.is_front] or [similar_tissue(tissue, HELD_G) for _, tissue in fitted]
     if not chosen:
         raise InputError(f"No tooth of the jaw can be fitted; the first one says: {starts[0].sentence}")
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.fit.anatomy.average_arch import is_upper
 from services.fit.blocks import PixelParts
 from services.fit.optics.domain import Domain
 
@@ -17,14 +18,14 @@ COLOURS = 3
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Teeth, by their positions in the scene, in the order in which they stand along the arch."""
+    """Teeth, by their positions in the scene, in the order in which they stand along the arch, one jaw after the other."""
 
     order: tuple[int, ...]
 
     @staticmethod
     def of(fdi: Sequence[int]) -> Neighbours:
         """Those of some teeth by their numbers."""
-        return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: arch_place(fdi[k]))))
+        return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: (is_upper(fdi[k]), arch_place(fdi[k])))))
 
     def colour(self, tooth: int) -> int:
         """One of COLOURS, in turn along the arch."""
@@ -49,6 +50,6 @@ class Neighbours:
 
 
 def arch_place(fdi: int) -> int:
-    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4), positive for the left (2, 3)."""
+    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4 and milk teeth's 5, 8), positive for the left."""
     quadrant, place = divmod(fdi, 10)
-    return -place if quadrant in {1, 4} else place
+    return -place if quadrant in {1, 4, 5, 8} else place

@@ -144,7 +144,7 @@ def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: 
         )
         return first, second
 
-    return loss_change(*residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1)), trace_row("compare", task, start)
+    return loss_change(*residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1), len(block.reference)), trace_row("compare", task, start)
 
 
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:

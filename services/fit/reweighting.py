@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +54,9 @@ def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, 
             weight = np.zeros_like(block.fit_weight)
             weight[chosen] = part
             file = write_block(old.path.parent, replace(block, fit_weight=weight))
-            files.append((str(file.path), file.digest))
+            files.append((file.path.name, file.digest))
         return files
 
     files, _ = journal.once(key, compute)
-    return replace(passes, blocks=tuple(StoredFile(Path(path), digest) for path, digest in files))
+    folder = passes.blocks[0].path.parent
+    return replace(passes, blocks=tuple(StoredFile(folder / name, digest) for name, digest in files))

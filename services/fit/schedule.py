@@ -98,8 +98,8 @@ class ChannelSchedule(Stages[Tissue]):
         return ("enamel", "dentin") if self.has_dentin else ("enamel",)
 
     def _held(self, domain: Domain) -> Held:
-        free = {name.rpartition(".")[0] for name in domain.parameters if name.endswith((".g1", ".cosine"))}
-        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in free}
+        told = {name.rpartition(".")[0] for name in (*domain.parameters, *self.spec.held) if name.endswith((".g1", ".cosine"))}
+        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in told}
 
     def _others(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
@@ -115,16 +115,12 @@ class ChannelSchedule(Stages[Tissue]):
     def _stages(self) -> Fitted:
         # The media, and the dentin's shape, by Gauss-Newton.
         spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
-        tissue, domain = self.start(), self._domain(("sigma", "alpha"))
-        if self.has_dentin:
-            tissue = self._best_start(tissue, self.short(START_STEPS))
-        tissue = tissue.with_values(spec.held)
-        stage = "layered" if self.has_dentin else "homogeneous"
-        tissue, solution = self._solve(stage, domain, tissue, options, 2 * samples, SIMILAR_G)
+        domain = self._domain(("sigma", "alpha"))
+        tissue, reached = self._neighbourhood(domain, options) if domain.coordinates else (self._given(), 2 * samples)
         domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
         if self.modes:
             problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
-            tissue, solution = self._iterate(problem, options, solution.samples)
+            tissue, _ = self._iterate(problem, options, reached)
 
         options = self.at_full_resolution()
         exact_samples = self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels)))
@@ -136,9 +132,25 @@ class ChannelSchedule(Stages[Tissue]):
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
             tissue, solution = self._iterate(problem, options, solution.samples)
         if spec.lobes == 2:
-            problem = StackProblem(self.passes, self._domain(ALL_LEAVES), self._with_lobes(tissue), "phase")
+            problem = StackProblem(self.passes, self._with_shape(self._domain(ALL_LEAVES)), self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return problem, tissue, solution
+
+    def _neighbourhood(self, domain: Domain, options: Options) -> tuple[Tissue, int]:
+        # The stages in similar media, and how many paths per pixel they came to.
+        tissue = self.start()
+        if self.has_dentin:
+            tissue = self._best_start(tissue, self.short(START_STEPS))
+        stage = "layered" if self.has_dentin else "homogeneous"
+        tissue, solution = self._solve(stage, domain, tissue.with_values(self.spec.held), options, 2 * self.spec.samples_per_pixel, SIMILAR_G)
+        return tissue, solution.samples
+
+    def _given(self) -> Tissue:
+        # Media that are held whole, so that only the dentin's shape is asked for.
+        return self._uniform(Medium(1.0, 0.5, g1=HELD_G)).with_values(self.spec.held)
+
+    def _uniform(self, medium: Medium) -> Tissue:
+        return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
 
     def _paper_stages(self) -> Fitted:
         # As in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
@@ -194,8 +206,8 @@ class ChannelSchedule(Stages[Tissue]):
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
 
     def _with_cosines(self, domain: Domain) -> Domain:
-        # Of the enamel where its density is fitted and its lobe is not given: what lies below it is lit by light that has scattered often.
-        fitted = [part for part in self.media[:1] if f"{part}.sigma" in domain.parameters and f"{part}.g1" not in self.spec.held]
+        # Of the enamel where nothing of it is given, which another cosine would change: what lies below it is lit by light that has scattered often.
+        fitted = [part for part in self.media[:1] if not any(name.startswith(f"{part}.") for name in self.spec.held)]
         return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
 
     def _with_shape(self, domain: Domain) -> Domain:
@@ -208,8 +220,7 @@ class ChannelSchedule(Stages[Tissue]):
     def _homogeneous_start(self) -> Tissue:
         # The table's best point, seen as a medium of the mean cosine that is held.
         start = self._search()
-        medium = similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G)
-        return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
+        return self._uniform(similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G))
 
     def _search(self) -> table_search.Candidate:
         # One render per node and view with two seeds each, so that <C,C> is free of noise; every albedo follows from it.
@@ -221,8 +232,7 @@ class ChannelSchedule(Stages[Tissue]):
             observed = [table_search.Observed.of(block) for block in passes.read_blocks()]
             pending = []
             for n, node in enumerate(nodes):
-                medium = Medium(node.sigma, 1.0, g1=node.g)
-                tissue = Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
+                tissue = self._uniform(Medium(node.sigma, 1.0, g1=node.g))
                 label = f"{self.scope}-search-{n}"
                 for task in passes.tasks(label, tissue, max(self.spec.samples_per_pixel, SEARCH_SAMPLES)):
                     for k in (1, 2):

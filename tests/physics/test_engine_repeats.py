@@ -95,6 +95,14 @@ def test_seeds_and_batches_are_independent() -> None:
     assert 0.7 <= np.sqrt(np.mean(z**2)) <= 1.35
 
 
+def test_cameras_have_streams_of_their_own() -> None:
+    engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
+    other = View(view.camera.model_copy(update={"name": "another"}), view.pixels)
+    one, two = (engine.images(TISSUE, of, samples=512, seed=1).mean for of in (view, other))
+    lit = one > 0
+    assert (one[lit] != two[lit]).mean() > 0.99
+
+
 def test_reshaping_there_and_back_gives_the_same_bits() -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
     before = engine.images(TISSUE, view, samples=32, seed=9).mean

@@ -70,6 +70,24 @@ def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
     assert errors["robust"] < 0.5 * errors["l2"]
 
 
+def test_what_is_held_stays_and_only_the_shape_is_asked_for_where_all_media_are(tmp_path: Path) -> None:
+    media = {f"{part}.{leaf}": getattr(getattr(TRUTH, part), leaf) for part in ("enamel", "dentin") for leaf in ("sigma", "alpha", "g1")}
+    write_prepared(tmp_path)
+    report = fit(tmp_path, dentin="fit", held=media)
+    table = report.parameters["green"]
+    assert {name: table[name].value for name in media} == pytest.approx(media)
+    assert all(table[name].se is None for name in media)
+    assert len(report.shape) == 3
+    assert all(table[f"shape.{k}"].se for k in range(3))
+
+
+def test_a_held_albedo_is_not_moved_by_the_cosine(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    table = fit(tmp_path, held={"enamel.alpha": 0.99}).parameters["green"]
+    assert (table["enamel.alpha"].value, table["enamel.alpha"].se) == (pytest.approx(0.99), None)
+    assert table["enamel.sigma"].se
+
+
 def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
     options = {"solver": "adam", "adam_steps": 80}
     write_prepared(tmp_path / "whole")
@@ -100,4 +118,4 @@ def test_weights_follow_residuals_once_a_round_and_are_kept(tmp_path: Path) -> N
     entries = json.loads((tmp_path / "fit-checkpoint" / "journal.json").read_text())["entries"]
     rounds = [key for key in entries if key.endswith("/weights")]
     assert rounds == ["green/exact/weights", "green/exact.1/weights", "green/exact.2/weights"]
-    assert all(Path(path).is_file() for key in rounds for path, _ in entries[key])
+    assert all((tmp_path / "fit-checkpoint" / "inputs" / name).is_file() for key in rounds for name, _ in entries[key])

@@ -163,8 +163,10 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
             assert abs(found - true) < 4.5 * estimate.se
         assert tooth.enamel_thickness is not None
         assert tooth.enamel_thickness.se is not None
-    # What is hidden keeps the shape that every tooth starts from.
+    # What is hidden keeps the shape that every tooth starts from, and nothing of its thickness is known.
     assert report.teeth["21"].shape == (SHAPE[0],) * 3
+    assumed = report.teeth["21"].enamel_thickness
+    assert assumed is None or (assumed.se is None and not assumed.determined)
     (prepared, manifest), spec = open_stage(tmp_path, "prepared", PreparedManifest), spec_for(tmp_path, **options)
     first, _, _ = fitted_teeth(prepared, manifest, spec, report)
     assert first.dentin is not None
@@ -197,7 +199,11 @@ def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
     [
         ({"fdi": (11,)}, {}, CaptureInputError, "at least two teeth"),
         ({"fdi": (11, 12)}, {"kind": "tooth"}, CaptureInputError, "set kind to 'jaw'"),
-        ({"fdi": (11, 12)}, {"lobes": 2}, SettingsError, "one lobe"),
+        ({"fdi": (11, 12)}, {"lobes": 2}, SettingsError, "lobes = 1, not 2"),
+        ({"fdi": (11, 12)}, {"held": {"enamel.sigma": 4.5}}, SettingsError, "held = {}, not {'enamel.sigma': 4.5}"),
+        ({"fdi": (11, 12)}, {"stains": True}, SettingsError, "stains = False"),
+        ({"fdi": (11, 12)}, {"solver": "adam"}, SettingsError, "solver = 'gauss-newton'"),
+        ({"fdi": (11, 12)}, {"loss": "robust"}, SettingsError, "loss = 'l2'"),
         ({"fdi": (11, 12), "dark": (11, 12)}, {}, InputError, "No tooth of the jaw can be fitted"),
     ],
 )

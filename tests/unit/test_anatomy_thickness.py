@@ -90,9 +90,12 @@ def test_a_camera_sees_thickness_and_its_error_at_the_same_pixels() -> None:
     assert found.mean.se == pytest.approx(0.02, rel=0.03)
     assert found.mean.determined
 
-    # Known, it is the plain image; of another place nothing is seen.
-    known = thickness_map(outer, shape, (0.3,), None, camera)
-    assert known is not None
-    assert known.errors_mm is None
-    np.testing.assert_array_equal(known.image_mm, thickness_image(outer, Mesh(shape.vertices_mm((0.3,)), ball.faces), camera))
+    # Known, it is the plain image; assumed, the same one, which determines nothing; of another place nothing is seen.
+    inside = Mesh(shape.vertices_mm((0.3,)), ball.faces)
+    for dentin, weights, is_known in ((DentinShape.known(inside), (), True), (shape, (0.3,), False)):
+        plain = thickness_map(outer, dentin, weights, None, camera)
+        assert plain is not None
+        assert plain.errors_mm is None
+        assert plain.mean.determined is is_known
+        np.testing.assert_array_equal(plain.image_mm, thickness_image(outer, inside, camera))
     assert thickness_map(Mesh(outer.vertices_mm + np.array([0.0, 500.0, 0.0]), outer.faces), shape, (0.3,), None, camera) is None

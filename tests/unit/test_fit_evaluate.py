@@ -26,6 +26,17 @@ def test_error_is_unbiased_by_either_noise(truth_error: float) -> None:
     assert abs(z) < 4
 
 
+def test_lights_of_a_pixel_err_together() -> None:
+    # Twelve lights whose noise is one and the same. The variance over 2000 draws is known to 3 %, its heavy tails to three times that.
+    rng, reference = np.random.default_rng(3), np.full((12, 60), 1.0)
+    draws = []
+    for _ in range(2000):
+        first, second = (reference * 1.1 + 0.2 * rng.standard_normal(60) for _ in range(2))
+        draws.append(error_sums(first, second, reference, np.zeros_like(reference), np.ones_like(reference, dtype=bool)))
+    stated, seen = np.mean([draw.product_noise for draw in draws]), np.var([draw.product for draw in draws])
+    assert stated == pytest.approx(seen, rel=0.1)
+
+
 def test_masked_measurements_do_not_count_and_blocks_add() -> None:
     rng = np.random.default_rng(5)
     a, b, r = rng.uniform(0.5, 1.5, (3, 40))

@@ -78,6 +78,11 @@ def test_others_follow_the_median_of_the_front_teeth() -> None:
     assert mouth.teeth[2].enamel.sigma == pytest.approx(100.0)
     assert mouth.reflectance == pytest.approx(half_space_reflectance(Medium(8.0, 0.96, g1=0.8)))
     assert typical([starts[2]], [tissue(5.0)]).enamel.sigma == pytest.approx(5.0)
+    # Whatever their cosines, what the others take has the same reduced scattering and absorption.
+    turned = similar_tissue(tissue(5.0), 0.5)
+    for part in ("enamel", "dentin"):
+        other, own = typical([starts[2]], [turned]).medium(part), turned.medium(part)
+        assert (other.g1, other.sigma_s_reduced, other.alpha_reduced) == pytest.approx((0.8, own.sigma_s_reduced, own.alpha_reduced))
     with pytest.raises(InputError, match=r"No tooth of the jaw can be fitted.*Hidden"):
         start_mouth([starts[3]], None, has_cavity=False)
 
@@ -85,10 +90,14 @@ def test_others_follow_the_median_of_the_front_teeth() -> None:
 def test_neighbours_are_those_along_the_arch() -> None:
     assert sorted((11, 17, 21, 27, 12), key=arch_place) == [17, 12, 11, 21, 27]
     assert sorted((31, 41, 48, 38), key=arch_place) == [48, 41, 31, 38]
+    assert sorted((51, 61, 71, 81), key=arch_place) == [51, 81, 61, 71]
     names = [f"{k}.enamel.sigma" for k in range(4)] + ["gums.sigma", "cavity.reflectance"]
     domain = Domain(tuple(Coordinate((name,)) for name in names))
     # Teeth 11, 12, 21, 22 in a manifest's order stand as 12, 11, 21, 22.
     assert Neighbours.of((11, 12, 21, 22)).near(domain) == ((0, 1, 2, 4, 5), (0, 1, 4, 5), (0, 2, 3, 4, 5), (2, 3, 4, 5))
+    # One jaw after the other: 11 stands between 12 and 21, whatever bites on it.
+    both = (12, 11, 21, 42, 41, 31)
+    assert [both[k] for k in Neighbours.of(both).beside(both.index(11))] == [12, 11, 21]
 
 
 def test_a_mouth_has_coordinates_like_a_tooth() -> None:

@@ -66,11 +66,11 @@ def test_compared_losses_are_unbiased_and_their_error_true() -> None:
     old, new, weight = rng.standard_normal(MEASUREMENTS), rng.standard_normal(MEASUREMENTS), rng.uniform(0.5, 2, MEASUREMENTS)
     changes = []
     for _ in range(ROUNDS):
-        shared = rng.standard_normal((2, MEASUREMENTS))
+        shared = np.tile(rng.standard_normal((2, MEASUREMENTS // LIGHTS)), LIGHTS)
         own = rng.standard_normal((2, 2, MEASUREMENTS))
         o = [old + 0.5 * shared[k] + 0.1 * own[0, k] for k in range(2)]
         n = [new + 0.5 * shared[k] + 0.1 * own[1, k] for k in range(2)]
-        changes.append(loss_change(o[0], o[1], n[0], n[1], weight))
+        changes.append(loss_change(o[0], o[1], n[0], n[1], weight, LIGHTS))
     values = np.array([c.change for c in changes])
     exact = 0.5 * float(weight @ (new**2 - old**2))
     assert abs(values.mean() - exact) < 4 * values.std() / np.sqrt(ROUNDS)

@@ -72,12 +72,12 @@ def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], c
     """What a camera sees of a fitted dentin; None where it does not see the tooth.
 
     Args:
-        covariance: of the weights (M, M); None where they are known.
+        covariance: of the weights (M, M); None where none were fitted: the dentin is known, or its weights are only assumed, which determines nothing.
     """
     if covariance is None:
         image = thickness_image(outer, Mesh(shape.vertices_mm(weights), shape.base.faces), camera)
         mean = float(image[np.isfinite(image)].mean()) if np.isfinite(image).any() else None
-        return None if mean is None else ThicknessMap(image, None, Estimate(value=mean, se=None, unit="mm", determined=True))
+        return None if mean is None else ThicknessMap(image, None, Estimate(value=mean, se=None, unit="mm", determined=len(shape.modes_mm) == 0))
     seen, points_mm = _seen(outer, camera)
     if not seen.any():
         return None

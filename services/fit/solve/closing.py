@@ -99,12 +99,13 @@ def closing_sums(
     gradient, gradient_noise = with_noise(residuals)
     shifts = [with_noise((change[0], change[1])) for change in moved]
 
-    # Response; where J is borrowed the noise that both sides share is taken off.
+    # Response; where J is borrowed both sides share their noise, which is taken off the value and makes their errors go together.
     response = (weight * m) @ e.T - (weight * d) @ o.T
     variance = np.zeros_like(response)
-    for terms, rest, sign in ((m, f, 1.0), (d, e, 1.0), (d, f, -1.0)):
-        for a in range(len(m)):
-            variance[a] += sign * (per_pixel(weight * terms[a] * rest, lights) ** 2).sum(axis=1)
+    rendered = f - o
+    for a in range(len(m)):
+        for terms, sign in ((m[a] * rendered, 1.0), (d[a] * e + m[a] * o, 1.0), (d[a] * rendered, -1.0)):
+            variance[a] += sign * (per_pixel(weight * terms, lights) ** 2).sum(axis=1)
     return ClosingSums(
         gradient=gradient,
         gradient_noise=gradient_noise,

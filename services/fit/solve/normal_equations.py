@@ -153,12 +153,12 @@ class LossChange:
         return LossChange(self.change + other.change, self.variance + other.variance, self.loss + other.loss)
 
 
-def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array) -> LossChange:
-    """Compare residuals (M,) at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
+def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array, lights: int) -> LossChange:
+    """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
 
     The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows from the same identity as above,
-    applied to the bilinear form n1 n2 - o1 o2.
+    applied to the bilinear form n1 n2 - o1 o2, and is summed by pixels, whose lights share their walks.
     """
     terms = weight * (new1 * new2 - old1 * old2)
-    deviations = weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))
+    deviations = per_pixel(weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))[None], lights)[0]
     return LossChange(0.5 * float(terms.sum()), 0.25 * float(deviations @ deviations), 0.5 * float((weight * new1) @ new2))

@@ -6,6 +6,7 @@ was cut.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import drjit as dr
@@ -42,7 +43,7 @@ class PathStart:
 
 
 class CameraStart:
-    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples."""
+    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples. Every camera has streams of its own, by its name."""
 
     def __init__(self, view: View, batches: int, seed: int, radius_mm: float, skipped: int = 0) -> None:
         camera = view.camera
@@ -54,7 +55,7 @@ class CameraStart:
         self.pixel = aligned(mi.UInt32(self._pixels.astype(np.uint32)))
         self.batch = aligned(mi.UInt32(self._batch))
         self.width = dr.opaque(mi.UInt32, width)
-        self.seed = dr.opaque(mi.UInt32, seed)
+        self.seed = dr.opaque(mi.UInt32, seed ^ zlib.crc32(camera.name.encode()))
         self.batches = batches
         pose = np.asarray(camera.camera_from_world)
         eye = -pose[:3, :3].T @ pose[:3, 3]
