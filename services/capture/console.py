@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, suppress
+from functools import partial
 
 from services.capture.address import dome_address
 from services.capture.dome import ExposureBudget
@@ -30,6 +31,8 @@ PATIENCE_S = 1.0
 """How long a command waits for another one that drives the dome."""
 DOSE_S = 1e4
 """Light adds up over this time (IEC 62471), so that a limit is for all lights by hand since the dome was last left dark for so long."""
+SHARED_LIMITS = ("watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s")
+"""A preflight's rig may ask for less than the server allows, never for more."""
 SIMULATED_LIGHTS = 155
 
 
@@ -60,7 +63,7 @@ class Console:
         self._ending.set()
         if not self._driving.acquire(timeout=PATIENCE_S):
             with suppress(RigError):
-                all_off(self._host, self._port)
+                self._all_off()
             self._driving.acquire()
         with suppress(RigError):
             self._leave()
@@ -71,9 +74,11 @@ class Console:
         findings: tuple[str, ...] = ()
         if command.do == "off":
             self._newest_off = max(self._newest_off, command.number)
-            status = all_off(self._host, self._port)
-            if self._driving.acquire(timeout=PATIENCE_S):
-                self._let_go()
+            try:
+                status = self._all_off()
+            finally:
+                if self._driving.acquire(timeout=PATIENCE_S):
+                    self._let_go()
             return DomeAnswer(number=command.number, status=status)
         if command.do != "status":
             if not self._driving.acquire(timeout=PATIENCE_S):
@@ -90,6 +95,15 @@ class Console:
                 self._driving.release()
         return DomeAnswer(number=command.number, status=self._status(), findings=findings)
 
+    def _all_off(self) -> DomeStatus:
+        try:
+            return all_off(self._host, self._port)
+        except BaseException:
+            # The controller may have no connection left to give; the driver here has one.
+            if (dome := self._dome) is not None:
+                dome.give_up()
+            raise
+
     def _let_go(self) -> None:
         try:
             with suppress(RigError):
@@ -100,8 +114,7 @@ class Console:
     def _light(self, command: DomeCommand) -> None:
         try:
             if self._dome is None:
-                if time.monotonic() > self._until_s + DOSE_S:
-                    self._budget.spent_s.clear()
+                self._forget_old_dose()
                 self._dome = self._held.enter_context(ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s))
             self._require_wanted(command)
             _require_light(command.light, self._dome.light_count)
@@ -118,10 +131,18 @@ class Console:
 
         if command.rig is None:
             raise SettingsError("A preflight needs a rig; give its mouth folder.")
-        planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}"}))
-        with planned.in_use() as (dome, cameras):
-            self._require_wanted(command)
-            return preflight(planned.plan, dome, cameras, planned.spec)
+        safest = {name: min(getattr(command.rig, name), getattr(self._settings, name)) for name in SHARED_LIMITS}
+        planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}", **safest}))
+        self._forget_old_dose()
+        try:
+            with planned.in_use(self._budget.spent_s) as (self._dome, cameras):
+                return preflight(planned.plan, self._dome, cameras, planned.spec, partial(self._require_wanted, command))
+        finally:
+            self._dome, self._until_s = None, time.monotonic()
+
+    def _forget_old_dose(self) -> None:
+        if time.monotonic() > self._until_s + DOSE_S:
+            self._budget.spent_s.clear()
 
     def _require_wanted(self, command: DomeCommand) -> None:
         # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the controller.

@@ -5,6 +5,7 @@
   has been on for its strobe time (a hung one).
 * Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
 * ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the watchdog anew.
+* A device that says it is no dome gets no write. One that does not say what it is may be a dome under light, and is switched off.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ HANG_MARGIN_S = 2.0
 DARK_ATTEMPTS = 3
 
 
+class OtherDeviceError(LinkError):
+    """What answers is no dome controller, and gets no write."""
+
+
 def all_off(host: str, port: int) -> DomeStatus:
     """Switch every light off, whoever drives the dome, and keep the supply open until a driver arms the watchdog anew.
 
@@ -45,6 +50,8 @@ def all_off(host: str, port: int) -> DomeStatus:
     try:
         for _ in range(DARK_ATTEMPTS):
             try:
+                with suppress(NoReplyError, RefusedError, WrongReplyError):
+                    _require_dome(link, repeated=False)
                 link.write(reg.ALL_OFF, [1])
                 link.write(reg.KEEPALIVE, [1, reg.STOPPED_MS])
                 status = _read_status(link)
@@ -116,6 +123,7 @@ class ModbusDome:
 
     def __enter__(self) -> Self:
         try:
+            self._require_dome()
             with self._dark_on_error():
                 self._identify()
                 self._require_safe()
@@ -210,6 +218,14 @@ class ModbusDome:
             f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within {self.watchdog_s:g} s, switch the dome off."
         ) from problem
 
+    def give_up(self) -> None:
+        """Go dark if that can be, and stop feeding the watchdog, from any thread: whoever drives gets no more light."""
+        try:
+            with suppress(RigError):
+                self.dark()
+        finally:
+            self._keepalive.stop()
+
     def status(self) -> DomeStatus:
         """Read the controller's state."""
         with self._dark_on_error():
@@ -235,9 +251,9 @@ class ModbusDome:
     def _confirmed(self) -> Rgb:
         self._require_safe()
         self._require_no_fault()
-        wanted = np.zeros((self._light_count, 3), dtype=np.int64)
-        if self._lit is not None:
-            wanted[self._lit[0]] = reg.level_word(self._lit[1])
+        lit, wanted = self._lit, np.zeros((self._light_count, 3), dtype=np.int64)
+        if lit is not None:
+            wanted[lit[0]] = reg.level_word(lit[1])
         for register in (reg.LEVELS, reg.OUTPUTS):
             held = self._rgb(register)
             wrong = np.flatnonzero((held != wanted).any(axis=1))
@@ -248,12 +264,19 @@ class ModbusDome:
                     f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
                     "all lights were switched off, check that light and the controller."
                 )
-        first = self._lit[0].start if self._lit else 0
+        first = lit[0].start if lit else 0
         return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
 
+    def _require_dome(self) -> None:
+        try:
+            _require_dome(self._link)
+        except (OtherDeviceError, RefusedError) as answer:
+            raise RigError(f"The device at {self.address} does not answer as a dome controller; correct rig.dome.") from answer
+        except LinkError:
+            with self._dark_on_error():
+                raise
+
     def _identify(self) -> None:
-        if self._link.read(reg.IDENTITY)[0] != reg.IDENTITY_VALUE:
-            raise RigError(f"The device at {self.address} is no dome controller; correct rig.dome.")
         firmware = self._link.read(reg.FIRMWARE)[0]
         if firmware >> 8 != reg.FIRMWARE_MAJOR:
             raise RigError(f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR}; update one of them.")
@@ -289,16 +312,14 @@ class ModbusDome:
             raise ReadbackError(f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the controller.")
 
     def _account(self) -> None:
-        if self._lit is not None:
-            lights, level, since_s = self._lit
+        lit, self._lit = self._lit, None
+        if lit is not None:
+            lights, level, since_s = lit
             self._budget.spend(lights, level, time.monotonic() - since_s)
-            self._lit = None
 
     def _last_resort(self) -> None:
         self._link.close()
-        with suppress(RigError):
-            self.dark()
-        self._keepalive.stop()
+        self.give_up()
 
     def _catch_signals(self) -> None:
         if threading.current_thread() is threading.main_thread():
@@ -312,9 +333,13 @@ class ModbusDome:
         self._previous_handlers.clear()
 
 
+def _require_dome(link: ModbusLink, *, repeated: bool = True) -> None:
+    if link.read(reg.IDENTITY, repeated=repeated)[0] != reg.IDENTITY_VALUE:
+        raise OtherDeviceError(f"the device at {link.address} is no dome controller")
+
+
 def _read_status(link: ModbusLink) -> DomeStatus:
-    if link.read(reg.IDENTITY)[0] != reg.IDENTITY_VALUE:
-        raise LinkError(f"the device at {link.address} is no dome controller")
+    _require_dome(link)
     firmware, lights = link.read(reg.FIRMWARE)[0], min(link.read(reg.LIGHT_COUNT)[0], reg.MAX_LIGHTS)
     closed, pressed, supply = link.read(reg.INTERLOCK_CLOSED, 3)
     banks = -(-lights // reg.LIGHTS_PER_BANK)

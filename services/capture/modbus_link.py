@@ -50,8 +50,8 @@ class ModbusLink:
         self._client = ModbusTcpClient(host, port=port, timeout=timeout_s, retries=0)
         self._lock = threading.RLock()
 
-    def read(self, register: Register, count: int | None = None) -> list[int]:
-        """First ``count`` values of a register, in requests of at most 125; repeated once over a new connection."""
+    def read(self, register: Register, count: int | None = None, *, repeated: bool = True) -> list[int]:
+        """First ``count`` values of a register, in requests of at most 125; unless told not to, repeated once over a new connection."""
         total = register.count if count is None else count
         values: list[int] = []
         for start in range(0, total, MAX_READ):
@@ -59,6 +59,8 @@ class ModbusLink:
             try:
                 values += self._read_once(register, register.address + start, share)
             except (NoReplyError, WrongReplyError):
+                if not repeated:
+                    raise
                 values += self._read_once(register, register.address + start, share)
         return values
 

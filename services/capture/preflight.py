@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from services.capture.camera import Cameras
 from services.capture.dome import Dome
@@ -15,8 +15,11 @@ GLIMPSE_S = 0.005
 BLACK_TOLERANCE = 0.005
 
 
-def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec) -> tuple[str, ...]:
+def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_unwanted: Callable[[], None]) -> tuple[str, ...]:
     """Light every light for a moment, then expose one black and one lit frame.
+
+    Args:
+        raise_if_unwanted: called in the dark before every light and at the end; what it raises ends the preflight.
 
     Returns:
         Sentences about what the operator may want to correct; empty when all is well.
@@ -26,6 +29,7 @@ def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: R
     """
     for frame in plan:
         if frame.light is not None:
+            raise_if_unwanted()
             dome.light(frame.light, frame.level, GLIMPSE_S)
             dome.dark()
 
@@ -38,9 +42,12 @@ def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: R
                 f"Camera {camera} reads {image.mean():.1f} counts in the dark instead of {cameras.black_level}; darken the room or correct the black level."
             )
 
+    raise_if_unwanted()
     findings = []
     lit = next((frame for frame in plan if frame.kind == "tracking"), plan[-1])
-    for camera, image in enumerate(expose(lit, dome, cameras, rig.settle_s)[1]):
+    images = expose(lit, dome, cameras, rig.settle_s)[1]
+    raise_if_unwanted()
+    for camera, image in enumerate(images):
         fraction = clipped_fraction(image, cameras.bits)
         if fraction > CLIPPED_FRACTION:
             findings.append(f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or rig.exposure_s.")

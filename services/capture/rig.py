@@ -45,15 +45,18 @@ class PlannedRig:
         return tuple(light.name for light in self.description.lights)
 
     @contextmanager
-    def in_use(self) -> Iterator[tuple[ModbusDome, Cameras]]:
+    def in_use(self, spent_s: dict[int, float] | None = None) -> Iterator[tuple[ModbusDome, Cameras]]:
         """Dome and cameras, connected; dark at the end.
+
+        Args:
+            spent_s: dose of each light so far, in level-seconds; what is emitted is added to it.
 
         Raises:
             RigError: the dome does not answer, or has too few lights. SettingsError: its address cannot be.
         """
         spec = self.spec
         with dome_address(spec.dome, len(self.lights), spec.watchdog_s) as (host, port):
-            budget = ExposureBudget(spec.light_exposure_limit_s, spec.total_exposure_limit_s)
+            budget = ExposureBudget(spec.light_exposure_limit_s, spec.total_exposure_limit_s, {} if spent_s is None else spent_s)
             with ModbusDome(host, port, budget, spec.watchdog_s) as dome:
                 if dome.light_count < len(self.lights):
                     listing = f"{spec.mouth / 'capture.json'} lists {len(self.lights)}"

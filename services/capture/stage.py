@@ -43,7 +43,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     with rig.in_use() as (dome, cameras):
         # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by the dome.
         context.raise_if_cancelled()
-        for finding in preflight(plan, dome, cameras, spec.rig):
+        for finding in preflight(plan, dome, cameras, spec.rig, context.raise_if_cancelled):
             context.report(StageEvent(stage="capture", kind="log", message=finding))
         capture_frames(plan, rig.lights, dome, cameras, spec.rig.settle_s, store, context)
         manifest = CaptureManifest(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic_core import PydanticCustomError
 
 from services.core.errors import MeshError
 
@@ -16,6 +18,21 @@ Vector3 = tuple[float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
+MOST_NAME_BYTES = 64
+# Controls, halves of a character, and separators of lines and paragraphs
+UNWRITABLE = {"Cc", "Cs", "Zl", "Zp"}
+
+
+def _part_of_a_file_name(name: str) -> str:
+    plain = not any(letter in "/\\" or unicodedata.category(letter) in UNWRITABLE for letter in name)
+    if plain and name not in {"", ".", ".."} and len(name.encode()) <= MOST_NAME_BYTES:
+        return name
+    rule = f"a name has 1 to {MOST_NAME_BYTES} bytes, no slash, backslash or control character, and is neither '.' nor '..'"
+    raise PydanticCustomError("name", "{rule}", {"rule": rule})
+
+
+Name = Annotated[str, AfterValidator(_part_of_a_file_name)]
+"""Of a camera, light or channel: pictures and previews carry it in their file names."""
 
 
 class Record(BaseModel):
@@ -27,7 +44,7 @@ class Record(BaseModel):
 class Camera(Record):
     """A pinhole camera without distortion."""
 
-    name: str
+    name: Name
     size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(description="width, height in pixels")
     K: Matrix3 = Field(description="intrinsic matrix, pixels; pixel centres at half-integers")
     camera_from_world: Matrix4 = Field(description="rigid transform, mm, OpenCV axes")
@@ -62,7 +79,7 @@ class Camera(Record):
 class Light(Record):
     """An isotropic point light."""
 
-    name: str
+    name: Name
     position_mm: Vector3
     intensity: tuple[float, ...] = Field(description="radiant intensity per channel, with mm as the length unit")
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, Strict, model_validator
 from pydantic_core import PydanticCustomError
 
-from services.core.geometry import Camera, Light, Record, Vector3
+from services.core.geometry import Camera, Light, Name, Record, Vector3
 
 
 def _no_stand_in(value: Any) -> Any:
@@ -57,7 +57,7 @@ class FolderCapture(Record):
     """``capture.json`` of a folder capture, also the description of a rig (then ``images`` may be empty)."""
 
     units: Literal["mm"]
-    channels: tuple[str, ...]
+    channels: tuple[Name, ...]
     cameras: tuple[Camera, ...]
     lights: tuple[Light, ...]
     images: tuple[ImageEntry, ...] = ()

@@ -22,6 +22,8 @@ from services.preprocess.stabilise import warp
 STILL_PX = 0.1
 # A frame whose interpolated motion is less certain than this is not used
 UNCERTAIN_PX = 0.5
+# A sample that takes less than this share from inside the image is dimmed by the black around it
+WHOLLY_SEEN = 1 - 1e-3
 BLACK_FRAMES = 8
 # A cubic in time has four coefficients
 MIN_TRACKING = 4
@@ -95,8 +97,9 @@ def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion
         if move.median_px > STILL_PX:
             # Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right
             field = motion.field(move)
-            radiance, variance, saturated = warp(radiance, field), warp(variance, field), warp(saturated, field) > 0
-            beyond |= (variance <= 0).any(axis=-1)
+            of_saturated, of_image = np.moveaxis(warp(np.stack([saturated, np.ones_like(saturated)], axis=-1), field), -1, 0)
+            radiance, variance, saturated = warp(radiance, field), warp(variance, field), of_saturated > 0
+            beyond |= of_image < WHOLLY_SEEN
             warped = True
         merged.add(radiance, variance, saturated)
     radiance, variance, lost = merged.result()

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 
 import pytest
 
@@ -19,6 +16,7 @@ from services.capture.dome_modbus import DomeObserver, ModbusDome
 from services.capture.registers import FaultKind
 from services.capture.simulator import order_fault, serve_dome, simulated_dome
 from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError
+from tests.support.dome_proxy import Proxy
 
 WATCHDOG_S = 1.0
 ALWAYS = 60_000
@@ -163,42 +161,6 @@ def test_a_dome_that_falls_silent_is_reported_as_not_confirmed_dark(address: Add
     gave_up_s = time.monotonic()
     order_fault(*address, FaultKind.NONE)
     require_dark_within_watchdog(observer, gave_up_s)
-
-
-class Proxy:
-    """Forwards TCP connections, until told that those that exist fall silent without closing."""
-
-    def __init__(self, target: Address) -> None:
-        self._target, self._silent, self.accepted = target, set[socket.socket](), list[socket.socket]()
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.address: Address = ("127.0.0.1", self._listener.getsockname()[1])
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def silence(self) -> None:
-        self._silent.update(self.accepted)
-
-    def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:
-                return
-            self.accepted.append(near)
-            far = socket.create_connection(self._target)
-            for source, sink in ((near, far), (far, near)):
-                threading.Thread(target=self._forward, args=(source, sink, near), daemon=True).start()
-
-    def _forward(self, source: socket.socket, sink: socket.socket, near: socket.socket) -> None:
-        with suppress(OSError), source:
-            while data := source.recv(4096):
-                if near not in self._silent:
-                    sink.sendall(data)
-        with suppress(OSError):
-            sink.shutdown(socket.SHUT_RDWR)
 
 
 def test_connections_that_hang_are_replaced(address: Address, observer: DomeObserver) -> None:

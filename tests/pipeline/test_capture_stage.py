@@ -291,7 +291,7 @@ def look(mouth: Path, address: Address, kind: type[SimulatedCameras], gain_level
     plan = plan_capture(rig, LIGHTS)
     stills = Stills(mouth, read_record(mouth / "capture.json", FolderCapture))
     with ModbusDome(*address, ExposureBudget(10, 10)) as dome, kind(stills, rig, gain_level, SubjectMotion(0, 0, 1, 0), *address) as cameras:
-        return preflight(plan, dome, cameras, rig)
+        return preflight(plan, dome, cameras, rig, lambda: None)
 
 
 def test_preflight_finds_nothing_in_a_good_rig(mouth: Path, address: Address) -> None:

@@ -197,6 +197,12 @@ def move_camera(distance: float) -> Callable[[Tree], object]:
     return lambda tree: tree["cameras"][1]["camera_from_world"][2].__setitem__(3, distance)
 
 
+def rename_camera(tree: Tree, name: str) -> None:
+    for image in tree["images"]:
+        image["camera"] = name if image["camera"] == tree["cameras"][0]["name"] else image["camera"]
+    tree["cameras"][0]["name"] = name
+
+
 BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] = {
     "missing file": (
         lambda root, _: (root / "front_right.npy").unlink(),
@@ -220,6 +226,9 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
     "channel without intensity": (edit(lambda tree: tree["lights"][1].update(intensity=[1e6])), CaptureInputError, r"light right has 1 intensities for 2"),
     "other format": (edit(lambda tree: tree["images"][0].update(file="capture.json")), CaptureInputError, r"no \.npy file"),
     "file elsewhere": (edit(lambda tree: tree["images"][0].update(file="../secret.npy")), CaptureInputError, r"secret\.npy lies outside"),
+    "camera whose name leads elsewhere": (edit(lambda tree: rename_camera(tree, "../../c0")), CaptureInputError, r"cameras\.0\.name: a name has 1 to 64 bytes"),
+    "light whose name leads elsewhere": (edit(lambda tree: tree["lights"][1].update(name="/tmp/l")), CaptureInputError, r"lights\.1\.name: .* no slash"),
+    "channel without a name": (edit(lambda tree: tree.update(channels=["green", ""])), CaptureInputError, r"channels\.1: a name has 1 to 64 bytes"),
     "not JSON": (lambda root, _: (root / "capture.json").write_text("{"), CaptureInputError, r"capture\.json"),
     "other units": (edit(lambda tree: tree.update(units="m")), CaptureInputError, r"capture\.json: units"),
     "no mesh": (lambda root, _: (root / "teeth" / "11" / "outer.ply").unlink(), CaptureInputError, r"outer\.ply does not exist"),
@@ -256,6 +265,14 @@ def test_bad_input_ends_in_one_sentence(case: str, tmp_path: Path) -> None:
     assert "\n" not in caught.value.message
     assert not (job / "prepared").exists()
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_camera_may_be_named_in_any_script(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    rename_camera(tree, "Kamera 2.1 – öben")
+    write_tree(tmp_path, tree)
+    assert prepare(tmp_path, tmp_path / "job").cameras[0].name == "Kamera 2.1 – öben"
+    assert (tmp_path / "job" / "prepared" / "quality" / "Kamera 2.1 – öben_left.png").is_file()
 
 
 @pytest.mark.parametrize(
