@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING
 
 from services.api.audit import AuditLog
+from services.api.clerks import Clerks
 from services.api.sessions import COOKIE, Sessions, read_key
 from services.api.tokens import LOCAL, Caller, Tokens
 from services.core.errors import SettingsError, UnauthenticatedError
@@ -16,14 +16,16 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from starlette.requests import HTTPConnection
 
-    from services.api.clerks import Clerks
+
+LOOKERS = 4
+"""Threads that look tokens up: of their own, so that no disk or name server that hangs keeps anybody from ALL OFF."""
 
 
 class Access:
     """The callers of one server; ``sessions`` is None where access is open."""
 
     def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
-        self.tokens, self.sessions = tokens, sessions
+        self.tokens, self.sessions, self._lookers = tokens, sessions, Clerks(LOOKERS)
 
     async def identify(self, request: HTTPConnection) -> Caller:
         """The caller, by the Authorization header or else by the session cookie.
@@ -39,12 +41,12 @@ class Access:
                 raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
             presented = presented.strip()
             if (token := self.tokens.trusted(presented=presented)) is None:
-                token = await asyncio.to_thread(self.tokens.authenticate, presented)
+                token = await self._lookers.ask(self.tokens.authenticate, presented)
             return Caller.of(token)
         if (cookie := request.cookies.get(COOKIE)) is not None:
             token_id = self.sessions.token_id(cookie)
             if (token := self.tokens.trusted(session_of=token_id)) is None:
-                token = await asyncio.to_thread(self.tokens.living, token_id)
+                token = await self._lookers.ask(self.tokens.living, token_id)
             return Caller.of(token, by_session=True)
         raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
 

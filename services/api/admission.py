@@ -7,7 +7,7 @@ import shutil
 import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,15 +51,16 @@ def predict(spec: JobSpec) -> Needs:
 
 
 def _stored_bytes(folder: Path) -> int:
-    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its stage and not walked through here.
+    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its stage and not walked through here. Nor
+    # does a folder that cannot be listed, as on a mount that went away, keep other jobs from starting.
     total = 0
     with suppress(OSError):
         if not any((folder / one).is_file() for one in _DESCRIPTIONS):
             return 0
-    for path in itertools.islice(folder.rglob("*"), MOST_FILES):
-        with suppress(OSError):
-            status = path.lstat()
-            total += 512 * status.st_blocks if stat.S_ISREG(status.st_mode) else 0
+        for path in itertools.islice(folder.rglob("*"), MOST_FILES):
+            with suppress(OSError):
+                status = path.lstat()
+                total += 512 * status.st_blocks if stat.S_ISREG(status.st_mode) else 0
     return total
 
 
@@ -112,10 +113,10 @@ class Admission:
             )
 
     def holds(self, job_id: str, spec: JobSpec) -> bool:
-        """Whether a queued job must wait; ``reason`` then says why."""
+        """Whether a queued job must wait; ``reason`` then says why, and does not wait for this, as the disk of a capture may hang."""
         machine = self._look()
+        needs = self._needs.pop(job_id, None) or predict(spec)
         with self._lock:
-            needs = self._needs.pop(job_id, None) or predict(spec)
             until, reason = self._paused.get(job_id, (0.0, ""))
             if self._clock() >= until:
                 needed, reason = needs.disk_bytes + KEPT_FREE_BYTES, ""
@@ -126,6 +127,14 @@ class Admission:
             if reason:
                 self._needs[job_id], self._reasons[job_id] = needs, reason
             return bool(reason)
+
+    def remember_only(self, job_ids: Iterable[str]) -> None:
+        """Forget jobs that wait no more: cancelled, deleted or another server's."""
+        waiting = set(job_ids)
+        with self._lock:
+            for known in (self._needs, self._paused, self._reasons):
+                for job_id in known.keys() - waiting:
+                    del known[job_id]
 
     def pause(self, job_id: str, problem: DentineError) -> None:
         """Let a job wait that could not go on."""

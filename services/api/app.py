@@ -77,11 +77,9 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            await asyncio.to_thread(readers.close)
-            await asyncio.to_thread(auditors.close)
-            await asyncio.to_thread(dome.close)
-            await asyncio.to_thread(jobs.close)
-            await asyncio.to_thread(workers.close)
+            closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
+            for close in (dome.close, readers.close, auditors.close, jobs.close, workers.close):
+                await closing.ask(close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)

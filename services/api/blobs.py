@@ -30,8 +30,12 @@ class PartialFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._write = write
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        os.ftruncate(self._descriptor, offset)
-        os.lseek(self._descriptor, offset, os.SEEK_SET)
+        try:
+            os.ftruncate(self._descriptor, offset)
+            os.lseek(self._descriptor, offset, os.SEEK_SET)
+        except OSError:
+            os.close(self._descriptor)
+            raise
 
     def __enter__(self) -> Self:
         return self

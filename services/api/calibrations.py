@@ -55,7 +55,7 @@ class CalibrationCreation:
 
 
 class Calibrations:
-    """Use-cases over one data folder, which servers may share."""
+    """Use-cases over one data folder."""
 
     def __init__(self, data: Path, now_s: Callable[[], float] = time.time) -> None:
         self._folder, self._now_s = data / FOLDER, now_s
@@ -115,7 +115,7 @@ class Calibrations:
         return self._folder / f"{calibration_id}.json"
 
     def _take_name(self, entry: NamedCalibration) -> bool:
-        # A hard link is made once, whichever server is first.
+        # A hard link is made once, whichever request is first.
         written = self._folder / f".{secrets.token_hex(8)}"
         write_record(written, entry)
         try:

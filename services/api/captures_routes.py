@@ -1,6 +1,7 @@
 """Captures by upload, below ``/v1/captures``. Annotations are evaluated here, because FastAPI reads them."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from http import HTTPStatus
@@ -8,6 +9,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
+from sqlalchemy.exc import SQLAlchemyError
 
 from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
@@ -34,7 +36,10 @@ def build_captures_router(captures: Captures) -> APIRouter:
     async def sweeping(_app: Any) -> AsyncIterator[None]:
         async def sweep() -> None:
             while True:
-                await in_thread(captures.sweep)
+                try:
+                    await in_thread(captures.sweep)
+                except (SQLAlchemyError, OSError):
+                    logging.getLogger(__name__).exception("looking after captures failed; trying again in %g s", SWEEP_S)
                 await asyncio.sleep(SWEEP_S)
 
         task = asyncio.create_task(sweep())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
@@ -13,6 +14,8 @@ import sqlalchemy as sql
 
 MOST_READERS = 8
 """Of a database over a network, where most of the time is waiting."""
+CLOSE_S = 5.0
+"""How long the server's end waits for work that is under way."""
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -42,5 +45,7 @@ class Clerks:
         return answer
 
     def close(self) -> None:
-        """Wait for what is under way."""
-        self._pool.shutdown()
+        """Wait for what is under way, but not for what hangs: the dome is yet to be left dark."""
+        closing = threading.Thread(target=self._pool.shutdown, name="clerks' end", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)

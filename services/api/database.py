@@ -10,7 +10,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +21,9 @@ from sqlalchemy.dialects import sqlite
 from services.core.errors import PlatformError, SettingsError
 
 BUSY_MS = 5000
-"""How long a writer waits for another one before it gives up."""
+"""How long a writer waits for one of another process before it gives up."""
+TURN_S = 5.0
+"""How long it waits before that for those of its own."""
 MOST_CONNECTIONS = 64
 """Kept open to a file: as many as a server has threads that ask."""
 WRITER_LOCK = 0x64656E74
@@ -101,13 +103,11 @@ class Query:
             with engine.connect() as connection:
                 return connection.execute(self.statement, values).all()
         text, constants = self._compiled
-        borrowed = engine.raw_connection()
         try:
-            rows: list[tuple[Any, ...]] = borrowed.cursor().execute(text, constants | values).fetchall()
-        except sqlite3.Error as problem:
+            with closing(engine.raw_connection()) as borrowed:
+                rows: list[tuple[Any, ...]] = borrowed.cursor().execute(text, constants | values).fetchall()
+        except sqlite3.Error as problem:  # also of connecting, which SQLAlchemy does not translate here
             raise sql.exc.DBAPIError.instance(text, values, problem, sqlite3.Error, hide_parameters=True, dialect=engine.dialect) from problem
-        finally:
-            borrowed.close()
         return rows
 
     @cached_property
@@ -119,12 +119,29 @@ class Query:
 
 @contextmanager
 def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
-    """A transaction that keeps other writers out from its first statement."""
-    turn = engine.get_execution_options().get("turn", nullcontext())
-    with turn, engine.connect() as connection, connection.execution_options(writes=True).begin():
+    """A transaction that keeps other writers out from its first statement.
+
+    Raises:
+        sqlalchemy.exc.OperationalError: others write for too long, or the database does not answer.
+    """
+    with _turn(engine), engine.connect() as connection, connection.execution_options(writes=True).begin():
         if engine.dialect.name == "postgresql":
             connection.execute(sql.select(sql.func.pg_advisory_xact_lock(WRITER_LOCK)))
         yield connection
+
+
+@contextmanager
+def _turn(engine: sql.Engine) -> Iterator[None]:
+    turn: threading.Lock | None = engine.get_execution_options().get("turn")
+    if turn is None:
+        yield
+        return
+    if not turn.acquire(timeout=TURN_S):
+        raise sql.exc.OperationalError("BEGIN IMMEDIATE", None, TimeoutError("other writers of this process have not ended"))
+    try:
+        yield
+    finally:
+        turn.release()
 
 
 def _watchful(url: sql.URL) -> dict[str, Any]:

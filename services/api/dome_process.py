@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import queue
 import subprocess
 import sys
 import threading
@@ -20,11 +21,15 @@ END_S = 10.0
 
 
 class DomeProcess:
-    """Started when it is first needed and again after it died. It ends dark with the pipe to it, however this process ends."""
+    """Started when it is first needed and again after it died. It ends dark with the pipe to it, however this process ends.
+
+    A thread of its own writes to the pipe, as a process that no longer reads lets whoever writes wait: nobody else does, and the lock is free for ``kill``.
+    """
 
     def __init__(self, settings: DomeSettings) -> None:
         self._settings, self._lock, self._numbers = settings, threading.Lock(), itertools.count(1)
         self._process: subprocess.Popen[str] | None = None
+        self._commands: queue.SimpleQueue[DomeCommand | None] = queue.SimpleQueue()
         self._waiting: dict[int, Future[DomeAnswer]] = {}
 
     @property
@@ -38,23 +43,17 @@ class DomeProcess:
         Raises:
             DentineError: what the command ended in. TimeoutError: no answer in time. PlatformError: the packages of the dome are not installed.
         """
-        number = next(self._numbers)
-        line = DomeCommand.model_validate({"number": number} | command).model_dump_json()
+        asked = DomeCommand.model_validate({"number": next(self._numbers)} | command)
         future: Future[DomeAnswer] = Future()
         with self._lock:
             self._start()
             waiting = self._waiting
-            waiting[number] = future
-            assert self._process is not None
-            assert self._process.stdin is not None
-            try:
-                print(line, file=self._process.stdin, flush=True)
-            except BrokenPipeError:
-                raise _ended() from None
+            waiting[asked.number] = future
+            self._commands.put(asked)
         try:
             answer = future.result(timeout_s)
         finally:
-            waiting.pop(number, None)
+            waiting.pop(asked.number, None)
         if answer.code is not None:
             raise error_of(answer.code, answer.message) or DentineError(answer.message)
         return answer
@@ -82,11 +81,9 @@ class DomeProcess:
         process, self._process = self._process, None
         if process is None:
             return
-        assert process.stdin is not None
         if not patience_s:
             process.kill()
-        with suppress(BrokenPipeError):
-            process.stdin.close()
+        self._commands.put(None)
         with suppress(subprocess.TimeoutExpired):
             process.wait(patience_s)
         process.kill()
@@ -101,8 +98,21 @@ class DomeProcess:
         command = [sys.executable, "-m", DOOR, self._settings.model_dump_json()]
         # A session of its own: Ctrl-C must not reach it before the server has closed its pipe.
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)  # noqa: S603
-        self._waiting = {}
+        self._commands, self._waiting = queue.SimpleQueue(), {}
+        threading.Thread(target=_speak, args=(self._process, self._commands, self._waiting), name="to the dome process", daemon=True).start()
         threading.Thread(target=_listen, args=(self._process, self._waiting), name="dome process", daemon=True).start()
+
+
+def _speak(process: subprocess.Popen[str], commands: queue.SimpleQueue[DomeCommand | None], waiting: dict[int, Future[DomeAnswer]]) -> None:
+    """Write every command, then close the pipe, which is what ends the process."""
+    assert process.stdin is not None
+    for command in iter(commands.get, None):
+        try:
+            print(command.model_dump_json(), file=process.stdin, flush=True)
+        except BrokenPipeError:
+            _tell_ended(waiting, command.number)
+    with suppress(BrokenPipeError):
+        process.stdin.close()
 
 
 def _listen(process: subprocess.Popen[str], waiting: dict[int, Future[DomeAnswer]]) -> None:
@@ -112,9 +122,10 @@ def _listen(process: subprocess.Popen[str], waiting: dict[int, Future[DomeAnswer
             answer = DomeAnswer.model_validate_json(line)
             if (future := waiting.pop(answer.number, None)) is not None:
                 future.set_result(answer)
-    for number in list(waiting):
-        waiting.pop(number).set_exception(_ended())
+    _tell_ended(waiting, *waiting)
 
 
-def _ended() -> RigError:
-    return RigError("The process that works the dome ended, and so did its light; ask again, the server's log says why it ended.")
+def _tell_ended(waiting: dict[int, Future[DomeAnswer]], *numbers: int) -> None:
+    for number in numbers:
+        if (future := waiting.pop(number, None)) is not None:
+            future.set_exception(RigError("The process that works the dome ended, and so did its light; ask again, the server's log says why it ended."))

@@ -27,20 +27,20 @@ def erase(folder: Path) -> Erased:
     """Remove a folder and everything below it; an absent one counts as empty. A removal that was cut short is gone on with, and counts from its beginning.
 
     Raises:
-        StoreError: something could not be removed.
+        StoreError: something could not be read or removed, or what is removed not be noted.
     """
     listing = _listing(folder)
-    if not listing.exists():
-        write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
     try:
+        if not listing.exists():
+            listing.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
         while folder.exists():
-            with suppress(FileNotFoundError):  # another server removes it too
+            with suppress(FileNotFoundError):  # gone meanwhile, by whomever
                 shutil.rmtree(folder)
+        return Erased(**json.loads(listing.read_text()))
     except OSError as problem:
-        raise StoreError(
-            f"{problem.filename or folder} could not be removed ({problem.strerror}); correct its permissions and delete the job again."
-        ) from problem
-    return Erased(**json.loads(listing.read_text()))
+        what = f"{problem.filename or folder} could not be removed ({problem.strerror})"
+        raise StoreError(f"{what}; correct its permissions or its disk and delete the job again.") from problem
 
 
 def forget_listing(folder: Path) -> None:

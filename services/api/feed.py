@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -14,14 +15,17 @@ import sqlalchemy as sql
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
+from services.api.lifecycle import JobState
 from services.api.repository import Repository
-from services.api.threads import in_thread
+from services.core.errors import UnknownJobError
 
 PERIOD_S = 0.2
 PING_S = 15.0
-"""A silent stream says that it lives this often."""
+"""A silent stream says that it lives this often, and looks whether its job still does."""
 MOST_EVENTS = 1000
 """Read and sent at once."""
+MOST_TURNS = 64
+"""Remembered; a stream that was stalled for longer reads again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {"itemSchema": {"type": "object", "properties": {name: {"type": "string"} for name in ("data", "event", "id")}}}}}
 }
@@ -39,7 +43,7 @@ class EventStream(StreamingResponse):
 
 @dataclass(frozen=True)
 class Chapter:
-    """Events of a job after some id, as they are sent; the last one carries the final state."""
+    """Events of a job after some id, as they are sent; the last one carries the final state, which may be that the job is being deleted."""
 
     text: bytes
     last_id: int
@@ -52,10 +56,10 @@ class Chapter:
 class Turn:
     """From one growth of the event table to the next. Streams walk from turn to turn, so that they miss none while they send."""
 
+    number: int
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     jobs: frozenset[str] = frozenset()
     """Those that have new events, once it has ended."""
-    following: Turn | None = None
     reads: dict[tuple[str, int], asyncio.Task[Chapter]] = field(default_factory=dict)
     """Under way, by job and the id after which they read."""
 
@@ -67,20 +71,21 @@ class EventFeed:
         ask: calls a reader in a thread.
     """
 
-    def __init__(self, repository: Repository, ask: Callable[[Callable[[], Chapter]], Coroutine[Any, Any, Chapter]] = asyncio.to_thread) -> None:
+    def __init__(self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread) -> None:
         self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
-        self._turn = Turn()
+        self._turns = deque([Turn(0)], MOST_TURNS)
 
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
         while True:
             newest: dict[str, int] = {}
             with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
-                newest = await in_thread(self._repository.newest_events, self._newest)
+                newest = await self._ask(partial(self._repository.newest_events, self._newest))
             if newest:
                 self._newest = max(newest.values())
-                ended, self._turn = self._turn, Turn()
-                ended.jobs, ended.following = frozenset(newest), self._turn
+                ended = self._turns[-1]
+                self._turns.append(Turn(ended.number + 1))
+                ended.jobs = frozenset(newest)
                 ended.ended.set()
             await asyncio.sleep(PERIOD_S)
 
@@ -90,17 +95,26 @@ class EventFeed:
         Raises:
             UnknownJobError: there is no such job.
         """
-        turn = self._turn
+        turn = self._turns[-1]
         chapter = await self._read(turn, job_id, after)
         if chapter.is_last:
             return Response(chapter.text, headers=_UNBUFFERED, media_type=EventStream.media_type)
         return EventStream(self.follow(job_id, after, (turn, chapter)), headers=_UNBUFFERED)
 
     async def follow(self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None) -> AsyncIterator[bytes]:
-        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state; ``opening`` was read already."""
+        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or the job's deletion.
+
+        Args:
+            opening: was read already.
+        """
         while True:
-            turn = self._turn if opening is None else opening[0]
-            chapter = await self._read(turn, job_id, after) if opening is None else opening[1]
+            turn = self._turns[-1] if opening is None else opening[0]
+            try:
+                chapter = await self._read(turn, job_id, after) if opening is None else opening[1]
+            except UnknownJobError:
+                return
+            except sql.exc.SQLAlchemyError:
+                chapter = Chapter(b"", after, is_last=False, is_full=False)  # the next ping's look makes up for it
             opening = None
             if chapter.text:
                 yield chapter.text
@@ -113,10 +127,16 @@ class EventFeed:
                         await turn.ended.wait()
                 except TimeoutError:
                     yield KEEPALIVE_COMMENT
-                    continue
-                if job_id in turn.jobs or turn.following is None:
                     break
-                turn = turn.following
+                following = self._after(turn)
+                if job_id in turn.jobs or following is None:
+                    break
+                turn = following
+
+    def _after(self, turn: Turn) -> Turn | None:
+        """The turn after one that has ended; None if it is not remembered. Turns do not know it, or a stalled stream would keep all that came after."""
+        back = self._turns[-1].number - turn.number
+        return self._turns[-back] if back <= len(self._turns) else None
 
     async def _read(self, turn: Turn, job_id: str, after: int) -> Chapter:
         """Read what happened up to this turn at least; whoever asks the same in the same turn shares the read."""
@@ -132,6 +152,6 @@ def _read(repository: Repository, job_id: str, after: int) -> Chapter:
     events = repository.events_of(job_id).read(after, MOST_EVENTS)
     told = [format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events]
     is_full = len(events) == MOST_EVENTS
-    if is_last := state.is_final and not is_full:
+    if is_last := (state.is_final or state is JobState.DELETING) and not is_full:
         told.append(format_sse_event(event="end", data_str=f'"{state}"'))
     return Chapter(b"".join(told), events[-1].id if events else after, is_last, is_full)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from http import HTTPStatus
 from typing import TYPE_CHECKING
@@ -17,8 +18,9 @@ from services.api.access import Access
 from services.api.audit import AuditLog, Deed
 from services.api.clerks import Clerks
 from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
-from services.api.problems import MEDIA_TYPE, Problem, response_of
+from services.api.problems import MEDIA_TYPE, Problem, database_lost, response_of
 from services.api.rates import Rates, network_of
+from services.api.requests import method_of
 from services.api.shield import SAFE_METHODS
 from services.api.tokens import public_id
 from services.core.errors import PlatformError, RateError, ScopeError, UnauthenticatedError
@@ -48,8 +50,11 @@ class Gate:
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        deed = Deed(f"{scope['method']} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
-        refusal = await self._refusal(request, found, deed)
+        deed = Deed(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
+        try:
+            refusal = await self._refusal(request, found, deed)
+        except SQLAlchemyError:
+            refusal = database_lost(scope["path"])
         if refusal is not None:
             await refusal(scope, receive, send)
             return
@@ -123,12 +128,15 @@ class Gate:
                 await self._app(scope, receive, send_audited)
             except Exception:
                 if is_audited:
-                    await self._auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                    with suppress(SQLAlchemyError):
+                        await self._auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
                 raise
 
     async def _is_still_known(self, request: HTTPConnection) -> bool:
+        # While the database is away nobody can say otherwise; the next message asks again.
         try:
-            await self._access.identify(request)
+            with suppress(SQLAlchemyError):
+                await self._access.identify(request)
         except UnauthenticatedError:
             return False
         return True

@@ -13,6 +13,8 @@ from services.core.geometry import Record
 from services.core.stage import StageName
 
 PICTURES = ("render", "photo", "residual")
+ENTRY_BYTES = 512
+"""What a curve that is kept takes beside its text and its channel: key, tuples, its place in the mapping."""
 
 
 class LogLine(Record):
@@ -124,14 +126,18 @@ class Histories:
         with self._lock:
             self._drop(key)
             self._kept[key] = newest, text
-            self._bytes += len(text)
+            self._bytes += _kept_bytes(channel, text)
             while self._bytes > self._most_bytes:
                 self._drop(next(iter(self._kept)))
         return text
 
     def _drop(self, key: tuple[str, int, str | None]) -> None:
-        _, text = self._kept.pop(key, (0, b""))
-        self._bytes -= len(text)
+        if (kept := self._kept.pop(key, None)) is not None:
+            self._bytes -= _kept_bytes(key[2], kept[1])
+
+
+def _kept_bytes(channel: str | None, text: bytes) -> int:
+    return len(text) + 4 * len(channel or "") + ENTRY_BYTES
 
 
 class _Thinned:

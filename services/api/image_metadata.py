@@ -80,15 +80,15 @@ def metadata_fault(path: Path, name: str, suffix: str) -> str | None:
 
 def plain_png(content: bytes) -> bytes:
     """A whole PNG with nothing but header, palette and pixels."""
-    kept, place = PNG_SIGNATURE, len(PNG_SIGNATURE)
+    kept, place = [PNG_SIGNATURE], len(PNG_SIGNATURE)
     while place < len(content):
         length, kind = struct.unpack_from(">I4s", content, place)
         if kind in {b"IHDR", b"PLTE", b"IDAT", b"IEND"}:
-            kept += content[place : place + 12 + length]
+            kept.append(content[place : place + 12 + length])
         if kind == b"IEND":
             break
         place += 12 + length
-    return kept
+    return b"".join(kept)
 
 
 def _png(stream: BinaryIO) -> Iterator[str]:
@@ -112,25 +112,25 @@ def _png(stream: BinaryIO) -> Iterator[str]:
 
 
 def _tiff(stream: BinaryIO) -> Iterator[str]:
+    # Directories and lists of offsets may lie one over the other, so a small file can hold many long ones: what counts is their sum.
     layout = tiff_layout(stream.read(16))
-    waiting, seen = [layout.start], set[int]()
+    waiting, seen, parts = [layout.start], set[int](), 0
     while waiting:
         start = waiting.pop()
         if start in seen or start == 0:
             continue
         seen.add(start)
-        if len(seen) > _MOST_PARTS:
-            raise ValueError(f"it has more than {_MOST_PARTS} directories")
         stream.seek(start)
         (count,) = struct.unpack(layout.count, stream.read(struct.calcsize(layout.count)))
-        if count > _MOST_PARTS:
-            raise ValueError(f"a directory has more than {_MOST_PARTS} entries")
+        parts = _counted(parts + 1 + count)
         entries = stream.read(count * layout.entry_bytes)
         waiting += struct.unpack(layout.offset, stream.read(struct.calcsize(layout.offset)))
         for place in range(0, count * layout.entry_bytes, layout.entry_bytes):
             (tag,) = struct.unpack_from(f"{layout.order}H", entries, place)
             if tag == _SUB_IMAGES:
-                waiting += _sub_images(stream, layout.offset, entries[place : place + layout.entry_bytes])
+                starts = _sub_images(stream, layout.offset, entries[place : place + layout.entry_bytes])
+                parts = _counted(parts + len(starts))
+                waiting += starts
             elif tag not in _TIFF_PLAIN:
                 yield _TIFF_NAMES.get(tag, f"tag {tag}")
 
@@ -142,10 +142,14 @@ def _sub_images(stream: BinaryIO, offset: str, entry: bytes) -> list[int]:
     (value,) = struct.unpack_from(offset, entry, 4 + room)
     if count == 1:
         return [int(value)]
-    if count > _MOST_PARTS:
-        raise ValueError(f"it has more than {_MOST_PARTS} directories")
     stream.seek(value)
-    return [one for (one,) in struct.iter_unpack(offset, stream.read(count * room))]
+    return [one for (one,) in struct.iter_unpack(offset, stream.read(_counted(count) * room))]
+
+
+def _counted(parts: int) -> int:
+    if parts > _MOST_PARTS:
+        raise ValueError(f"it has more than {_MOST_PARTS} directories and entries")
+    return parts
 
 
 def _exr(stream: BinaryIO) -> Iterator[str]:

@@ -34,10 +34,10 @@ class JobSize(Record):
 
 def size_of(spec: JobSpec) -> JobSize | None:
     """Size of a job from the description of its capture; None where that cannot be read."""
-    path = _description(spec)
-    if path is None:
-        return None
     try:
+        path = _description(spec)
+        if path is None:
+            return None
         images_px, channels = _images(path, path.stat().st_mtime_ns)
     except (OSError, ValueError, KeyError, StoreError):
         return None

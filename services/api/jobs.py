@@ -13,6 +13,7 @@ from pydantic import Field
 from services.api.admission import Admission, Machine
 from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
+from services.api.data_folder import require_own_folder
 from services.api.erasure import erase, forget_listing
 from services.api.events import JobEvent
 from services.api.lifecycle import Instruction, JobState, Trigger
@@ -38,19 +39,25 @@ class StageProgress(Record):
     """How far one stage of a job is."""
 
     stage: StageName
-    state: str = Field(description="waiting, running, finished, or stopped where the job ended in it")
+    state: str = Field(description="waiting, running, finished, or stopped where it was begun and the job does not run")
     attempt: int = Field(description="0 before the first")
     done: float = Field(description="fraction, 0 to 1")
     message: str
 
 
 class Jobs:
-    """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run."""
+    """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run.
+
+    Raises:
+        SettingsError: the database belongs to another data folder.
+    """
 
     def __init__(self, settings: ServerSettings, run: RunJob) -> None:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(settings.database_url)
+        if settings.database is not None:
+            require_own_folder(self.repository.engine, self._data)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self.calibrations = Calibrations(self._data)
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
@@ -94,8 +101,8 @@ class Jobs:
             self.calibrations.require(spec.calibration)
         elif spec.calibration is not None:
             require_server_path("calibration", spec.calibration)
+        self._admission.refuse_too_large(self.locate(spec))  # before other submissions have to wait, as it walks through the capture
         with self.captures.keeping(spec.capture):
-            self._admission.refuse_too_large(self.locate(spec))
             creation = self.repository.create(spec, key, request_id)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
@@ -155,7 +162,7 @@ class Jobs:
 
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, None if nothing keeps it."""
-        return self._admission.reason(job.id)
+        return self._admission.reason(job.id) if job.state is JobState.QUEUED else None
 
     def time_range(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
@@ -185,7 +192,7 @@ class Jobs:
                 self.delete(job_id)
             except UnknownJobError:
                 continue  # deleted meanwhile
-            except StoreError as problem:
+            except (StoreError, OSError) as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
 
 
@@ -214,5 +221,5 @@ def _is_there(path: Path) -> bool:
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:
     if last is None:
         return StageProgress(stage=stage, state="waiting", attempt=0, done=0.0, message="")
-    state = "finished" if last.kind == "finished" else "stopped" if job.state.is_final else "running"
+    state = "finished" if last.kind == "finished" else "running" if job.state in {JobState.RUNNING, JobState.CANCELLING} else "stopped"
     return StageProgress(stage=stage, state=state, attempt=last.attempt, done=last.done or 0.0, message=last.message)

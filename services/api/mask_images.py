@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _GREY = 0
 _DEPTHS = (1, 8)
+_PIECE_BYTES = 2**18
 
 
 def require_mask(content: bytes, camera: Camera) -> None:
@@ -40,7 +41,7 @@ def _require_header(header: PngHeader, camera: Camera) -> None:
 
 
 def _require_rows(content: bytes, camera: Camera) -> None:
-    # Inflates what the header promises and not a byte more; every row begins with the number of its filter.
+    # Inflates little more than the header promises, in pieces, as a mask may grow a thousandfold; every row begins with the number of its filter.
     (width, height), depth = camera.size, png_header(content).depth
     expected_bytes = height * (1 + -(-width * depth // 8))
     inflater, inflated_bytes, place = zlib.decompressobj(), 0, len(PNG_SIGNATURE)
@@ -50,9 +51,13 @@ def _require_rows(content: bytes, camera: Camera) -> None:
         if zlib.crc32(kind + data) != checksum:
             raise ValueError("a part of it is damaged")
         if kind == b"IDAT":
-            inflated_bytes += len(inflater.decompress(data, expected_bytes - inflated_bytes + 1))
-            if inflated_bytes > expected_bytes:
-                raise ValueError("it holds more than its header declares")
+            is_used_up = inflater.eof
+            while not is_used_up:
+                piece = inflater.decompress(data, _PIECE_BYTES)
+                inflated_bytes += len(piece)
+                if inflated_bytes > expected_bytes:
+                    raise ValueError("it holds more than its header declares")
+                data, is_used_up = inflater.unconsumed_tail, len(piece) < _PIECE_BYTES
         if kind == b"IEND":
             break
         place += 12 + length

@@ -46,7 +46,7 @@ def build_observe_router(jobs: Jobs, readers: Clerks) -> APIRouter:
 
     @router.get("/jobs/{job_id}/history", response_model=History, tags=["jobs"], dependencies=[needs("read")])
     @readers.answering
-    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: str | None = None) -> Response:
+    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: Annotated[str | None, Query(max_length=100)] = None) -> Response:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
         return Response(histories.read(events_of(job_id), points, channel), media_type=JSON)
 

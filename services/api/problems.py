@@ -125,6 +125,15 @@ def response_of(problem: DentineError, path: str, headers: dict[str, str] | None
     return Response(Problem.of(status, problem.code, problem.message, path).model_dump_json(), status, headers, MEDIA_TYPE)
 
 
+def database_lost(path: str) -> Response:
+    """The answer to a request that the database kept from being answered."""
+    from starlette.responses import Response
+
+    detail = "The database does not answer; what is stored is kept, try again later."
+    problem = Problem.of(HTTPStatus.SERVICE_UNAVAILABLE, "database-lost", detail, path)
+    return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)
+
+
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """What the description says of routes that may answer so, besides what the shield, the gate and a lost database answer everywhere."""
     return {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in sorted({400, 401, 403, 429, 503, *statuses})}
@@ -135,6 +144,7 @@ def install(app: FastAPI) -> None:
     from fastapi.exceptions import RequestValidationError
     from fastapi.responses import Response
     from sqlalchemy.exc import DataError, DBAPIError
+    from sqlalchemy.exc import TimeoutError as NoConnectionError
     from starlette.exceptions import HTTPException
 
     describe = app.openapi
@@ -162,9 +172,10 @@ def install(app: FastAPI) -> None:
         detail = "The request holds text or a number that the database does not take, such as the character NUL; leave it out."
         return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", detail)
 
+    @app.exception_handler(NoConnectionError)
     @app.exception_handler(DBAPIError)
-    def _database(request: Request, _problem: DBAPIError) -> Response:
-        return answer(request, HTTPStatus.SERVICE_UNAVAILABLE, "database-lost", "The database does not answer; what is stored is kept, try again later.")
+    def _database(request: Request, _problem: DBAPIError | NoConnectionError) -> Response:
+        return database_lost(request.scope["path"])
 
     @app.exception_handler(RequestValidationError)
     def _request(request: Request, problem: RequestValidationError) -> Response:

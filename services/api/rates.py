@@ -20,7 +20,7 @@ class MovingWindow:
 
     def hit(self, key: str) -> int:
         """Count a hit and answer 0, or answer how many seconds to wait for the next one that is granted."""
-        now = time.time()
+        now = time.monotonic()
         if now >= self._sweep_at:
             self._hits = {one: hits for one, hits in self._hits.items() if hits[-1] > now - self._seconds}
             self._sweep_at = now + self._seconds

@@ -7,10 +7,11 @@ once the checksum holds; without one, what came before the connection broke is k
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import hmac
 from collections.abc import AsyncIterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
 from starlette.requests import ClientDisconnect
@@ -19,7 +20,7 @@ from services.api.blobs import PartialFile
 from services.api.threads import in_thread
 from services.api.tus import Checksum
 from services.api.uploads import Upload, Uploads
-from services.core.errors import ChecksumError, DentineError, TooLargeError
+from services.core.errors import ChecksumError, DentineError, DiskFullError, TooLargeError
 
 BLOCK_BYTES = 2**20
 RECORD_BYTES = 64 * 2**20
@@ -61,7 +62,8 @@ async def receive(uploads: Uploads, capture: str, number: int, offset: int, stre
 
 
 async def _append(uploads: Uploads, upload: Upload, body: AsyncIterator[bytes], checksum: Checksum | None) -> Received:
-    with uploads.open_partial(upload) as partial:
+    with ExitStack() as opened:
+        partial = await in_thread(_open, uploads, upload, opened)
         tail = _Tail(uploads, upload, partial, checksum)
         try:
             async for chunk in body:
@@ -76,6 +78,16 @@ async def _append(uploads: Uploads, upload: Upload, body: AsyncIterator[bytes], 
         await in_thread(tail.flush)
         tail.require_checksum()
         return await in_thread(tail.record)
+
+
+def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
+    """Open the file where its next bytes go, to be closed with ``opened``, also if whoever asked has gone meanwhile."""
+    try:
+        return opened.enter_context(uploads.open_partial(upload))
+    except OSError as problem:
+        if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
+            raise DiskFullError("The server's disk is full; free some space there and send again, what was acknowledged is kept.") from problem
+        raise
 
 
 class _Tail:

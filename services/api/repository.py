@@ -22,6 +22,7 @@ from services.api.events import Begun, EventAddress, EventLog, begun, event_tabl
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
 from services.api.past_runs import PastRuns, past_run_table
+from services.api.webhook_outbox import collect_changes
 from services.core.errors import DentineError, FencedError, JobStateError, UnknownJobError
 from services.core.geometry import Record
 from services.core.records import JobSpec
@@ -99,7 +100,7 @@ class JobFilter(Record):
     def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
         """What a row of the job table must fulfil."""
         if self.states:
-            yield sql.or_(*(job_table.c.state == state.value for state in self.states))
+            yield sql.or_(*(job_table.c.state == state.value for state in sorted(set(self.states))))  # each once, as SQLite nests no more than 1000 of them
         if self.kind is not None:
             yield job_table.c.kind == self.kind
         if self.created_after_s is not None:
@@ -303,6 +304,7 @@ class Repository:
             job = self._find(connection, job_id)
             if job.state is not JobState.DELETING:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
+            collect_changes(connection, self._clock())  # as the events go with the job
             receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
             connection.execute(deletion_table.insert().values(receipt.model_dump()))
             for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from starlette.datastructures import Headers, MutableHeaders
 
 from services.api.logs import bind_request
-from services.api.metrics import RequestMetrics
+from services.api.metrics import METHODS, RequestMetrics
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -55,8 +55,14 @@ class RequestLog:
             if not status:  # an exception, which the server answers further out
                 status = 500
                 self._metrics.count(scope["method"], route_of(scope), status, duration_s)
-            told = {"method": scope["method"], "route": route_of(scope), "status": status, "duration_s": round(duration_s, 6)}
+            told = {"method": method_of(scope), "route": route_of(scope), "status": status, "duration_s": round(duration_s, 6)}
             logging.getLogger(__name__).info("Request answered.", extra=told | {"client": scope["client"][0] if scope.get("client") else None})
+
+
+def method_of(scope: Scope) -> str:
+    """The request's method, ``other`` for one that HTTP does not know: that is whatever a stranger wrote, at any length."""
+    method: str = scope["method"]
+    return method if method in METHODS else "other"
 
 
 def route_of(scope: Scope) -> str:

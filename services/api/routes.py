@@ -1,5 +1,6 @@
 """The REST routes below ``/v1``. Annotations are evaluated here, because FastAPI reads them and they name local dependencies."""
 
+import asyncio
 import json
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,9 @@ from services.api.repository import Deletion, Job, JobFilter
 from services.api.time_ranges import TimeRange
 from services.core.geometry import Record
 from services.core.records import JobSpec
+
+LOOK_S = 2.0
+"""How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
 
 
 class JobPage(Record):
@@ -46,10 +50,23 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
     """Routes over the given jobs."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
+    lookers = Clerks(1)
 
-    def detail(job: Job) -> JobDetail:
+    @in_json
+    def tell(job: Job, remaining: TimeRange | None) -> JobDetail:
         fields = {name: getattr(job, name) for name in Job.model_fields}
-        return JobDetail(**fields, stages=jobs.progress(job), waits_for=jobs.waits_for(job), remaining=jobs.time_range(job))
+        return JobDetail(**fields, stages=jobs.progress(job), waits_for=jobs.waits_for(job), remaining=remaining)
+
+    def find(job_id: str) -> Job | Response:
+        job = jobs.repository.get(job_id)
+        return tell(job, None) if job.state.is_final else job
+
+    async def look(job: Job) -> TimeRange | None:
+        try:
+            async with asyncio.timeout(LOOK_S):
+                return await lookers.ask(jobs.time_range, job)
+        except TimeoutError:
+            return TimeRange(reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again.")
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
@@ -76,12 +93,11 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
         found = jobs.repository.page(limit + 1, before, only=only)
         return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
-    @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("read")])
-    @readers.answering
-    @in_json
-    def get(job_id: str) -> JobDetail:
+    @router.get("/jobs/{job_id}", response_model=JobDetail, tags=["jobs"], dependencies=[needs("read")])
+    async def get(job_id: str) -> Response:
         """One job with its stages."""
-        return detail(jobs.repository.get(job_id))
+        found = await readers.ask(find, job_id)
+        return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found))
 
     @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def cancel(job_id: str) -> Job:

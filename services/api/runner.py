@@ -107,7 +107,9 @@ class Runner:
 
     def _next(self) -> Lease | None:
         # The oldest job that may start; those that wait for disk or workers let others pass.
-        for job in self._repository.queued():
+        queued = self._repository.queued()
+        self._admission.remember_only(job.id for job in queued)
+        for job in queued:
             if self._admission.holds(job.id, self._locate(job.spec)):
                 continue
             try:

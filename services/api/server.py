@@ -25,7 +25,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
 
     Raises:
         PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
-        SettingsError: other machines reach the server and access is open.
+        SettingsError: other machines reach the server and access is open, or the database belongs to another data folder.
     """
     refuse_open_network(settings)
     try:

@@ -122,12 +122,26 @@ class _Credential(NamedTuple):
         return cls(None if presented is None else _hash(presented), session_of)
 
 
-class Tokens:
-    """The token table."""
+class _Trust(NamedTuple):
+    """A token that was looked up, how long to trust it, and how many were revoked at this server before the look-up began: after another one it is void."""
 
-    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time) -> None:
-        self._engine, self._clock = engine, clock
-        self._trusted: dict[_Credential, tuple[Token, float]] = {}
+    token: Token
+    until_ticks: float
+    revocations: int
+
+
+class Tokens:
+    """The token table.
+
+    Args:
+        clock: Unix time; tokens expire by it.
+        ticks: seconds that no step of the clock changes; trust ends by them.
+    """
+
+    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time, ticks: Callable[[], float] = time.monotonic) -> None:
+        self._engine, self._clock, self._ticks = engine, clock, ticks
+        self._trusted: dict[_Credential, _Trust] = {}
+        self._revocations = 0
 
     def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed) -> IssuedToken:
         """Make a token; the result is the only place where its secret is.
@@ -177,13 +191,13 @@ class Tokens:
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(revoked_s=now))
             deed.ids["token_id"] = row["id"]
             deed.write(connection, 200)
-        self._trusted.clear()
+        self._revocations += 1
         return Token(**_fields(row))
 
     def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
         """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks nobody."""
-        token, until_s = self._trusted.get(_Credential.of(presented, session_of), (None, 0.0))
-        return token if self._clock() < until_s else None
+        found = self._trusted.get(_Credential.of(presented, session_of))
+        return found.token if found is not None and self._ticks() < found.until_ticks and found.revocations == self._revocations else None
 
     def authenticate(self, presented: str) -> Token:
         """The token that was presented.
@@ -191,12 +205,12 @@ class Tokens:
         Raises:
             UnauthenticatedError: it is malformed, unknown, expired or revoked; the message does not tell which.
         """
-        row = self._find(public_id(presented) or "")
+        revocations, row = self._revocations, self._find(public_id(presented) or "")
         is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
         if row is None or not is_same or not _is_living(row, self._clock()):
             raise UnauthenticatedError("This token is unknown, expired or revoked; ask an administrator for a new one.")
         self._note_use(row)
-        return self._trust(_Credential.of(presented), row)
+        return self._trust(_Credential.of(presented), row, revocations)
 
     def living(self, token_id: str) -> Token:
         """The token with this id, for a session that it has opened.
@@ -204,16 +218,17 @@ class Tokens:
         Raises:
             UnauthenticatedError: it has expired or was revoked since.
         """
-        row = self._find(token_id)
+        revocations, row = self._revocations, self._find(token_id)
         if row is None or not _is_living(row, self._clock()):
             raise UnauthenticatedError("The token of this session has expired or was revoked; sign in with another one.")
-        return self._trust(_Credential.of(session_of=token_id), row)
+        return self._trust(_Credential.of(session_of=token_id), row, revocations)
 
-    def _trust(self, credential: _Credential, row: Any) -> Token:
-        token, now = Token(**_fields(row)), self._clock()
+    def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
+        token = Token(**_fields(row))
+        left_s = math.inf if token.expires_s is None else token.expires_s - self._clock()
         if len(self._trusted) >= MOST_TRUSTED:
             self._trusted.clear()
-        self._trusted[credential] = token, min(now + TRUSTED_S, token.expires_s or math.inf)
+        self._trusted[credential] = _Trust(token, self._ticks() + min(TRUSTED_S, left_s), revocations)
         return token
 
     def _find(self, token_id: str) -> Any:

@@ -6,7 +6,9 @@ import asyncio
 import ipaddress
 import re
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import httpx
 
@@ -15,6 +17,8 @@ from services.core.errors import WebhookAddressError
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 _HOST = re.compile(r"[A-Za-z0-9_.:-]+")
+_ASKERS = ThreadPoolExecutor(16, "names")
+"""Ask name servers, as many at once as there are receivers; nothing else waits for one that does not answer."""
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
 
@@ -63,7 +67,8 @@ class AddressPolicy:
             WebhookAddressError: one of them is refused, or the name has none.
         """
         try:
-            found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            ask = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+            found = await asyncio.get_running_loop().run_in_executor(_ASKERS, ask)
         except (OSError, UnicodeError) as problem:
             raise WebhookAddressError(f"The webhook's host {host} cannot be resolved; correct the address.") from problem
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))

@@ -7,6 +7,7 @@ import ssl
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
+from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
@@ -116,7 +117,7 @@ class Workers:
         import dask
         from distributed import Client, LocalCluster
 
-        leave_alone_what_is_loaded()
+        _leave_dask_alone()
         dask.config.set(WORKER_CONFIG)  # for good, as connections that are made later read it too
         if self._scheduler is not None:
             try:
@@ -135,6 +136,12 @@ class Workers:
                 with suppress(OSError, TimeoutError):
                     one.close()
         self._client = self._cluster = None
+
+
+@cache
+def _leave_dask_alone() -> None:
+    # Once in a process: whatever else is frozen, such as what a connection that failed has left, is never collected.
+    leave_alone_what_is_loaded()
 
 
 async def _census(client: Client) -> Census:

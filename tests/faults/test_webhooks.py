@@ -246,6 +246,18 @@ def test_a_server_killed_between_event_and_delivery_tells_it_after_its_restart(s
     assert len({headers["webhook-id"] for headers, _ in receiver.received}) == 3
 
 
+def test_what_happened_to_a_job_is_told_though_it_was_deleted_before_the_events_were_read(service: Service) -> None:
+    webhook = service.subscribe("https://example.org/hook", "SUCCEEDED", "DELETING")
+    job = service.run_job()
+    service.repository.apply(job, Trigger.DELETE)
+    service.repository.forget(job, 0, 0, "abc")
+    assert service.deliveries.collect(service.now_s) == 0
+    assert [(delivery.payload["data"]["job"], delivery.payload["data"]["state"]) for delivery in service.log(webhook)] == [
+        (job, "SUCCEEDED"),
+        (job, "DELETING"),
+    ]
+
+
 def test_restarts_at_random_moments_lose_nothing_and_repeat_only_under_the_same_id(service: Service) -> None:
     jobs = []
     with receiving() as receiver:

@@ -90,6 +90,13 @@ def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, 
     assert [line["status"] for line in of_request if line["message"] == "Request answered."] == [500]
 
 
+def test_a_method_that_nobody_knows_is_not_repeated(tmp_path: Path, lines: Any) -> None:
+    with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
+        assert client.request("X" * 1000, "/v1/jobs").status_code == 405
+    (answered,) = (line for line in lines() if line["message"] == "Request answered.")
+    assert (answered["method"], answered["status"]) == ("other", 405)
+
+
 def test_what_is_logged_inside_a_block_carries_its_values(lines: Any) -> None:
     with log_context(job="j1", request_id=None):
         try:

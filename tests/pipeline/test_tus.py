@@ -272,6 +272,20 @@ def test_a_full_disk_is_a_507_and_keeps_what_was_acknowledged(client: httpx.Clie
     assert is_known(client, upload)
 
 
+def test_a_disk_without_room_for_one_more_file_is_a_507_and_hangs_nobody(client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[str] = []
+
+    def truncate(_descriptor: int, _size: int) -> None:
+        threads.append(threading.current_thread().name)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "ftruncate", truncate)
+        assert code_of(patch(client, upload, 0, CONTENT)) == (507, "disk-full")
+    assert [name.startswith("asyncio_") for name in threads] == [True], "the loop waited for the disk"
+    assert patch(client, upload, 0, CONTENT).status_code == 204
+
+
 def test_disk_promised_to_open_captures_is_not_promised_twice(client: httpx.Client, world: World) -> None:
     world.free_bytes = 2 * (2 + len(CONTENT)) + 9
     announce(client, CONTENTS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from distributed import LocalCluster
 from services.api.app import create_app
 from services.api.client import Client
 from services.api.events import EventAddress
+from services.api.workers import Workers
 from services.core.errors import SchedulerLostError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -59,6 +61,17 @@ def test_workers_tell_what_they_do(tmp_path: Path, cluster: LocalCluster) -> Non
         with pytest.raises(SchedulerLostError, match="does not answer"):
             client.workers()
         assert http.get("/v1/workers").status_code == 503
+
+
+def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.workers.CONNECT_S", 0.1)
+    workers, frozen = Workers("tcp://127.0.0.1:1"), []
+    for _ in range(3):
+        with pytest.raises(SchedulerLostError):
+            workers.connect(0)
+        frozen.append(gc.get_freeze_count())
+    assert frozen[0] > 0
+    assert frozen == sorted(frozen, reverse=True)
 
 
 def test_workers_that_were_not_started_are_not_told_of(tmp_path: Path) -> None:

@@ -24,11 +24,20 @@ NOON_S = 1_800_000_000.0
 
 
 class Clock:
+    """Unix time, and ticks that go on with it unless it steps."""
+
     def __init__(self) -> None:
-        self.now_s = NOON_S
+        self.now_s, self.stepped_s = NOON_S, 0.0
 
     def __call__(self) -> float:
         return self.now_s
+
+    def ticks(self) -> float:
+        return self.now_s - NOON_S - self.stepped_s
+
+    def step(self, seconds: float) -> None:
+        self.now_s += seconds
+        self.stepped_s += seconds
 
 
 @pytest.fixture
@@ -46,7 +55,7 @@ def engine(tmp_path: Path) -> Iterator[sql.Engine]:
 
 @pytest.fixture
 def table(engine: sql.Engine, clock: Clock) -> Tokens:
-    return Tokens(engine, clock)
+    return Tokens(engine, clock, clock.ticks)
 
 
 def issue(table: Tokens, name: str = "rig-1", scopes: tuple[Scope, ...] = (Scope.READ,), days: float | None = None) -> str:
@@ -154,6 +163,23 @@ def test_trust_ends_with_the_token(table: Tokens, clock: Clock) -> None:
     token = issue(table, "rig-2")
     found = table.authenticate(token)
     table.revoke(found.id, make_deed())
+    assert table.trusted(presented=token) is None
+
+
+def test_trust_ends_in_time_though_the_clock_steps_back(table: Tokens, clock: Clock) -> None:
+    token = issue(table)
+    table.authenticate(token)
+    clock.step(-3600)
+    assert table.trusted(presented=token) is not None
+    clock.now_s += tokens.TRUSTED_S
+    assert table.trusted(presented=token) is None
+
+
+def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(table: Tokens, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The look-up has read its row and waits until the one who writes is done: he revokes.
+    token = issue(table)
+    monkeypatch.setattr(table, "_note_use", lambda _: table.revoke("rig-1", make_deed()))
+    table.authenticate(token)
     assert table.trusted(presented=token) is None
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from services.api.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
+from services.api.job_size import size_of
 from services.core.errors import DentineError, DiskFullError, JobTooLargeError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 
@@ -46,6 +49,28 @@ def test_a_folder_that_is_no_capture_is_not_walked_through(spec: JobSpec, tmp_pa
     assert predict(spec).disk_bytes == LEAST_DISK_BYTES
 
 
+def test_a_mount_that_went_away_keeps_no_queue_from_moving(spec: JobSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = list(spec.capture.rglob("*")) if spec.capture else []
+
+    def go_away(*_: object) -> Iterator[Path]:
+        yield from whole
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    needed = predict(spec)
+    monkeypatch.setattr(Path, "rglob", go_away)
+    assert predict(spec) == needed
+    assert not World().admission.holds("a", spec)
+
+
+def test_what_cannot_even_be_looked_at_has_no_size(spec: JobSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    monkeypatch.setattr(Path, "stat", fail)
+    assert size_of(spec) is None
+    assert predict(spec).disk_bytes == LEAST_DISK_BYTES
+
+
 def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> None:
     world, enough = World(), predict(spec).disk_bytes + KEPT_FREE_BYTES
     world.free(enough - 1)
@@ -68,6 +93,16 @@ def test_what_was_paused_is_tried_again_after_a_while(spec: JobSpec, problem: De
     assert not world.admission.holds("b", spec)
     world.now_s = RETRY_S
     assert not world.admission.holds("a", spec)
+
+
+def test_nothing_is_remembered_of_jobs_that_wait_no_more(spec: JobSpec) -> None:
+    world = World()
+    world.free(0)
+    assert world.admission.holds("a", spec)
+    assert world.admission.holds("b", spec)
+    world.admission.remember_only(["b"])
+    assert world.admission.reason("a") is None
+    assert world.admission.reason("b")
 
 
 def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from services.api import jobs
+from services.api import erasure, jobs
 from services.api.erasure import Erased, erase, forget_listing
 from services.api.jobs import Jobs
-from services.api.lifecycle import Trigger
+from services.api.lifecycle import JobState, Trigger
+from services.api.repository import job_table
 from services.core.errors import StoreError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -56,6 +57,51 @@ def test_a_removal_that_was_cut_short_counts_from_its_beginning(tmp_path: Path, 
 
 def test_an_absent_folder_is_empty(tmp_path: Path) -> None:
     assert erase(tmp_path / "none").files == 0
+
+
+def test_a_job_that_never_ran_is_deleted_before_there_is_any_folder_of_jobs(tmp_path: Path) -> None:
+    service = Jobs(ServerSettings(data=tmp_path / "data"), lambda *_: None)
+    job = service.repository.create(JobSpec(capture=tmp_path), key=None).job.id
+    service.repository.apply(job, Trigger.CANCEL)
+    assert service.delete(job).files == 0
+    assert list((tmp_path / "data" / "jobs").iterdir()) == []
+    service.repository.close()
+
+
+def test_a_file_that_cannot_be_read_or_noted_is_told_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_job(folder := tmp_path / "job")
+
+    def refuse(*_: object) -> None:
+        raise OSError(5, "Input/output error", str(folder / "fit" / "shard"))
+
+    for broken in ("file_digest", "write_atomic"):
+        with monkeypatch.context() as patched:
+            patched.setattr(hashlib if broken == "file_digest" else erasure, broken, refuse)
+            with pytest.raises(StoreError, match=r"shard could not be removed \(Input/output error\)"):
+                erase(folder)
+    assert erase(folder).files == 2
+
+
+def test_a_round_goes_on_after_a_job_that_cannot_be_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    service = Jobs(ServerSettings(data=tmp_path / "data", keep_days=1), lambda *_: None)
+    broken, refused, sound = (service.repository.create(JobSpec(capture=tmp_path), key=None).job.id for _ in range(3))
+    for job in (broken, refused, sound):
+        service.repository.apply(job, Trigger.CANCEL)
+    with service.repository.engine.begin() as connection:
+        connection.execute(job_table.update().values(changed_s=0.0))
+    problems = {broken: OSError(5, "Input/output error"), refused: StoreError("No.")}
+
+    def erase_or_break(folder: Path) -> Erased:
+        if folder.name in problems:
+            raise problems[folder.name]
+        return erase(folder)
+
+    monkeypatch.setattr(jobs, "erase", erase_or_break)
+    service._tidy()
+    assert service.repository.deletion(sound).files == 0
+    assert [service.repository.get(job).state for job in (broken, refused)] == [JobState.DELETING] * 2
+    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == jobs.__name__] == [f"job {broken}", f"job {refused}"]
+    service.repository.close()
 
 
 def test_a_round_that_meets_a_deletion_lets_it_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+import sqlalchemy as sql
 
 from services.api import feed
 from services.api.database import sqlite_url
-from services.api.feed import EventFeed
+from services.api.feed import EventFeed, Turn
 from services.api.lifecycle import Trigger
 from services.api.repository import Lease, Repository
 from services.core.records import JobSpec
@@ -112,3 +115,73 @@ def test_a_silent_stream_says_that_it_lives(repository: Repository, monkeypatch:
             return await anext(events) + await anext(events)
 
     assert asyncio.run(watch()) == b": ping\n\n: ping\n\n"
+
+
+def test_a_stream_of_a_job_that_is_deleted_ends(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "PING_S", 0.01)
+    leases = start(repository), start(repository, seed=2)
+
+    async def watch() -> list[str]:
+        one, after = EventFeed(repository), repository.newest_event()
+        streams = [one.follow(lease.job.id, after) for lease in leases]
+        assert [await anext(stream) for stream in streams] == [b": ping\n\n"] * 2
+        for lease in leases:
+            repository.settle(lease, Trigger.SUCCEED)
+            repository.apply(lease.job.id, Trigger.DELETE)
+        repository.forget(leases[1].job.id, 0, 0, "")
+        async with asyncio.timeout(10):
+            return [await listen(stream, 0.0) for stream in streams]
+
+    deleting, forgotten = asyncio.run(watch())
+    assert deleting.endswith('event: end\ndata: "DELETING"\n\n')
+    assert forgotten == ""
+
+
+def test_a_stalled_stream_keeps_little_and_is_told_everything_later(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "PERIOD_S", 0.0)
+    monkeypatch.setattr(feed, "MOST_TURNS", 4)
+    lease = start(repository)
+    log = repository.events_of(lease.job.id)
+
+    def count_turns() -> int:
+        gc.collect()
+        return sum(isinstance(thing, Turn) for thing in gc.get_objects())
+
+    before = count_turns()
+
+    async def stall() -> str:
+        async with running(repository) as one:
+            stalled = one.follow(lease.job.id, 0)
+            told = await anext(stalled)
+            for step in range(20):
+                log.append(1, StageEvent(stage="fit", kind="step", message=f"Step {step}."))
+                while one._newest < repository.newest_event():
+                    await asyncio.sleep(0.001)
+            assert count_turns() - before <= 4 + 1
+            repository.settle(lease, Trigger.SUCCEED)
+            return told.decode() + await listen(stalled, 0.0)
+
+    assert ids_of(asyncio.run(stall())) == [event.id for event in log.read()]
+
+
+def test_a_stream_outlasts_a_database_that_is_away_for_a_while(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "PING_S", 0.01)
+    lease, read, answers = start(repository), feed._read, iter([True, False, False])
+
+    def read_or_fail(*arguments: Any) -> feed.Chapter:
+        if not next(answers, True):
+            raise sql.exc.OperationalError("SELECT", None, OSError("away"))
+        return read(*arguments)
+
+    monkeypatch.setattr(feed, "_read", read_or_fail)
+
+    async def watch() -> str:
+        async with running(repository) as one, asyncio.timeout(10):
+            stream = one.follow(lease.job.id, 0)
+            told = await anext(stream)
+            repository.settle(lease, Trigger.SUCCEED)
+            return told.decode() + await listen(stream, 0.0)
+
+    text = asyncio.run(watch())
+    assert ids_of(text) == [event.id for event in repository.events_of(lease.job.id).read()]
+    assert text.endswith('event: end\ndata: "SUCCEEDED"\n\n')

@@ -62,6 +62,14 @@ def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatc
     assert len(reads) == 3 + 27 + 1  # the others have pushed it out
 
 
+def test_names_of_channels_that_nothing_is_known_of_count_as_what_they_take(log: EventLog) -> None:
+    histories = Histories(most_bytes=100_000)
+    for number in range(1000):
+        histories.read(log, 500, f"{number:0100}")
+    assert len(histories._kept) < 120
+    assert histories._bytes <= 100_000
+
+
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(first=st.integers(0, 5), count=st.integers(1, 400), points=st.integers(3, 60))
 def test_thinned_columns_are_even_and_keep_both_ends(log: EventLog, first: int, count: int, points: int) -> None:

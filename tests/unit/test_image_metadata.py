@@ -53,6 +53,24 @@ def test_metadata_of_a_second_image_in_a_tiff_is_named(tmp_path: Path) -> None:
     assert "(Artist)" in (fault(tmp_path, ".tif", stream.getvalue()) or "")
 
 
+def test_a_small_tiff_of_many_long_directories_is_refused_before_all_are_read(tmp_path: Path) -> None:
+    # 300 directories of 65,535 entries each, one two bytes after the other: twenty million entries in 0.8 MB.
+    many, most = 300, 2**16 - 1
+    list_at = 8 + 2 + 12 + 4
+    first = list_at + 4 * many
+    head = b"II" + struct.pack("<HI", 42, 8) + struct.pack("<HHHIII", 1, 330, 4, many, list_at, 0)
+    starts = struct.pack(f"<{many}I", *range(first, first + 2 * many, 2))
+    with pytest.raises(ValueError, match="more than 250000 directories and entries"):
+        fault(tmp_path, ".tif", head + starts + b"\xff\xff" * many + bytes(12 * most + 4))
+
+
+def test_a_small_tiff_that_names_one_long_list_of_directories_again_and_again_is_refused(tmp_path: Path) -> None:
+    entries, list_at = 1000, 8 + 2 + 12 * 1000 + 4
+    head = b"II" + struct.pack("<HI", 42, 8) + struct.pack("<H", entries) + struct.pack("<HHII", 330, 4, 200_000, list_at) * entries
+    with pytest.raises(ValueError, match="more than 250000 directories and entries"):
+        fault(tmp_path, ".tif", head + bytes(4) + bytes(4 * 200_000))
+
+
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "I;16", "P"])
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_plain_images_pass(tmp_path: Path, suffix: str, mode: str) -> None:

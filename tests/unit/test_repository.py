@@ -12,7 +12,7 @@ import sqlalchemy as sql
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from services.api import audit, capture_table, tokens, webhook_tables
+from services.api import audit, capture_table, data_folder, tokens, webhook_tables
 from services.api.database import Query, metadata, open_database, patiently, sqlite_url, writing
 from services.api.events import event_table
 from services.api.lifecycle import JobState, Trigger
@@ -182,6 +182,14 @@ def test_a_deleted_job_leaves_its_receipt_alone(repository: Repository, clock: C
         assert connection.scalar(sql.select(sql.func.count()).select_from(event_table)) == 0
 
 
+def test_a_filter_may_name_its_states_any_number_of_times(repository: Repository) -> None:
+    queued, cancelled, _ = (repository.create(SPEC, None).job.id for _ in range(3))
+    repository.apply(cancelled, Trigger.CANCEL)
+    repository.lease(queued, "a", 60)
+    only = JobFilter(states=(JobState.CANCELLED, JobState.RUNNING) * 2000)
+    assert [job.id for job in repository.page(9, only=only)] == [cancelled, queued]
+
+
 def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Repository]) -> None:
     # A reader that asks for what is newer than the last id it saw must miss none, however many write.
     repositories = [opened() for _ in range(4)]
@@ -217,7 +225,7 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
-    for table in (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table):
+    for table in (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table, data_folder.data_folder_table):
         assert table.metadata is metadata
     with repository.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []

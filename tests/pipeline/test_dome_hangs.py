@@ -1,0 +1,80 @@
+"""A dome's process that no longer reads what it is told: it keeps nobody from darkness, nor the server from its end."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from services.api.dome import Dome, LightRequest
+from services.api.jobs import Jobs
+from services.capture.dome_modbus import DomeObserver
+from services.capture.simulator import simulated_dome
+from services.core.errors import RigUnreachableError
+from services.core.settings import DomeSettings, ServerSettings
+
+WATCHDOG_S = 10.0
+COMMANDS = 2000
+"""More than a pipe of 64 KiB holds."""
+LONGEST_S = 20.0
+
+
+@dataclass(frozen=True)
+class Hanging:
+    """A dome with a light on, eyes on it, and its process, which is suspended with a full pipe."""
+
+    dome: Dome
+    observer: DomeObserver
+    process: psutil.Process
+
+
+@pytest.fixture
+def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging]:
+    with simulated_dome(6, WATCHDOG_S) as (host, port), closing(DomeObserver(host, port)) as observer:
+        settings = ServerSettings(data=tmp_path, dome=DomeSettings(address=f"{host}:{port}", watchdog_s=WATCHDOG_S))
+        dome = Dome(settings.dome, Jobs(settings, lambda *_: None))
+        dome.light(LightRequest(light=3, on_s=30.0))
+        process = next(child for child in psutil.Process().children() if "services.capture.console" in child.cmdline())
+        process.suspend()
+        try:
+            with monkeypatch.context() as hurried:
+                hurried.setattr("services.api.dome.ANSWER_S", 0.0)
+                require_end(lambda: [ask(dome) for _ in range(COMMANDS)])
+            assert observer.status().lit == (3,)
+            yield Hanging(dome, observer, process)
+        finally:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+            dome.close()
+
+
+def ask(dome: Dome) -> None:
+    with suppress(RigUnreachableError):
+        dome.state()
+
+
+def require_end(work: Callable[[], object]) -> None:
+    """Do it in a thread, so that a test fails where the work would wait for ever."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(LONGEST_S)
+    assert not thread.is_alive(), f"it was not done within {LONGEST_S:g} s"
+
+
+def test_all_off_gets_past_a_process_that_no_longer_reads(hanging: Hanging, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.dome.OFF_S", 0.2)
+    require_end(hanging.dome.all_off)
+    assert hanging.observer.status().lit == ()
+    assert hanging.observer.status().stopped
+    assert not hanging.process.is_running()
+
+
+def test_the_server_ends_with_a_process_that_no_longer_reads(hanging: Hanging, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.dome_process.END_S", 0.2)
+    require_end(hanging.dome.close)
+    assert not hanging.process.is_running()

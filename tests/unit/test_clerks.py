@@ -1,0 +1,38 @@
+"""Threads that do short work in order."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+
+import pytest
+
+from services.api.clerks import Clerks
+
+
+def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.clerks.CLOSE_S", 0.01)
+    clerks, goes_on = Clerks(1), threading.Event()
+
+    async def close_while_it_works() -> bool:
+        work = asyncio.create_task(clerks.ask(goes_on.wait, 30))
+        await asyncio.sleep(0)
+        clerks.close()
+        assert not work.done()
+        goes_on.set()
+        return await work
+
+    assert asyncio.run(close_while_it_works())
+
+
+def test_what_is_under_way_is_awaited() -> None:
+    clerks, is_done = Clerks(1), threading.Event()
+
+    async def close_after_asking() -> None:
+        asked = asyncio.create_task(clerks.ask(is_done.set))
+        await asyncio.sleep(0)
+        clerks.close()
+        assert is_done.is_set()
+        await asked
+
+    asyncio.run(close_after_asking())

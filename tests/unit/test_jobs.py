@@ -1,0 +1,54 @@
+"""What a server does with jobs that do not run."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from services.api import admission
+from services.api.admission import Needs
+from services.api.jobs import Jobs
+from services.core.errors import DiskFullError
+from services.core.records import JobSpec
+from services.core.settings import ServerSettings
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Jobs]:
+    service = Jobs(ServerSettings(data=tmp_path / "data"), lambda *_: None)
+    yield service
+    service.repository.close()
+
+
+def test_only_a_queued_job_waits_for_something(service: Jobs, tmp_path: Path) -> None:
+    job = service.submit(JobSpec(capture=tmp_path)).job
+    service._admission.pause(job.id, DiskFullError("It was full."))
+    assert service._admission.holds(job.id, job.spec)
+    assert service.waits_for(job) == "Waits for disk: It was full."
+    assert service.waits_for(service.cancel(job.id)) is None
+
+
+def test_a_capture_that_takes_long_to_measure_holds_up_no_other_submission(service: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (slow := tmp_path / "slow").mkdir()
+    measuring, go_on = threading.Event(), threading.Event()
+
+    def measure(spec: JobSpec) -> Needs:
+        if spec.capture == slow:
+            measuring.set()
+            assert go_on.wait(30)
+        return Needs(0, 0)
+
+    monkeypatch.setattr(admission, "predict", measure)
+    first = threading.Thread(target=service.submit, args=(JobSpec(capture=slow),))
+    second = threading.Thread(target=service.submit, args=(JobSpec(capture=tmp_path),))
+    first.start()
+    assert measuring.wait(30)
+    second.start()
+    second.join(10)
+    assert [job.spec.capture for job in service.repository.queued()] == [tmp_path]
+    go_on.set()
+    first.join()
+    assert len(service.repository.queued()) == 2

@@ -1,0 +1,56 @@
+"""Masks as PNG: every byte is counted however it is packed, and little of it is in memory at once."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from services.api.image_headers import PNG_SIGNATURE
+from services.api.mask_images import require_mask
+from services.core.errors import MaskError
+from services.core.geometry import Camera
+
+AHEAD = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def camera(side: int) -> Camera:
+    return Camera(name="c0", size=(side, side), K=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), camera_from_world=AHEAD)
+
+
+def png(side: int, *packed: bytes) -> bytes:
+    """A grey PNG whose pixels are packed in these parts."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)), *((b"IDAT", part) for part in packed), (b"IEND", b"")]
+    return PNG_SIGNATURE + b"".join(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)
+
+
+def test_a_mask_that_inflates_a_thousandfold_is_checked_in_little_memory() -> None:
+    side = 6000
+    content = png(side, zlib.compress(bytes(side * (1 + side)), 9))
+    tracemalloc.start()
+    try:
+        require_mask(content, camera(side))
+        _, most_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(content) < side * side / 900
+    assert most_bytes < 2 * 2**20
+
+
+@pytest.mark.parametrize("step", [1, 7, 1000, 10**7])
+@pytest.mark.parametrize("side", [511, 512, 700])
+@pytest.mark.parametrize("is_noisy", [True, False])
+def test_every_byte_is_counted_however_a_mask_is_cut_into_parts(side: int, step: int, is_noisy: bool) -> None:
+    size = side * (1 + side)
+    rows = np.random.default_rng(1).bytes(size) if is_noisy and step > 7 else bytes(size)
+    for missing, told in ((0, None), (1, "less than its header declares"), (-1, "more than its header declares")):
+        packed = zlib.compress(rows[: size - missing] if missing >= 0 else rows + b"\0")
+        content = png(side, *(packed[at : at + step] for at in range(0, len(packed), step)))
+        if told is None:
+            require_mask(content, camera(side))
+        else:
+            with pytest.raises(MaskError, match=told):
+                require_mask(content, camera(side))
