@@ -5,90 +5,28 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
 from services.api.database import sqlite_url
-from services.api.events import EventAddress, EventLog
+from services.api.events import EventLog
 from services.api.repository import Repository
-from services.core.errors import CaptureInputError
-from services.core.records import Estimate, JobSpec
+from services.core.errors import CaptureInputError, DiskFullError
+from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from tests.browser.contrast import contrast_failures
+from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving
 from tests.support.past_runs import remember_runs
 from tests.support.uploading import write_capture
 
 pytestmark = pytest.mark.browser
-
-STEPS = 6
-
-
-class ScriptedJob:
-    """Reports what a fit reports, one step whenever the test lets it; the page cannot tell it from a fit."""
-
-    def __init__(self) -> None:
-        self.steps = threading.Semaphore(0)
-        self.fails = False
-
-    def __call__(self, _spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        with events.open() as log:
-            prepare = log.begin_stage("prepare")
-            log.append(prepare, StageEvent(stage="prepare", kind="finished", done=1.0, message="24 images prepared."))
-            fit = log.begin_stage("fit")
-            for step in range(STEPS):
-                self.steps.acquire()
-                if self.fails:
-                    raise CaptureInputError("Frame c0_l3.npy is missing; copy it there.")
-                self._report(log, fit, step, folder)
-            log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged after 6 steps."))
-            export = log.begin_stage("export")
-            table = {
-                "enamel.sigma": Estimate(value=4.0321, se=0.0512, unit="1/mm", determined=True),
-                "dentin.g1": Estimate(value=0.41, se=0.9, unit="1", determined=False),
-            }
-            (folder / "parameters.json").write_text("{" + ",".join(f'"{c}": {{{_json(table)}}}' for c in ("green", "red")) + "}")
-            (folder / "report.html").write_text("<!doctype html><title>report</title>")
-            log.append(export, StageEvent(stage="export", kind="finished", done=1.0))
-
-    def _report(self, log: Any, attempt: int, step: int, folder: Path) -> None:
-        for channel, factor in (("green", 1.0), ("red", 2.0)):
-            data = {
-                "channel": channel,
-                "step": step,
-                "loss": factor * 0.3**step,
-                "held_out_error": factor * 0.4 * 0.5**step if step % 2 else None,
-                "parameters": {"enamel.sigma": 4.0 + 0.01 * step},
-            }
-            log.append(attempt, StageEvent(stage="fit", kind="step", message=f"{channel} step {step}.", done=(step + 1) / STEPS, data=data))
-        paths = {kind: f"previews/{step}-{kind}.png" for kind in ("render", "photo", "residual")}
-        (folder / "previews").mkdir(exist_ok=True)
-        for kind, path in paths.items():
-            _write_picture(folder / path, kind, step)
-        log.append(attempt, StageEvent(stage="fit", kind="preview", data={"camera": "c0", "light": "l3", "channel": "green", "step": step, **paths}))
-
-
-def _json(table: dict[str, Estimate]) -> str:
-    return ",".join(f'"{name}": {estimate.model_dump_json()}' for name, estimate in table.items())
-
-
-def _write_picture(path: Path, kind: str, step: int) -> None:
-    from PIL import Image
-
-    y, x = np.mgrid[-1:1:60j, -1:1:48j]
-    ball = np.sqrt(np.clip(1 - x**2 - y**2, 0, 1))
-    grey = {"photo": ball, "render": ball ** (1 + 1 / (1 + step)), "residual": 0.5 + 0.1 * ball / (1 + step)}[kind]
-    Image.fromarray((255 * grey).astype(np.uint8)).save(path)
 
 
 @pytest.fixture
@@ -114,12 +52,6 @@ def page(chromium: Browser, tmp_path: Path, job: ScriptedJob, request: pytest.Fi
         job.steps.release(STEPS)
     assert not said
     assert all(url.startswith(str(client.base_url)) for url in asked)
-
-
-def submit(page: Page) -> str:
-    answer = page.request.post("/v1/jobs", data={"capture": "/"})
-    assert answer.status == 201
-    return str(answer.json()["id"])
 
 
 def test_an_address_that_names_nothing_says_so_until_a_job_is_chosen(page: Page) -> None:
@@ -166,10 +98,10 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
 def test_a_failure_says_what_to_do_and_can_be_retried_by_keyboard(page: Page, job: ScriptedJob) -> None:
     submit(page)
     page.goto("/")
-    job.fails = True
+    job.problem = CaptureInputError("Frame c0_l3.npy is missing; copy it there.")
     job.steps.release()
     expect(page.get_by_role("alert")).to_have_text("fit: Frame c0_l3.npy is missing; copy it there.")
-    job.fails = False
+    job.problem = None
     page.get_by_role("button", name="Retry").focus()
     page.keyboard.press("Enter")
     expect(page.locator(".job .badge")).to_have_text("running")
@@ -195,6 +127,96 @@ def test_jobs_are_reached_by_keyboard_alone(page: Page, job: ScriptedJob) -> Non
     expect(page.locator("#jobs a[aria-current]")).to_have_attribute("href", f"#/{first}")
 
 
+def test_the_skip_link_leads_to_the_content_and_leaves_the_view(page: Page) -> None:
+    job_id = submit(page)
+    page.goto(f"/#/{job_id}")
+    expect(page.locator(".job .badge")).to_have_text("running")
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator("#main")).to_be_focused()
+    page.evaluate("location.hash = '#main'")
+    expect(page).to_have_url(re.compile("#main$"))
+    expect(page.locator(".job .badge")).to_have_text("running")
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_stage_that_was_begun_is_stopped_while_its_job_waits(page: Page, job: ScriptedJob) -> None:
+    job_id = submit(page)
+    page.goto(f"/#/{job_id}")
+    fit = page.locator(".stages li", has_text="fit").locator(".state")
+    expect(fit).to_have_text("running")
+    job.problem = DiskFullError("The disk was full; free some space.")
+    job.steps.release()
+    expect(page.locator(".job .badge")).to_have_text("queued")
+    expect(fit).to_have_text("stopped")
+    page.reload()
+    expect(fit).to_have_text("stopped")
+    stages = page.request.get(f"/v1/jobs/{job_id}").json()["stages"]
+    assert [(stage["stage"], stage["state"]) for stage in stages] == [("prepare", "finished"), ("fit", "stopped"), ("export", "waiting")]
+    job.problem = None
+
+
+def test_single_teeth_of_a_jaw_are_named_and_give_way_to_the_whole_jaw(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
+    job_id = submit(page)
+    page.goto(f"/#/{job_id}")
+    expect(page.locator(".stages li", has_text="fit").locator(".state")).to_have_text("running")
+    repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
+    log = EventLog(repository.engine, job_id)
+
+    def tell(step: int, channel: str, tooth: int | None, **parameters: float) -> None:
+        data = {"channel": channel, "step": step, "loss": 0.5**step, "tooth": tooth, "parameters": parameters}
+        log.append(1, StageEvent(stage="fit", kind="step", data=data))
+
+    caption, head = page.locator(".chart figcaption"), page.locator(".scroll thead th")
+    tell(1, "green", 11, **{"enamel.sigma": 4.0})
+    expect(caption).to_contain_text("1 steps. green, tooth 11: loss 0.5.")
+    tell(2, "green", 12, **{"enamel.sigma": 5.0, "enamel.alpha": 0.9})
+    expect(caption).to_contain_text("1 steps. green, tooth 12: loss 0.25.")
+    expect(head).to_have_text(["parameter", "unit", "green, tooth 12"])
+    tell(3, "green", None, **{"0.enamel.sigma": 6.0, "cavity.reflectance": 0.3})
+    tell(3, "red", 11, **{"enamel.sigma": 7.0})
+    tell(4, "red", None, **{"0.enamel.sigma": 8.0})
+    expect(caption).to_contain_text("2 steps. green: loss 0.125; red: loss 0.0625.")
+    expect(head).to_have_text(["parameter", "unit", "green", "red"])
+    expect(page.locator(".scroll tr", has_text="0.enamel.sigma").locator("td")).to_have_text(["mm⁻¹", "6", "8"])
+    expect(page.locator(".scroll tr", has_text="cavity.reflectance").locator("td")).to_have_text(["", "0.3", "–"])
+    expect(page.locator(".scroll tbody tr")).to_have_count(2)
+    repository.close()
+
+
+@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
+def test_a_job_fits_a_phone_however_long_its_names_are(page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    page.set_viewport_size({"width": 375, "height": 800})
+    name = "-".join(["incisor"] * 12)
+    (tmp_path / name).mkdir()
+    job_id = submit(page, str(tmp_path / name))
+    page.goto(f"/#/{job_id}")
+    expect(page.locator(".stages li", has_text="fit").locator(".state")).to_have_text("running")
+    (tmp_path / "data" / "jobs" / job_id / f"{name}.json").touch()
+    job.steps.release(STEPS - 1)
+    expect(page.locator(".chart figcaption")).to_contain_text("5 steps.")
+    repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
+    pictures = dict.fromkeys(("render", "photo", "residual"), "previews/0-photo.png")
+    data = {"camera": name, "light": name, "channel": "green", "step": 0, "held_out": True} | pictures
+    EventLog(repository.engine, job_id).append(1, StageEvent(stage="fit", kind="preview", message=f"{name}.", data=data))
+    repository.close()
+    page.get_by_label("Picture").select_option(f"green · {name} · {name} (held out)")
+    expect(page.locator(".stack .over")).to_have_attribute("alt", f"Render: camera {name}, light {name}, step 0")
+    job.problem = CaptureInputError(f"Frame {tmp_path / name} is missing; copy it there.")
+    job.steps.release()
+    expect(page.get_by_role("alert")).to_be_visible()
+    expect(page.locator(".files a", has_text=name)).to_be_visible()
+    expect(page.locator(".chart canvas")).to_be_visible()
+    keep_picture(page, f"phone-{request.node.callspec.params['page']}")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 375
+
+
+def keep_picture(page: Page, name: str) -> None:
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/dashboard-{name}.png", full_page=True)
+
+
 def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
     repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
     job.steps.release(STEPS)
@@ -214,11 +236,6 @@ def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: Scrip
     expect(page.locator("#jobs a")).to_have_count(50)
     page.get_by_role("button", name="Older jobs").click()
     expect(page.locator("#jobs a")).to_have_count(100)
-
-
-def expect_state(page: Page, job_id: str, state: str) -> None:
-    while page.request.get(f"/v1/jobs/{job_id}").json()["state"] != state:
-        time.sleep(0.05)
 
 
 def test_a_queued_job_says_what_it_waits_for(page: Page, job: ScriptedJob, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from services.api.app import STATIC, create_app
 from services.capture.simulator import simulated_dome
@@ -58,7 +58,7 @@ def test_a_light_and_all_off_by_keyboard(page: Page, request: pytest.FixtureRequ
     state, lights = page.locator(".dome .badge"), page.locator(".lights button")
     expect(state).to_contain_text("dark")
     expect(lights).to_have_count(LIGHTS)
-    expect(page.locator(".dome .failure")).to_be_hidden()
+    expect(page.get_by_role("alert")).to_have_count(0)
     assert contrast_failures(page) == []
 
     page.locator(".all-off").focus()
@@ -109,6 +109,85 @@ def test_a_preflight_tells_what_it_found_or_why_it_cannot(page: Page, tmp_path: 
     page.get_by_role("button", name="Run the preflight").click()
     expect(page.locator(".findings li")).to_have_text(["All is well."])
     expect(page.get_by_role("alert")).to_be_hidden()
+
+
+def test_nothing_is_shown_as_known_while_the_dome_does_not_answer(page: Page) -> None:
+    state, third = page.locator(".dome .badge"), page.get_by_role("button", name="Light 3", exact=True)
+    page.get_by_label("Seconds").fill("30")
+    third.click()
+    expect(state).to_have_text("light 3 is on")
+    page.route("**/v1/dome", lambda route: route.fulfill(status=502, json={"detail": "The dome does not answer; check its cable."}))
+    expect(page.get_by_role("alert")).to_have_text("The dome does not answer; check its cable.")
+    expect(state).to_have_text("unknown")
+    expect(page.locator(".lights [aria-pressed]")).to_have_count(0)
+    expect(page.locator(".facts dt")).to_have_count(0)
+    expect(third).to_be_focused()
+    assert contrast_failures(page) == []
+    keep_picture(page, "dome-unknown")
+    page.unroute("**/v1/dome")
+    expect(state).to_have_text("light 3 is on")
+    expect(third).to_have_attribute("aria-pressed", "true")
+    expect(page.locator(".facts dt")).not_to_have_count(0)
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
+def test_all_is_dark_is_told_no_longer_than_it_is_true(page: Page) -> None:
+    page.locator(".all-off").click()
+    expect(page.locator(".done")).to_have_text("All is dark. No job was capturing.")
+    answer = page.request.put("/v1/dome/light", data={"light": 3, "level": 0.05, "on_s": 30})
+    assert answer.ok, answer.text()
+    expect(page.locator(".dome .badge")).to_have_text("light 3 is on")
+    expect(page.locator(".done")).to_be_hidden()
+
+
+def test_a_state_that_was_asked_for_before_all_off_is_not_shown_after_it(page: Page) -> None:
+    page.get_by_role("button", name="Light 3", exact=True).click()
+    expect(page.locator(".dome .badge")).to_have_text("light 3 is on")
+    before = page.request.get("/v1/dome").json()
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route("**/v1/dome", hold, times=1)
+    while not held:
+        page.wait_for_timeout(50)
+    page.locator(".all-off").click()
+    expect(page.locator(".done")).to_be_visible()
+    with page.expect_response("**/v1/dome"):
+        held[0].fulfill(json=before)
+    page.evaluate("new Promise(requestAnimationFrame)")
+    assert page.locator(".dome .badge").text_content() == "dark, ALL OFF"
+    assert page.locator(".done").is_visible()
+
+
+def test_the_link_to_the_capturing_job_keeps_the_focus(page: Page) -> None:
+    def capture(route: Route) -> None:
+        state = route.fetch().json()
+        route.fulfill(json=state | {"capturing": ["0123456789ab"]})
+
+    page.route("**/v1/dome", capture)
+    link = page.get_by_role("link", name="0123456789ab")
+    link.focus()
+    for _ in range(2):
+        with page.expect_response("**/v1/dome"):
+            pass
+    page.evaluate("new Promise(requestAnimationFrame)")
+    expect(link).to_be_focused()
+    page.unroute_all(behavior="ignoreErrors")
+    expect(link).to_have_count(0)
+
+
+@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
+def test_the_dome_fits_a_phone(page: Page, request: pytest.FixtureRequest) -> None:
+    page.set_viewport_size({"width": 375, "height": 800})
+    folder = page.get_by_label("Folder of the rig on the server")
+    folder.fill("/" + "-".join(["absent"] * 12))
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("does not exist on the server; check the path.")
+    expect(page.locator(".lights button")).to_have_count(LIGHTS)
+    keep_picture(page, f"dome-phone-{request.node.callspec.params['page']}")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 375
 
 
 def test_a_server_without_a_dome_says_so(chromium: Browser, tmp_path: Path) -> None:

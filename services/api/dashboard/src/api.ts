@@ -1,5 +1,7 @@
 /** The public REST API, as far as this page uses it. */
 
+const REOPEN_MS = 3000;
+
 export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
 
 export interface Job {
@@ -115,15 +117,35 @@ export interface DomeState {
   capturing: string[];
 }
 
+/** The server answers, but not with what was asked for; the message is its sentence. */
+export class Refusal extends Error {
+  constructor(
+    sentence: string,
+    readonly status: number,
+  ) {
+    super(sentence);
+  }
+}
+
 /** The server does not know who asks; a token is needed. */
-export class Unauthenticated extends Error {}
+export class Unauthenticated extends Refusal {}
+
+/** Whether the same may be answered later: nobody answers, too much was asked, or the server is in trouble. */
+export function mayPass(problem: unknown): boolean {
+  return problem instanceof TypeError || (problem instanceof Refusal && (problem.status === 429 || problem.status >= 500));
+}
+
+export function sentenceOf(problem: unknown): string {
+  if (problem instanceof TypeError) return "The server cannot be reached.";
+  return problem instanceof Error ? problem.message : String(problem);
+}
 
 async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
   const sent = body ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) } : { method, headers };
   const answer = await fetch(`/v1${path}`, sent);
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
-    throw new (answer.status === 401 ? Unauthenticated : Error)(problem?.detail ?? `The server answered ${answer.status}.`);
+    throw new (answer.status === 401 ? Unauthenticated : Refusal)(problem?.detail ?? `The server answered ${answer.status}.`, answer.status);
   }
   return (answer.status === 204 ? undefined : answer.json()) as Promise<T>;
 }
@@ -132,7 +154,7 @@ export const getSession = (): Promise<Session> => ask("/session");
 export const signIn = (token: string): Promise<Session> => ask("/session", "POST", { Authorization: `Bearer ${token}` });
 export const signOut = (): Promise<void> => ask("/session", "DELETE");
 
-export const listJobs = (before: number | null): Promise<JobPage> => ask(`/jobs?limit=50${before === null ? "" : `&before=${before}`}`);
+export const listJobs = (limit: number, before?: number): Promise<JobPage> => ask(`/jobs?limit=${limit}${before === undefined ? "" : `&before=${before}`}`);
 export const listWorkers = (): Promise<Workers> => ask("/workers");
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
@@ -149,15 +171,37 @@ export function artifactUrl(id: string, path: string): string {
   return `/v1/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
 }
 
-/** Follow a job's events from the first one; the browser reconnects by itself and the server replays what was missed. */
+/**
+ * Follow a job's events from the first one. After a broken connection the browser reconnects by itself and the server replays what was missed;
+ * after a refusal the browser gives up, so the stream is opened anew.
+ */
 export function followEvents(id: string, onEvent: (event: JobEvent) => void, onEnd: () => void, onConnection: (open: boolean) => void): () => void {
-  const source = new EventSource(`/v1/jobs/${id}/events`);
-  source.onopen = () => onConnection(true);
-  source.onerror = () => onConnection(false);
-  source.onmessage = (message) => onEvent(JSON.parse(message.data));
-  source.addEventListener("end", () => {
+  let timer = 0;
+  let newest = 0;
+  let source = open();
+
+  function open(): EventSource {
+    const opened = new EventSource(`/v1/jobs/${id}/events`);
+    opened.onopen = () => onConnection(true);
+    opened.onerror = () => {
+      onConnection(false);
+      if (opened.readyState === EventSource.CLOSED) timer = window.setTimeout(() => (source = open()), REOPEN_MS);
+    };
+    opened.onmessage = (message) => {
+      const event = JSON.parse(message.data) as JobEvent;
+      if (event.id <= newest) return; // a stream opened anew begins at the first event
+      newest = event.id;
+      onEvent(event);
+    };
+    opened.addEventListener("end", () => {
+      opened.close();
+      onEnd();
+    });
+    return opened;
+  }
+
+  return () => {
+    window.clearTimeout(timer);
     source.close();
-    onEnd();
-  });
-  return () => source.close();
+  };
 }

@@ -1,6 +1,6 @@
 /** The page: a list of jobs and the job that the address names, or the dome; a form for a token where the server asks for one. */
 
-import { getSession, signOut, Unauthenticated } from "./api";
+import { getSession, mayPass, type Session, sentenceOf, signOut, Unauthenticated } from "./api";
 import { DomeView } from "./domeView";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
@@ -10,6 +10,7 @@ import { WorkerList } from "./workerList";
 
 const REFRESH_MS = 3000;
 const DOME = "#/dome";
+const LOST = "Connection lost; trying again.";
 
 const main = find("main");
 const jobs = find("jobs");
@@ -20,55 +21,84 @@ const list = new JobList(jobs);
 const workers = find("workers");
 const workerList = new WorkerList(workers);
 let view: JobView | DomeView | null = null;
+let listTrouble = "";
+let viewTrouble = "";
 let isSignedOut = false;
+/** Whether the next refresh opens the address: nothing was opened yet, or what was failed in a way that may pass. */
+let isViewDue = true;
+let isAccountDue = true;
 
-function showConnection(open: boolean): void {
-  connection.textContent = open || isSignedOut ? "" : "Connection lost; trying again.";
+function showConnection(): void {
+  connection.textContent = isSignedOut ? "" : listTrouble || viewTrouble;
+}
+
+function showViewConnection(open: boolean): void {
+  viewTrouble = open ? "" : LOST;
+  showConnection();
+}
+
+function isOfPage(hash: string): boolean {
+  return hash.startsWith("#/");
 }
 
 async function refreshList(): Promise<void> {
   try {
     const newest = await list.refresh();
-    showConnection(true);
-    if (!location.hash && newest) location.replace(`#/${newest}`);
+    listTrouble = "";
+    if (isAccountDue) void showAccount();
+    if (isViewDue && newest && !isOfPage(location.hash)) history.replaceState(null, "", `#/${newest}`);
+    if (isViewDue) void open();
   } catch (problem) {
     if (problem instanceof Unauthenticated) askForToken();
-    showConnection(false);
+    listTrouble = problem instanceof TypeError ? LOST : sentenceOf(problem);
   }
+  showConnection();
 }
 
 async function open(): Promise<void> {
-  if (!location.hash || isSignedOut) return;
-  view?.stop();
-  view = null;
+  if (!isOfPage(location.hash) || isSignedOut) return;
+  leave();
   const id = location.hash.match(/^#\/(\w+)$/)?.[1] ?? "";
   const isDome = location.hash === DOME;
   list.select(id);
   if (isDome) domeLink.setAttribute("aria-current", "page");
   else domeLink.removeAttribute("aria-current");
+  if (!isViewDue) main.replaceChildren();
+  isViewDue = false;
   if (!id) {
     showProblem(`No job has the address ${location.hash}; choose one from the list.`);
     return;
   }
-  view = isDome ? new DomeView(showConnection) : new JobView(id, () => void refreshList(), showConnection);
-  main.replaceChildren(view.root);
+  const opened = isDome ? new DomeView(showViewConnection) : new JobView(id, () => void refreshList(), showViewConnection);
+  view = opened;
   try {
-    await view.start();
+    await opened.start();
+    if (view === opened) main.replaceChildren(opened.root);
   } catch (problem) {
     if (problem instanceof Unauthenticated) askForToken();
-    else showProblem(problem instanceof Error ? problem.message : String(problem));
+    if (view !== opened) return;
+    leave();
+    isViewDue = mayPass(problem);
+    showProblem(isViewDue ? `${sentenceOf(problem)} Trying again.` : sentenceOf(problem));
   }
 }
 
+function leave(): void {
+  view?.stop();
+  view = null;
+  viewTrouble = "";
+  showConnection();
+}
+
+/** A sentence that stands there already is not told again. */
 function showProblem(sentence: string): void {
-  main.replaceChildren(element("p", { class: "failure", role: "alert" }, sentence));
+  if (main.textContent !== sentence) main.replaceChildren(element("p", { class: "failure", role: "alert" }, sentence));
 }
 
 function askForToken(): void {
   if (isSignedOut) return;
   isSignedOut = true;
-  view?.stop();
-  view = null;
+  leave();
   jobs.hidden = true;
   domeLink.hidden = true;
   workers.hidden = true;
@@ -79,7 +109,15 @@ function askForToken(): void {
 }
 
 async function showAccount(): Promise<void> {
-  const session = await getSession();
+  isAccountDue = false;
+  let session: Session;
+  try {
+    session = await getSession();
+  } catch (problem) {
+    if (problem instanceof Unauthenticated) askForToken();
+    isAccountDue = mayPass(problem);
+    return;
+  }
   domeLink.hidden = !session.is_open && !["admin", "operate-dome"].some((scope) => session.scopes.includes(scope));
   if (session.is_open) return;
   const button = element("button", { type: "button" }, "Sign out");
@@ -89,16 +127,21 @@ async function showAccount(): Promise<void> {
 
 async function start(): Promise<void> {
   isSignedOut = false;
+  isViewDue = true;
+  isAccountDue = true;
   jobs.hidden = false;
   workers.hidden = false;
   main.replaceChildren();
   await refreshList();
   if (isSignedOut) return;
-  void showAccount();
   void workerList.refresh();
-  await open();
+  if (isViewDue) await open();
 }
 
+find("skip").addEventListener("click", (event) => {
+  event.preventDefault();
+  main.focus();
+});
 window.addEventListener("hashchange", () => void open());
 window.addEventListener("unhandledrejection", (event) => {
   if (!(event.reason instanceof Unauthenticated)) return;

@@ -1,6 +1,6 @@
 /** The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again every second. */
 
-import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, Unauthenticated } from "./api";
+import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
@@ -14,6 +14,7 @@ export class DomeView {
   private readonly off = element("button", { type: "button", class: "all-off" }, "ALL OFF");
   private readonly done = element("p", { class: "done", role: "status" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
+  private readonly silence = element("p", { class: "failure", role: "alert" });
   private readonly facts = element("dl", { class: "facts" });
   private readonly capturing = element("p", { class: "soft" });
   private readonly level = numberInput("level", 5, 1, 100);
@@ -23,17 +24,21 @@ export class DomeView {
   private readonly mouth = element("input", { id: "mouth", type: "text", required: "", spellcheck: "false", autocomplete: "off" });
   private readonly look = element("button", {}, "Run the preflight");
   private readonly findings = element("ul", { class: "findings", role: "status" });
+  private capturers = "";
+  private deeds = 0;
   private timer = 0;
   private isStopped = false;
 
   constructor(private readonly onConnection: (open: boolean) => void) {
     this.refusal.hidden = true;
+    this.silence.hidden = true;
+    this.capturing.hidden = true;
     this.off.addEventListener("click", () => void this.allOff());
     this.dark.addEventListener("click", () => void this.act(async () => this.show(await darken())));
   }
 
   /** Fill the view, ALL OFF first of all, and follow the dome until `stop`. */
-  async start(): Promise<void> {
+  start(): void {
     const rig = element("form", { class: "fields" }, labelled("Folder of the rig on the server", this.mouth), this.look);
     rig.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -45,11 +50,12 @@ export class DomeView {
       element("p", { class: "soft" }, "Every light goes dark at once and every capture is stopped. It is no emergency stop: that one is a switch."),
       this.done,
       this.refusal,
+      this.silence,
       section("One light, for alignment", this.capturing, this.fields(), this.grid.root),
       section("Preflight", element("p", { class: "soft" }, "Every light for a moment, black level and clipping; takes seconds."), rig, this.findings),
       section("Controller", this.facts),
     );
-    await this.askAgain();
+    void this.askAgain();
   }
 
   stop(): void {
@@ -94,7 +100,9 @@ export class DomeView {
       await deed();
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
-      this.tell(problem);
+      tell(this.refusal, problem);
+    } finally {
+      this.deeds += 1;
     }
   }
 
@@ -104,23 +112,40 @@ export class DomeView {
   }
 
   private async askAgain(): Promise<void> {
+    const deeds = this.deeds;
     try {
-      if (!document.hidden) this.take(await getDome());
+      const dome = document.hidden ? null : await getDome();
+      if (this.isStopped) return;
+      if (dome && deeds === this.deeds) this.take(dome); // not what was asked before something was done by hand
       this.onConnection(true);
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
-      if (problem instanceof TypeError) this.onConnection(false);
-      this.state.textContent = "unknown";
-      this.state.dataset["state"] = "FAILED";
-      if (!(problem instanceof TypeError)) this.tell(problem);
+      if (this.isStopped) return;
+      const isLost = problem instanceof TypeError;
+      this.onConnection(!isLost);
+      this.forget();
+      tell(this.silence, problem);
+      this.silence.hidden = isLost;
     }
     this.askLater();
   }
 
+  /** Show nothing as if it were known. */
+  private forget(): void {
+    this.state.textContent = "unknown";
+    this.state.dataset["state"] = "FAILED";
+    this.done.textContent = "";
+    this.grid.forget();
+    this.facts.replaceChildren();
+  }
+
   private take(dome: DomeState): void {
+    this.silence.hidden = true;
     this.show(dome.status);
     this.address.textContent = dome.address;
     this.capturing.hidden = dome.capturing.length === 0;
+    if (this.capturers === dome.capturing.join()) return;
+    this.capturers = dome.capturing.join();
     const jobs = dome.capturing.flatMap((id) => [" ", element("a", { href: `#/${id}` }, id)]);
     this.capturing.replaceChildren("The dome captures, so no light goes on by hand. Job", ...jobs);
   }
@@ -129,6 +154,7 @@ export class DomeView {
     const [first] = status.lit;
     this.state.textContent = first === undefined ? (status.stopped ? "dark, ALL OFF" : "dark") : status.lit.length === 1 ? `light ${first} is on` : `${status.lit.length} lights are on`;
     this.state.dataset["state"] = first === undefined ? "SUCCEEDED" : "RUNNING";
+    if (first !== undefined) this.done.textContent = "";
     this.grid.show(status.light_count, status.lit);
     const rows: [string, string][] = [
       ["Lights", `${status.light_count}`],
@@ -142,11 +168,12 @@ export class DomeView {
     ];
     this.facts.replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
   }
+}
 
-  private tell(problem: unknown): void {
-    this.refusal.hidden = false;
-    this.refusal.textContent = problem instanceof Error ? problem.message : String(problem);
-  }
+/** What stands there already is not told again. */
+function tell(where: HTMLElement, problem: unknown): void {
+  where.hidden = false;
+  if (where.textContent !== sentenceOf(problem)) where.textContent = sentenceOf(problem);
 }
 
 function section(title: string, ...content: HTMLElement[]): HTMLElement {

@@ -8,6 +8,11 @@ export function unitOf(estimate: Estimate): string {
   return UNITS[estimate.unit] ?? estimate.unit;
 }
 
+/** The unit of a parameter of a running fit, which tells bare values: lengths occur in coefficients alone, as ``sigma`` or ``sigma_s_reduced``. */
+export function unitOfName(name: string): string {
+  return /(^|\.)sigma(_\w+)?$/.test(name) ? "mm⁻¹" : "";
+}
+
 export function valueOf(estimate: Estimate): string {
   if (estimate.se === null) return significant(estimate.value);
   const decimals = decimalsFor(estimate.se);

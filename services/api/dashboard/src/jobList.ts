@@ -1,20 +1,30 @@
 /** The jobs, newest first; more on demand. */
 
-import { type Job, listJobs } from "./api";
+import { type Job, listJobs, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
 import { when } from "./format";
+
+const PAGE = 50;
+/** The server lists no more at once; what lies below is not asked for again. */
+const MOST = 500;
 
 export class JobList {
   private readonly items = element("ul");
   private readonly more = element("button", { type: "button" }, "Older jobs");
+  private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly empty = element("p", { class: "soft" }, "No job yet. Submit one: dentine submit JOB.toml");
-  private older: Job[] = [];
-  private next: number | null = null;
+  /** Newest first, without a gap. */
+  private jobs: Job[] = [];
+  private showsOlder = false;
+  private isLoading = false;
   private selected: string | null = null;
   private drawn = "";
 
   constructor(root: HTMLElement) {
-    root.append(this.empty, this.items, this.more);
+    this.refusal.hidden = true;
+    this.empty.hidden = true;
+    this.more.hidden = true;
+    root.append(this.empty, this.items, this.refusal, this.more);
     this.more.addEventListener("click", () => void this.loadOlder());
   }
 
@@ -23,30 +33,42 @@ export class JobList {
     for (const link of this.items.querySelectorAll("a")) this.mark(link);
   }
 
-  /** Load the newest jobs again; returns the newest one's id. */
+  /** Load what is shown again, as older jobs change too; returns the newest one's id. */
   async refresh(): Promise<string | null> {
-    const page = await listJobs(null);
-    if (!this.older.length) this.next = page.next_before;
-    this.draw(page.jobs);
-    return page.jobs[0]?.id ?? null;
+    const { jobs, next_before: last } = await listJobs(this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MOST) : PAGE);
+    const joint = this.jobs.findIndex((job) => job.number === last);
+    const below = this.showsOlder && joint >= 0 ? this.jobs.slice(joint + 1) : [];
+    if (!below.length) this.more.hidden = last === null;
+    this.draw([...jobs, ...below]);
+    return jobs[0]?.id ?? null;
   }
 
   private async loadOlder(): Promise<void> {
-    const page = await listJobs(this.next);
-    this.older.push(...page.jobs);
-    this.next = page.next_before;
-    await this.refresh();
+    if (this.isLoading) return;
+    const lowest = this.jobs.at(-1)?.number ?? 0;
+    this.showsOlder = true;
+    this.isLoading = true; // not the button's `disabled`, which would take its focus
+    this.refusal.hidden = true;
+    try {
+      const page = await listJobs(PAGE, lowest);
+      this.more.hidden = page.next_before === null;
+      this.draw([...this.jobs.filter((job) => job.number >= lowest), ...page.jobs]);
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.refusal.hidden = false;
+      this.refusal.textContent = sentenceOf(problem);
+    } finally {
+      this.isLoading = false;
+    }
   }
 
-  private draw(newest: Job[]): void {
-    const last = newest.at(-1)?.number ?? 0;
-    const jobs = [...newest, ...this.older.filter((job) => job.number < last)];
+  private draw(jobs: Job[]): void {
+    this.jobs = jobs;
     const state = JSON.stringify(jobs.map((job) => [job.id, job.state]));
     this.empty.hidden = jobs.length > 0;
-    this.more.hidden = this.next === null;
     if (state === this.drawn) return;
     this.drawn = state;
-    const focused = document.activeElement?.getAttribute("href");
+    const focused = this.items.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
     this.items.replaceChildren(...jobs.map((job) => element("li", {}, this.link(job))));
     if (focused) this.items.querySelector<HTMLElement>(`a[href="${focused}"]`)?.focus();
   }

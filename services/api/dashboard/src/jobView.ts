@@ -1,6 +1,22 @@
 /** One job, live: fed by its event stream, completed from its artifacts when it ends. */
 
-import { type Artifact, artifactUrl, cancelJob, followEvents, getJob, getParameters, type Job, type JobDetail, type JobEvent, type JobState, listArtifacts, retryJob, Unauthenticated } from "./api";
+import {
+  type Artifact,
+  artifactUrl,
+  cancelJob,
+  followEvents,
+  getJob,
+  getParameters,
+  type Job,
+  type JobDetail,
+  type JobEvent,
+  type JobState,
+  listArtifacts,
+  mayPass,
+  retryJob,
+  sentenceOf,
+  Unauthenticated,
+} from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, remaining, when } from "./format";
@@ -24,8 +40,13 @@ export class JobView {
   private readonly chart = new LossChart();
   private readonly parameters = new ParameterTable();
   private readonly comparison: Comparison;
+  private readonly filesRefusal = element("p", { class: "failure", role: "alert" });
   private readonly files = element("ul", { class: "files" });
   private current: JobState = "SUBMITTED";
+  /** Of a jaw: the tooth that is looked at alone, null for all together; undefined before the first step. */
+  private tooth: number | null | undefined;
+  private areFilesDue = false;
+  private isStopped = false;
   private timer = 0;
   private close: () => void = () => undefined;
 
@@ -37,6 +58,7 @@ export class JobView {
     this.comparison = new Comparison(id);
     this.failure.hidden = true;
     this.refusal.hidden = true;
+    this.filesRefusal.hidden = true;
     this.report.hidden = true;
     this.report.href = artifactUrl(id, "report.html");
     this.action.addEventListener("click", () => void this.act());
@@ -45,6 +67,7 @@ export class JobView {
   /** Fill the view and follow the job until `stop`. */
   async start(): Promise<void> {
     const job = await getJob(this.id);
+    if (this.isStopped) return;
     const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
     const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
     this.root.replaceChildren(
@@ -57,50 +80,71 @@ export class JobView {
       section("Fit", this.chart.root),
       section("Render and photograph", this.comparison.root),
       section("Parameters", this.parameters.root),
-      section("Files", this.files),
+      section("Files", this.filesRefusal, this.files),
     );
-    this.stages.show(job.stages);
-    this.showState(job);
-    this.showWaiting(job);
+    this.show(job);
     this.follow();
-    await this.showFiles();
+    void this.showFiles();
   }
 
   stop(): void {
+    this.isStopped = true;
     window.clearTimeout(this.timer);
     this.close();
+    this.chart.stop();
   }
 
   private follow(): void {
     this.close();
-    this.close = followEvents(this.id, (event) => this.take(event), () => void this.refresh(), this.onConnection);
+    const end = () => {
+      void this.refreshState();
+      void this.showFiles();
+    };
+    this.close = followEvents(this.id, (event) => this.take(event), end, this.onConnection);
   }
 
   private take(event: JobEvent): void {
     this.stages.take(event);
-    if (event.kind === "step") {
-      this.chart.add(event);
-      const { parameters, channel } = event.data;
-      if (parameters && typeof parameters === "object") this.parameters.showStep(typeof channel === "string" ? channel : "all", parameters as Record<string, number>);
-    }
+    if (event.kind === "step") this.takeStep(event);
     if (event.kind === "preview") this.comparison.add(event);
     if (event.kind === "finished") void this.showFiles();
     if (event.kind === "state") void this.refreshState();
   }
 
-  /** The replay tells old states too, so the state itself is always asked for. */
-  private async refreshState(): Promise<JobDetail> {
-    const job = await getJob(this.id);
-    this.showState(job);
-    this.showWaiting(job);
-    if (FINAL.includes(job.state)) this.stages.show(job.stages);
-    this.onChange();
-    return job;
+  /** Teeth that are looked at alone are shown one at a time, and no more once a step tells of all of them together. */
+  private takeStep(event: JobEvent): void {
+    const { channel, parameters } = event.data;
+    const tooth = typeof event.data["tooth"] === "number" ? event.data["tooth"] : null;
+    if (this.tooth === null && tooth !== null) return;
+    if (this.tooth !== tooth) {
+      this.chart.clear();
+      this.parameters.clear();
+    }
+    this.tooth = tooth;
+    const name = `${typeof channel === "string" ? channel : "all"}${tooth === null ? "" : `, tooth ${tooth}`}`;
+    this.chart.add(name, event);
+    if (parameters && typeof parameters === "object") this.parameters.showStep(name, parameters as Record<string, number>);
   }
 
-  private async refresh(): Promise<void> {
-    await this.refreshState();
-    await this.showFiles();
+  /** The replay tells old states too, so the state itself is always asked for. */
+  private async refreshState(): Promise<void> {
+    try {
+      const job = await getJob(this.id);
+      if (this.isStopped) return;
+      this.show(job);
+      this.onChange();
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      if (mayPass(problem)) this.askLater();
+      else this.refuse(problem);
+    }
+    if (this.areFilesDue) await this.showFiles();
+  }
+
+  private show(job: JobDetail): void {
+    this.stages.show(job.stages);
+    this.showState(job);
+    this.showWaiting(job);
   }
 
   /** What a queued job waits for, and how long a job will take, are no events, so they are asked for again. */
@@ -114,13 +158,8 @@ export class JobView {
   }
 
   private askLater(): void {
-    if (!this.root.isConnected) return;
-    this.timer = window.setTimeout(() => {
-      this.refreshState().catch((problem) => {
-        if (problem instanceof Unauthenticated) throw problem;
-        this.askLater();
-      });
-    }, ASK_AGAIN_MS);
+    window.clearTimeout(this.timer);
+    if (!this.isStopped) this.timer = window.setTimeout(() => void this.refreshState(), ASK_AGAIN_MS);
   }
 
   private showState(job: Job): void {
@@ -137,19 +176,42 @@ export class JobView {
     const retry = FINAL.includes(this.current);
     this.refusal.hidden = true;
     try {
-      this.showState(await (retry ? retryJob : cancelJob)(this.id));
+      const job = await (retry ? retryJob : cancelJob)(this.id);
+      if (this.isStopped) return;
+      this.showState(job);
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
-      this.refusal.hidden = false;
-      this.refusal.textContent = problem instanceof Error ? problem.message : String(problem);
+      this.refuse(problem);
       return;
     }
     if (retry) this.follow();
     this.onChange();
   }
 
+  private refuse(problem: unknown): void {
+    this.refusal.hidden = false;
+    this.refusal.textContent = sentenceOf(problem);
+  }
+
+  /** What is there so far; asked for again later where it cannot be told now. */
   private async showFiles(): Promise<void> {
-    const files = await listArtifacts(this.id);
+    this.areFilesDue = false;
+    try {
+      const files = await listArtifacts(this.id);
+      if (this.isStopped) return;
+      this.list(files);
+      if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id));
+      this.filesRefusal.hidden = true;
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.filesRefusal.hidden = false;
+      this.filesRefusal.textContent = sentenceOf(problem);
+      this.areFilesDue = mayPass(problem);
+      if (this.areFilesDue) this.askLater();
+    }
+  }
+
+  private list(files: Artifact[]): void {
     const isTop = (file: Artifact) => !file.path.includes("/");
     const shown = [...files.filter(isTop), ...files.filter((file) => file.path.startsWith("asset/"))];
     this.report.hidden = !files.some((file) => file.path === "report.html");
@@ -158,6 +220,5 @@ export class JobView {
         element("li", {}, element("a", { href: artifactUrl(this.id, file.path), target: "_blank", rel: "noopener" }, file.path), ` ${bytes(file.bytes)}`),
       ),
     );
-    if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id));
   }
 }

@@ -20,6 +20,11 @@ export class LightGrid {
     this.lights.forEach((button, light) => button.setAttribute("aria-pressed", `${lit.includes(light)}`));
   }
 
+  /** Show that nobody knows which lights emit; the buttons stay, so that the focus does. */
+  forget(): void {
+    for (const button of this.lights) button.removeAttribute("aria-pressed");
+  }
+
   private button(light: number): HTMLButtonElement {
     const button = element("button", { type: "button", "aria-label": `Light ${light}`, "aria-pressed": "false", tabindex: light ? "-1" : "0" }, `${light}`);
     button.addEventListener("click", () => this.onLight(light));

@@ -20,21 +20,35 @@ export class LossChart {
   private plot: uPlot | null = null;
   private plotted = "";
   private stale = false;
+  private readonly resizes = new ResizeObserver(() => this.plot?.setSize(this.size()));
+  private readonly scheme = matchMedia("(prefers-color-scheme: dark)");
+  private readonly recolour = () => {
+    this.plotted = "";
+    this.draw();
+  };
 
   constructor() {
     this.root.append(this.canvas, this.caption);
-    new ResizeObserver(() => this.plot?.setSize(this.size())).observe(this.canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-      this.plotted = "";
-      this.draw();
-    });
+    this.resizes.observe(this.canvas);
+    this.scheme.addEventListener("change", this.recolour);
   }
 
-  /** Take in a step; a step that a later attempt repeats replaces the earlier one. */
-  add(event: JobEvent): void {
-    const { step, loss, held_out_error: heldOut, channel } = event.data;
+  stop(): void {
+    this.resizes.disconnect();
+    this.scheme.removeEventListener("change", this.recolour);
+    this.clear();
+    this.plot?.destroy();
+    this.plot = null;
+  }
+
+  clear(): void {
+    this.channels.clear();
+  }
+
+  /** Take in a step of a channel; a step that a later attempt repeats replaces the earlier one. */
+  add(name: string, event: JobEvent): void {
+    const { step, loss, held_out_error: heldOut } = event.data;
     if (typeof step !== "number") return;
-    const name = typeof channel === "string" ? channel : "all";
     const points = this.channels.get(name) ?? new Map<number, Point>();
     this.channels.set(name, points.set(step, { loss: positive(loss), heldOut: positive(heldOut) }));
     if (!this.stale) requestAnimationFrame(() => this.draw());
@@ -60,7 +74,7 @@ export class LossChart {
   private rebuild(names: string[], data: uPlot.AlignedData): void {
     const style = getComputedStyle(document.documentElement);
     const colour = (name: string) => style.getPropertyValue(name).trim();
-    const line = (name: string, index: number) => colour(`--channel-${name}`) || colour(`--line-${index % 3}`);
+    const line = (name: string, index: number) => colour(`--channel-${name.split(",")[0]}`) || colour(`--line-${index % 3}`);
     const axis = { stroke: colour("--text-soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--rule") } };
     const series = names.flatMap((name, index) => [
       { label: `${name} loss`, stroke: line(name, index), width: 2, spanGaps: true },

@@ -2,7 +2,7 @@
 
 import type { Parameters } from "./api";
 import { element } from "./element";
-import { significant, unitOf, valueOf } from "./format";
+import { significant, unitOf, unitOfName, valueOf } from "./format";
 
 export class ParameterTable {
   readonly root = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" }, element("p", { class: "soft" }, "No value yet."));
@@ -13,9 +13,16 @@ export class ParameterTable {
   showStep(channel: string, values: Record<string, number>): void {
     this.current.set(channel, values);
     if (this.isFinal) return;
-    const cell = (name: string, at: string) => [significant(this.current.get(at)?.[name] ?? NaN)];
+    const cell = (name: string, at: string) => {
+      const value = this.current.get(at)?.[name];
+      return [value === undefined ? "–" : significant(value)];
+    };
     const names = [...new Set([...this.current.values()].flatMap(Object.keys))];
-    this.fill("While fitting: current values, uncertainty not known yet.", [...this.current.keys()], names, () => "", cell);
+    this.fill("While fitting: current values, uncertainty not known yet.", [...this.current.keys()], names, unitOfName, cell);
+  }
+
+  clear(): void {
+    this.current.clear();
   }
 
   /** The published result. */

@@ -1,6 +1,6 @@
 /** Asks for a token. The server answers with a cookie that scripts cannot read; the page keeps nothing. */
 
-import { signIn } from "./api";
+import { sentenceOf, signIn } from "./api";
 import { element } from "./element";
 
 export class SignIn {
@@ -30,7 +30,7 @@ export class SignIn {
       this.onSuccess();
     } catch (problem) {
       this.refusal.hidden = false;
-      this.refusal.textContent = problem instanceof Error ? problem.message : String(problem);
+      this.refusal.textContent = sentenceOf(problem);
       this.token.value = "";
       this.token.focus();
     }

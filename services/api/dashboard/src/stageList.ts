@@ -19,7 +19,7 @@ export class StageList {
       const row = this.row(stage.stage);
       row.root.dataset["state"] = stage.state;
       row.state.textContent = stage.attempt > 1 ? `${stage.state}, attempt ${stage.attempt}` : stage.state;
-      row.note.textContent = stage.message;
+      if (stage.message) row.note.textContent = stage.message;
       this.advance(row, stage.done, stage.state === "running");
     }
   }

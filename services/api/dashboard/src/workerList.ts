@@ -1,6 +1,6 @@
 /** The workers, what each is doing, and how many jobs they get done. */
 
-import { listWorkers, type Worker } from "./api";
+import { listWorkers, sentenceOf, type Worker } from "./api";
 import { element } from "./element";
 import { bytes } from "./format";
 
@@ -21,7 +21,7 @@ export class WorkerList {
       this.items.replaceChildren(...found.workers.map(item));
       if (focused) this.items.querySelector<HTMLElement>(`a[href="${focused}"]`)?.focus();
     } catch (problem) {
-      this.sentence.textContent = problem instanceof Error ? problem.message : String(problem);
+      this.sentence.textContent = sentenceOf(problem);
       this.items.replaceChildren();
     }
   }
