@@ -28,7 +28,8 @@ def cluster() -> Iterator[LocalCluster]:
     # The worker lives in the tests' own process, which may hold more than the limit that is told: so it is not acted upon.
     unlimited = dict.fromkeys((f"distributed.worker.memory.{act}" for act in ("target", "spill", "pause", "terminate")), False)
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp", "dashboard_address": "127.0.0.1:0", "memory_limit": "1 GiB"}
-    with dask.config.set(unlimited), LocalCluster(**options, resources={"DOME": 1}) as cluster:
+    as_if_alone = unlimited | {"distributed.worker.preload": []}  # which every connection of a server leaves for its process
+    with dask.config.set(as_if_alone), LocalCluster(**options, resources={"DOME": 1}) as cluster:
         yield cluster
 
 

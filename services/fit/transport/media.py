@@ -75,6 +75,7 @@ class Media:
         self.count = len(media)
         each = [[entry] if isinstance(entry, Medium) else entry for entry in media]
         self.two_lobes = any(m.beta < 1 for entry in each for m in entry)
+        """Whether the second lobe counts; also asked for by a derivative to beta, which tells what it would bring."""
         if any(m.table is not None for entry in each for m in entry if len(entry) > 1):
             raise InputError("Media that differ from lane to lane cannot have phase tables; give them lobes.")
         tables = [entry[0].table for entry in each]

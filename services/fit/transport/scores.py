@@ -65,8 +65,6 @@ class Scores:
         for s in plan.scores:
             if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
                 raise InputError(f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives.")
-        if "beta" in self.phase_fields and not media.two_lobes:
-            raise InputError("No medium has a second lobe, which a derivative to beta weighs against the first; give one a beta below 1.")
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
         # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
         self.mixing = mixing

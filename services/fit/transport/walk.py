@@ -86,6 +86,7 @@ class Walk:
     ) -> None:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
+        media.two_lobes |= any(score.field == "beta" for score in plan.scores)
         self.book = Scores(plan, media, mixing=geometry.mixing)
         self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.book, self.ior)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
