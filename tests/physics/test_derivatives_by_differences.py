@@ -127,7 +127,9 @@ def test_equation_32_alone_is_no_derivative(monkeypatch: pytest.MonkeyPatch) -> 
 def test_what_a_second_lobe_would_bring_is_told_where_there_is_none() -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
     none, hardly = (
-        engine.jacobian(Tissue(Medium(2, 0.95, beta, 0.6, -0.3), Medium(3, 0.8, beta, 0.6, -0.3), (0.5, 0.5)), view, ("enamel.beta",), samples=64, seed=1).jacobian
+        engine.jacobian(
+            Tissue(Medium(2, 0.95, beta, 0.6, -0.3), Medium(3, 0.8, beta, 0.6, -0.3), (0.5, 0.5)), view, ("enamel.beta",), samples=64, seed=1
+        ).jacobian
         for beta in (1.0, 1 - 1e-6)
     )
     # A path in some thousands turns by the other lobe.
