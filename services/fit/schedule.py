@@ -124,6 +124,8 @@ class ChannelSchedule(Stages[Tissue]):
 
         options = self.at_full_resolution()
         exact_samples = self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels)))
+        if self.files.full.pixels > self.files.coarse.pixels:
+            exact_samples = options.max_samples  # two levels on the way there took a third of a large stack's time and decided nothing
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         tissue, solution = self._iterate(problem, options, exact_samples)
