@@ -45,7 +45,7 @@ class Clerks:
         return answer
 
     def close(self) -> None:
-        """Wait for what is under way, but not for what hangs: the dome is yet to be left dark."""
+        """Wait for what is under way, but not for what hangs."""
         closing = threading.Thread(target=self._pool.shutdown, name="clerks' end", daemon=True)
         closing.start()
         closing.join(CLOSE_S)

@@ -50,6 +50,8 @@ START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise asks."""
+LEAST_EXACT_SAMPLES = 32
+"""With fewer, where the limit allows them, comparisons of full images decide nothing: levels of 6 and 12 took a fifth of a large stack's time."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
 REWEIGHTINGS = 2
@@ -123,9 +125,7 @@ class ChannelSchedule(Stages[Tissue]):
             tissue, _ = self._iterate(problem, options, reached)
 
         options = self.at_full_resolution()
-        exact_samples = self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels)))
-        if self.files.full.pixels > self.files.coarse.pixels:
-            exact_samples = options.max_samples  # two levels on the way there took a third of a large stack's time and decided nothing
+        exact_samples = max(self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))), LEAST_EXACT_SAMPLES)
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         tissue, solution = self._iterate(problem, options, exact_samples)
