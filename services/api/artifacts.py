@@ -54,7 +54,7 @@ def list_artifacts(root: Path) -> list[Artifact]:
 
 
 def open_artifact(root: Path, name: str) -> Path:
-    """The file behind an artifact's path.
+    """The file behind an artifact's path; a link, or what lies behind one, is none, as in the list.
 
     Raises:
         UnknownJobError: not a readable file of this job, whatever the path tries.
@@ -63,7 +63,7 @@ def open_artifact(root: Path, name: str) -> Path:
     path = root.joinpath(*relative.parts)
     inside = not relative.is_absolute() and ".." not in relative.parts and "\0" not in name
     with suppress(OSError):  # a path too long for the disk
-        if inside and _is_public(relative) and path.resolve().is_relative_to(root.resolve()) and path.is_file():
+        if inside and _is_public(relative) and not any((root / part).is_symlink() for part in (relative, *relative.parents[:-1])) and path.is_file():
             return path
     raise UnknownJobError(f"The job has no artifact {name!r}; list its artifacts to see their paths.")
 

@@ -23,13 +23,13 @@ from services.core.settings import ServerSettings
 class Observation:
     """Belongs to one application; ``webhook_sender`` is to be run while the application lives."""
 
-    def __init__(self, jobs: Jobs, settings: ServerSettings, readers: Clerks, certificates: Certificates | None = None) -> None:
+    def __init__(self, jobs: Jobs, settings: ServerSettings, readers: Clerks, openers: Clerks, certificates: Certificates | None = None) -> None:
         engine, policy = jobs.repository.engine, AddressPolicy(settings.private_webhooks)
         readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler, certificates)
         deliveries = Deliveries(engine)
         self._registry = build_registry(engine, readiness, jobs.free_bytes)
         self._routers = (
-            build_observe_router(jobs, readers),
+            build_observe_router(jobs, readers, openers),
             build_health_router(readiness, self._registry),
             build_webhook_router(Webhooks(engine, policy), deliveries),
         )

@@ -23,8 +23,8 @@ from services.core.stage import StageName
 After = Annotated[int, Query(ge=0, le=MOST_ID, description="id of the last one that is known already")]
 
 
-def build_observe_router(jobs: Jobs, readers: Clerks) -> APIRouter:
-    """Routes over the given jobs."""
+def build_observe_router(jobs: Jobs, readers: Clerks, openers: Clerks) -> APIRouter:
+    """Routes over the given jobs; ``openers`` read their files."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
     histories = Histories()
 
@@ -64,6 +64,7 @@ def build_observe_router(jobs: Jobs, readers: Clerks) -> APIRouter:
         tags=["artifacts"],
         dependencies=[needs("read", audited=True)],
     )
+    @openers.answering
     def preview(
         job_id: str, preview_id: Annotated[int, PathParameter(ge=1, le=MOST_ID)], picture: Literal["render", "photo", "residual"], request: Request
     ) -> Response:

@@ -46,8 +46,8 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
-    """Routes over the given jobs."""
+def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks) -> APIRouter:
+    """Routes over the given jobs; ``openers`` read their files."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
     lookers = Clerks(1)
@@ -127,6 +127,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
         return await feed.answer(job_id, last_event_id or 0)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
+    @openers.answering
     @in_json
     def artifacts(job_id: str) -> list[Artifact]:
         """List the job's files."""
@@ -135,6 +136,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks) -> APIRouter:
     @router.get(
         "/jobs/{job_id}/artifacts/{path:path}", response_class=Response, responses=ANSWERS, tags=["artifacts"], dependencies=[needs("read", audited=True)]
     )
+    @openers.answering
     def artifact(job_id: str, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
         return artifact_response(request, open_artifact(jobs.folder(jobs.repository.get(job_id).id), path))
