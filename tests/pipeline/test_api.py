@@ -168,13 +168,26 @@ def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str
 
 
 @pytest.mark.parametrize(
-    "path", ["..%2f..%2fdentine.sqlite", "%2e%2e/%2e%2e/dentine.sqlite", "%2fetc%2fpasswd", ".lock", "cancel", "fit.lease", "asset", "link", "a%00b"]
+    "path",
+    [
+        "..%2f..%2fdentine.sqlite",
+        "%2e%2e/%2e%2e/dentine.sqlite",
+        "%2fetc%2fpasswd",
+        ".lock",
+        "cancel",
+        "fit.lease",
+        "asset",
+        "link",
+        "linked%2fpasswd",
+        "a%00b",
+    ],
 )
 def test_no_path_leads_out_of_the_artifacts(serve: Any, capture_folder: str, tmp_path: Path, path: str) -> None:
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
     finish(client, job_id)
     (tmp_path / "data" / "jobs" / job_id / "link").symlink_to("/etc/passwd")
+    (tmp_path / "data" / "jobs" / job_id / "linked").symlink_to("/etc")
     assert client.get(f"/v1/jobs/{job_id}/artifacts/{path}").status_code == 404
 
 

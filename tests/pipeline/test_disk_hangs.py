@@ -1,9 +1,10 @@
-"""A capture on a disk that does not answer keeps nobody waiting who does not ask for it."""
+"""A disk that does not answer keeps nobody waiting who does not ask for what is on it."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
@@ -13,9 +14,12 @@ from services.api.app import create_app
 from services.core.settings import ServerSettings
 from tests.support.live_server import serving
 
+FILE_READERS = 50
+"""More than the threads in which FastAPI calls handlers, which are forty."""
+
 
 class Disk:
-    """Hangs from the first look at a capture until it is mended."""
+    """Hangs from the first look at it until it is mended."""
 
     def __init__(self) -> None:
         self.is_asked, self.is_mended = threading.Event(), threading.Event()
@@ -23,6 +27,11 @@ class Disk:
     def __call__(self, *_: object) -> None:
         self.is_asked.set()
         self.is_mended.wait(60)
+
+    def list_nothing(self, *_: object) -> list[object]:
+        """What a folder holds that can be looked at again."""
+        self()
+        return []
 
 
 @pytest.fixture
@@ -61,6 +70,20 @@ def test_a_job_whose_size_is_being_predicted_can_be_asked_for(tmp_path: Path, mo
             monkeypatch.undo()
             client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
             disk.is_mended.set()
+
+
+def test_many_who_wait_for_files_of_jobs_keep_nobody_from_submitting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
+    monkeypatch.setattr("services.api.routes.list_artifacts", disk.list_nothing)
+    with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client, ThreadPoolExecutor(FILE_READERS) as pool:
+        files = f"{client.base_url}/v1/jobs/{submit(client, tmp_path)}/artifacts"
+        waiting = [pool.submit(httpx.get, files, timeout=60) for _ in range(FILE_READERS)]
+        assert disk.is_asked.wait(60)
+        try:
+            for _ in range(3):
+                submit(client, tmp_path)
+        finally:
+            disk.is_mended.set()
+        assert [one.result().json() for one in waiting] == [[]] * FILE_READERS
 
 
 def submit(client: httpx.Client, capture: Path) -> str:
