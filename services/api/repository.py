@@ -28,8 +28,8 @@ from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
 
-KNOWN_SPECS = 1024
-"""Jobs whose options are kept as they were read."""
+KNOWN_JOBS = 1024
+"""Jobs, and their options, that are kept as they were read."""
 
 job_table = sql.Table(
     "job",
@@ -169,7 +169,8 @@ class Repository:
         self.engine = open_database(url)
         upgrade(self.engine)
         self.past_runs = PastRuns(self.engine)
-        self._spec_of = lru_cache(KNOWN_SPECS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
+        self._spec_of = lru_cache(KNOWN_JOBS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
+        self._known = lru_cache(KNOWN_JOBS)(self._read)
 
     def close(self) -> None:
         """Close every connection."""
@@ -368,6 +369,9 @@ class Repository:
         return [self._job(row) for row in rows]
 
     def _job(self, row: Sequence[Any]) -> Job:
+        return self._known(*row)
+
+    def _read(self, *row: Any) -> Job:
         job_id, number, state, created_s, changed_s, spec, failure, request_id = row
         return Job(
             id=job_id,
