@@ -23,7 +23,7 @@ test-all: ## the slow ones too: fits of the real incisor, long slab tables
 
 faults: ## kill -9 of every part of the service at every point of a job, a quarter of an hour; needs Postgres
 	@deploy/setup.sh
-	@$(BIN)/python -m tests.faults.kill_matrix --out faults.json
+	@$(BIN)/python -m tests.faults.kill_matrix --json faults.json
 
 contracts: ## ten thousand requests generated from the API's description, on SQLite and on Postgres, some minutes each
 	@deploy/setup.sh

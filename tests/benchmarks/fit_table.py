@@ -1,7 +1,7 @@
 """The rows of "what a fit must reach" for single teeth, on captures rendered by stock Mitsuba with sensor noise, as JSON.
 
-python -m tests.benchmarks.fit_table --cases homogeneous,known --out fit_table.json
-python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --out starts.json
+python -m tests.benchmarks.fit_table --cases homogeneous,known --json fit_table.json
+python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --json starts.json
 
 Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the truth's Monte Carlo noise taken out,
 and are not below what the photographs' noise resolves. Fits run in this process, on one thread; ``seconds`` is its processor time.
@@ -242,7 +242,7 @@ def main() -> None:
     parser.add_argument("--cases", default=",".join(CASES), help="rows, separated by commas")
     parser.add_argument("--subjects", default=",".join(LAYERED), help="stored truths with dentin, separated by commas")
     parser.add_argument("--options", default="{}", help="options of every fit's job, JSON")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     prepare_device(threads=1)
     rows: list[dict[str, Any]] = []
@@ -255,7 +255,7 @@ def main() -> None:
                     flush=True,
                 )
                 rows.append(asdict(figure) | {"reached": figure.reached})
-                arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+                arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Whether a fit's ± is true: many small fits of known teeth, how many of the 95 % intervals hold the truth, and the z-scores.
 
-python -m tests.benchmarks.honest_errors --fits 100 --out honest_errors.json
-python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --out honest_errors_drawn.json
-python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --out honest_errors_formula.json
-python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --shape --out honest_errors_shape.json
+python -m tests.benchmarks.honest_errors --fits 100 --json honest_errors.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --json honest_errors_drawn.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --json honest_errors_formula.json
+python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --shape --json honest_errors_shape.json
 
 Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
 six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits hold; with
@@ -150,7 +150,7 @@ def main() -> None:
     parser.add_argument("--max-samples", type=int, default=256)
     parser.add_argument("--max-steps", type=int, default=8)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     if arguments.shape and (not arguments.formula or arguments.truths == 1):
         parser.error("--shape needs --formula and more than one of --truths")
@@ -172,7 +172,7 @@ def main() -> None:
         fresh = list(fit_rows(teeth[which], truths[which], number, options, FORMULA if arguments.formula else ENGINE))
         rows += fresh
         print(number, f"{time.process_time() - began_s:.1f} s", fresh[0]["verdict"], [f"{row['z']:+.1f}" for row in fresh], flush=True)
-        arguments.out.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
+        arguments.json.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
     for line in summary(rows):
         print(line)
 

@@ -1,8 +1,8 @@
 """The row "jaw of 14" of what a fit must reach, tooth by tooth, on the jaw that stock Mitsuba rendered (``tests/support/jaw_truth.py``), as JSON.
 
-python -m tests.benchmarks.jaw_table --out jaw_table.json
-python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --out jaw_table.json
-python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --out jaw_table.json
+python -m tests.benchmarks.jaw_table --json jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --json jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json jaw_table.json
 
 Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the sensor and of the renderer, is part of
 every number: a medium's figure comes with its standard error, an image's with the error that this noise alone looks like in so few pixels. Photographs by
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--options", default="{}", help="options of the job, JSON")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--photographs", choices=("mitsuba", "engine"), default="mitsuba", help="stored ones by stock Mitsuba, or by the project's engine")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     truth = read_jaw_truth() if arguments.photographs == "mitsuba" else by_engine(read_jaw_truth(), PHOTOGRAPH_SAMPLES)
@@ -151,7 +151,7 @@ def main() -> None:
         for one in figures(Path(folder), truth, json.loads(arguments.options), arguments.workers):
             print(f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}): {one.reached}; {one.note}", flush=True)
             rows.append(asdict(one) | {"reached": one.reached})
-            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+            arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

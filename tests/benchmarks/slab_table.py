@@ -1,8 +1,8 @@
 """Every value of the slab tables with its error, z-score and cost, as JSON rows.
 
-python -m tests.benchmarks.slab_table derivatives --passes 3 --out slab_derivatives.json
-python -m tests.benchmarks.slab_table derivatives --cases S01,S02 --seconds 600 --out slab_derivatives.json
-python -m tests.benchmarks.slab_table totals --passes 4 --out slab_totals.json
+python -m tests.benchmarks.slab_table derivatives --passes 3 --json slab_derivatives.json
+python -m tests.benchmarks.slab_table derivatives --cases S01,S02 --seconds 600 --json slab_derivatives.json
+python -m tests.benchmarks.slab_table totals --passes 4 --json slab_totals.json
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--tolerance", type=float, default=1e-3, help="of totals, absolute; of the deepest white slabs at least 1e-3")
     parser.add_argument("--cases", help="only these, separated by commas; a first word, as S01")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     cases = derivative_cases() if arguments.table == "derivatives" else total_cases()
     if arguments.cases:
@@ -77,7 +77,7 @@ def main() -> None:
         tolerance = tolerances(case, max(arguments.tolerance, DEEP_TOLERANCE) if is_costly(case) else arguments.tolerance)
         shortfall = rule(tolerance, arguments.seconds) if arguments.seconds else passes(arguments.passes)
         rows += measure(case, tolerance, shortfall, arguments.seed + number)
-        arguments.out.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
+        arguments.json.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
     z = np.array([row["z"] for row in rows], dtype=np.float64)
     fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)
     print(f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a third of their tolerance")

@@ -1,6 +1,6 @@
 """One large file uploaded through a connection that is cut at random places, resumed each time, and verified, as JSON.
 
-python -m tests.benchmarks.upload_resume --bytes 2147483648 --cuts 20 --out upload_resume.json
+python -m tests.benchmarks.upload_resume --bytes 2147483648 --cuts 20 --json upload_resume.json
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ def main() -> None:
     parser.add_argument("--bytes", type=int, default=2 * 2**30, help="size of the file")
     parser.add_argument("--cuts", type=int, default=20, help="how often the connection is cut")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="also write the JSON here")
+    parser.add_argument("--json", type=Path, help="also write the JSON here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         text = json.dumps(measure(Path(work), options.bytes, options.cuts, options.seed), indent=1)
     print(text)
-    if options.out is not None:
-        options.out.write_text(text + "\n")
+    if options.json is not None:
+        options.json.write_text(text + "\n")
 
 
 if __name__ == "__main__":

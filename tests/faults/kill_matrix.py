@@ -1,6 +1,6 @@
 """Faults of every part of the service in every stage, kill -9 also at every boundary.
 
-python -m tests.faults.kill_matrix --out matrix.json
+python -m tests.faults.kill_matrix --json matrix.json
 
 A job of toy stages runs through the real API, database, scheduler and workers, each on a host of its own. It is held at one point, one fault strikes, the
 job is let go on, and what an orchestrator restarts is started again. A cell is good when the job succeeded, every stage was published once and by an attempt
@@ -135,7 +135,7 @@ def all_cells() -> list[tuple[str, str, str]]:
 def main() -> None:
     """Run all cells, print them as they end and write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one; may be repeated")
     parser.add_argument("--stage", action="append", choices=STAGES, help="only in this stage; may be repeated")
     arguments = parser.parse_args()
@@ -145,7 +145,7 @@ def main() -> None:
         for cell in run_cells(system, cells):
             done.append(cell)
             print(f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}", flush=True)
-            arguments.out.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n")
+            arguments.json.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n")
         late = [fault for cell in done for fault in _store_faults(system.data / "jobs" / cell.job, cell.attempts)]
     good = sum(not cell.faults for cell in done)
     print(f"{good} of {len(done)} cells are good; {len(late)} stores changed afterwards.")
