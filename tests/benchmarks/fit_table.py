@@ -152,9 +152,7 @@ def free(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
     """What each stage of teeth 2018, Fig. 9 leaves of the loss before it; each by a fit of its own, in exact media."""
-    chosen: dict[str, dict[str, Any]] = {"homogeneous": {"dentin": "none"}, "dentin": {"dentin": "fit"}}
-    if "stains" in JobSpec.model_fields:
-        chosen["stains"] = {"dentin": "fit", "stains": True}
+    chosen: dict[str, dict[str, Any]] = {"homogeneous": {"dentin": "none"}, "dentin": {"dentin": "fit"}, "stains": {"dentin": "fit", "stains": True}}
     for subject in subjects:
         before: float | None = None
         for stage, options in chosen.items():
