@@ -79,6 +79,8 @@ class Block:
     """Valid and kept from the fit."""
     parts: PixelParts | None = None
     """None where the scene is one tooth."""
+    cell: NDArray[np.int32] | None = None
+    """Number (N,) of the cell that each pixel lies in, within which losses are compared as means; None where pixels stand alone."""
 
     @property
     def fitted_view(self) -> View:
@@ -120,6 +122,7 @@ def write_block(folder: Path, block: Block) -> StoredFile:
         fit_weight=block.fit_weight,
         held_out=block.held_out,
         **parts,
+        **({} if block.cell is None else {"cell": block.cell}),
     )
 
 
@@ -129,7 +132,8 @@ def read_block(stored: StoredFile) -> Block:
     camera = Camera.model_validate_json(a["camera"].tobytes())
     view = View(camera, a["pixels"].astype(np.int32))
     parts = PixelParts(a["shown"].astype(np.int16), a["tooth"].astype(np.int16)) if "shown" in a else None
-    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool), parts)
+    cell = a["cell"].astype(np.int32) if "cell" in a else None
+    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool), parts, cell)
 
 
 def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:

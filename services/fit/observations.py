@@ -20,6 +20,10 @@ from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurface
 
 Array = NDArray[np.float64]
 
+CELL_EDGE = 4
+"""Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and noise is not."""
+LEAST_CELLS = 24
+"""Squares are smaller where a view would have about fewer, so that they still tell the comparison's error."""
 LEAST_BLOCKS = 4
 LEAST_BLOCK_PIXELS = 128
 COARSE_PIXELS = 600
@@ -248,6 +252,9 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
     for whole, f, part in zip(weights, fitted, by_view, strict=True):
         whole[f] = part
 
+    coarse_pixels = COARSE_PIXELS * len(scene.teeth)
+    cells = {v.camera.name: _cells(v, coarse_pixels) for v in views}
+
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         chosen = replace(scene, light_positions_mm=scene.light_positions_mm[lights], light_intensities=scene.light_intensities[lights])
         return write_recipe(folder, chosen)
@@ -257,7 +264,7 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
         held = view.valid[cut] & view.held_out[lights][:, None]
         measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
         parts = None if view.parts is None else view.parts.of(pixels)
-        return write_block(folder, Block(*measured, weight[cut], held, parts))
+        return write_block(folder, Block(*measured, weight[cut], held, parts, cells[view.camera.name][pixels]))
 
     def level(most: int | None) -> Level:
         fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
@@ -275,7 +282,7 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
     return ChannelFiles(
         channel=channel,
         recipe=recipe(used),
-        coarse=level(COARSE_PIXELS * len(scene.teeth)),
+        coarse=level(coarse_pixels),
         full=level(None),
         search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
         evaluation_recipe=recipe(seen),
@@ -290,6 +297,19 @@ def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: 
     while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
         every += 1
     return np.asarray(kept)
+
+
+def _cells(view: ViewStack, most: int) -> NDArray[np.int32]:
+    # Squares of some pixels of the coarse grid, of one part each, at any resolution; (N,).
+    counted = np.asarray(view.fitted.any(axis=0))
+    coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, most)]
+    if not len(coarse):
+        return np.zeros(len(view.pixels), dtype=np.int32)
+    pitch = max(1, int(np.gcd.reduce((coarse - coarse[0]).ravel())))
+    edge = pitch * max(1, min(CELL_EDGE, round(np.sqrt(len(coarse) / LEAST_CELLS))))
+    part = np.zeros(len(view.pixels), dtype=np.int64) if view.parts is None else view.parts.shown.astype(np.int64)
+    place = np.column_stack([view.pixels // edge, part])
+    return np.unique(place, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
 
 
 def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:

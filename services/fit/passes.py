@@ -134,8 +134,8 @@ def gradient_task(host: EngineHost, task: BlockTask, similar: Tissue, how: Diffe
     return Gradient(rows @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
 
 
-def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int]) -> tuple[LossChange, TraceRow]:
-    """Render a block at two points with the same two seeds and compare their losses."""
+def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int], by_cells: bool = True) -> tuple[LossChange, TraceRow]:
+    """Render a block at two points with the same two seeds and compare their losses, of cells' means or pixel by pixel."""
     start, block = time.time(), read_block(task.block)
 
     def residuals(tissue: Tissue | Mouth) -> tuple[Array, Array]:
@@ -144,7 +144,8 @@ def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: 
         )
         return first, second
 
-    return loss_change(*residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1), len(block.reference)), trace_row("compare", task, start)
+    given = *residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1)
+    return loss_change(*given, len(block.reference), block.cell if by_cells else None), trace_row("compare", task, start)
 
 
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:

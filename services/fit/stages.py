@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,8 +21,8 @@ from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
-from services.fit.solve.covariance import Uncertainty, closing_step, uncertainty, whitening
-from services.fit.solve.gauss_newton import Options, Result, Solution, State
+from services.fit.solve.covariance import Uncertainty, closing_model, uncertainty, whitening
+from services.fit.solve.gauss_newton import Judged, Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 
 IMAGE_TOLERANCE = 0.004
@@ -195,7 +196,8 @@ class Stages(ABC, Generic[Optics]):
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where images say it is better.
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where it is better by what it
+        # promises and by images together.
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             return problem, solution, uncertainty(domain, x, equations)
@@ -203,12 +205,17 @@ class Stages(ABC, Generic[Optics]):
 
         def compute() -> dict[str, Any]:
             sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
-            step, (mean, precision) = closing_step(domain, x, equations, sums, self.things), domain.prior
+            model, (mean, precision) = closing_model(domain, x, equations, sums), domain.prior
+            step = model.step(self.things)
             for trial in range(CLOSING_TRIALS):
                 compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
                 change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-                if change <= -compared.se:
+                promised, promised_se = model.promise(step)
+                judged = Judged(change, compared.se, promised, math.hypot(promised_se, SLOPE_ERROR * promised))
+                if judged.is_better(1.0):
                     return {"sums": sums.record(), "step": step.tolist()}
+                if not (judged.is_worse or judged.contradicted):
+                    break
                 step = 0.3 * step
             return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
 

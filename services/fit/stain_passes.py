@@ -120,7 +120,7 @@ class StainStage:
         # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike 1974).
         def compute() -> dict[str, float]:
             seeds = self.passes.seeds("stain.compare", 1), self.passes.seeds("stain.compare", 2)
-            parts = self.passes.run(f"{self.passes.seeds.channel}-stain-compare", plain, self.samples, compare_task, stained, seeds)
+            parts = self.passes.run(f"{self.passes.seeds.channel}-stain-compare", plain, self.samples, compare_task, stained, seeds, False)
             self.passes.record([row for _, row in parts])
             total: LossChange = parts[0][0]
             for change, _ in parts[1:]:

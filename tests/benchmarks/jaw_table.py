@@ -100,7 +100,7 @@ def figures(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int
         ):
             estimate = tooth.parameters[CHANNEL][name]
             found = 1 - estimate.value if name.endswith("alpha_reduced") else estimate.value
-            known = note if estimate.determined else f"{note}, not determined"
+            known = f"{note}, {100 * (found / right - 1):+.1f} %" + ("" if estimate.determined else ", not determined")
             yield JawFigure("jaw", fdi, name, abs(found / right - 1), must, goal, cost.processor_s, known, (estimate.se or 0.0) / found)
         if tooth.shape:
             off_mm = thickness_off_mm(folder, truth, spec, report, int(fdi))

@@ -47,7 +47,7 @@ class Quadratic:
         self.calls.append(("compare", samples))
         noise = self.loss_noise / np.sqrt(samples)
         change = self.loss(x_new) - self.loss(x_old) + noise * np.random.default_rng([self.seed, step, trial, samples, 1]).standard_normal()
-        return LossChange(change, noise**2, self.loss(x_new))
+        return LossChange(change, noise**2)
 
 
 def _domain(count: int) -> Domain:
@@ -168,7 +168,7 @@ def test_samples_double_only_for_noise() -> None:
 def test_uphill_model_stalls_with_advice() -> None:
     class Uphill(Quadratic):
         def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
-            return LossChange(1.0, 0.0, 1.0)
+            return LossChange(1.0, 0.0)
 
     solver = GaussNewton(_domain(2), Options(max_steps=40))
     state = solver.init(np.array([1.0, 2.0]), 64)
@@ -218,7 +218,7 @@ class Overpromising(Quadratic):
     """Standard error of a comparison."""
 
     def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
-        return LossChange(0.4, self.seen**2, 1.0)
+        return LossChange(0.4, self.seen**2)
 
 
 def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> None:
@@ -234,3 +234,17 @@ def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> N
     # Nor does the last step go there, as the comparison is not even on its side.
     assert refused.result is Result.NOISE_LIMITED
     np.testing.assert_array_equal(refused.x, start)
+
+
+def test_the_last_step_goes_where_both_witnesses_together_point() -> None:
+    # The promise is 2 again, uncertain by 0.53 of it. A comparison of 0.4 +- 10 knows nothing and leaves it standing by 1.9 standard errors: too few for a
+    # step on the way, enough for the last. One of 0.4 +- 0.1 knows better.
+    domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
+    solver, start = GaussNewton(domain, Options(max_samples=64, slope_error=0.5)), np.zeros(2)
+    ends = []
+    for seen in (10.0, 0.1):
+        problem = Overpromising(np.diag([816.0, 816.0]), np.array([0.07, 0.0]), seen=seen)
+        ends.append(solver.step(problem, solver.init(start, 64)))
+    assert [end.accepted for end in ends] == [0, 0]
+    np.testing.assert_allclose(ends[0].x, [0.07, 0.0])
+    np.testing.assert_array_equal(ends[1].x, start)

@@ -141,17 +141,43 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
     return Pooled((1 - share) * known + share * sums.gradient, (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise, (1 - share) * carried)
 
 
-def closing_step(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums, things: int = 1) -> Array:
-    """The last Newton step by the measured response: along what is not open, no longer than one scale for each of so many things, inside the bounds."""
+@dataclass(frozen=True)
+class ClosingModel:
+    """What is known about a solution once its response was measured: M, and the gradient (F,) with its noise (F, F), in whitened coordinates."""
+
+    domain: Domain
+    x: Array
+    known: Whitening
+    inverse: Array
+    gradient: Array
+    noise: Array
+
+    def step(self, things: int = 1) -> Array:
+        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things, inside the bounds."""
+        domain, open_directions = self.domain, self.known.open_directions
+        scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
+        scaled = scaled - open_directions @ (open_directions.T @ scaled)
+        low, high = domain.bounds
+        return np.asarray(np.clip(self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - self.x)
+
+    def promise(self, step: Array) -> tuple[float, float]:
+        """Change of F by a step and its standard error by noise; what noise alone would promise is taken off.
+
+        If the images' derivatives are J = J~ M as far as they matter, F changes by g'z + z'z / 2, z = M y.
+        """
+        moved = np.linalg.solve(self.inverse, np.linalg.solve(self.known.transform, step))
+        change = float(self.gradient @ moved + 0.5 * moved @ moved) + 0.5 * float(np.trace(self.noise))
+        return change, float(np.sqrt(max(float(moved @ self.noise @ moved), 0.0)))
+
+
+def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
+    """All that is known at x, where the closing measurement was made."""
     mean, precision = domain.prior
     known = whitening(domain, equations)
     t = known.transform
     solved = response(sums, t.T @ np.diag(precision) @ t, domain.relation)
-    gradient = _pooled(t, equations, sums, solved).gradient + t.T @ (precision * (x - mean))
-    scaled = -t @ solved.inverse @ gradient / domain.scale
-    scaled = scaled - known.open_directions @ (known.open_directions.T @ scaled)
-    low, high = domain.bounds
-    return np.asarray(np.clip(x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - x)
+    pooled = _pooled(t, equations, sums, solved)
+    return ClosingModel(domain, x, known, solved.inverse, pooled.gradient + t.T @ (precision * (x - mean)), _positive(pooled.noise))
 
 
 def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None) -> Uncertainty:

@@ -13,8 +13,8 @@ the optimum the comparison decides, close to it, where losses hardly differ, the
 * otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
 
 A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore settles it on the minimum of all
-that is known, along the directions whose curvature stands out of its noise, unless the comparison contradicts (surely, or at all where derivatives are
-not the images' own); its error is then that of the pooled gradient, and unbiased.
+that is known, along the directions whose curvature stands out of its noise, unless the comparison is surely against it, or, where derivatives are not the
+images' own, unless both witnesses together are not for it by one standard error; its error is then that of the pooled gradient, and unbiased.
 """
 
 from __future__ import annotations
@@ -191,16 +191,15 @@ class GaussNewton:
 
             # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
             model, model_se = noise_gain - promised, math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * length) * promised)
-            total, total_se = _combine(change, compared.se, model, model_se)
-            contradicted = abs(change - model) > options.sure_z * math.hypot(compared.se, model_se)
-            if total + options.sure_z * total_se < 0 and change - options.sure_z * compared.se < 0 and not (contradicted and change > 0):
+            judged = Judged(change, compared.se, model, model_se, options.sure_z)
+            if judged.is_better(options.sure_z):
                 poor = change > 0.25 * model
                 grown = 2 * radius if length > 0.8 * radius and change < 0.5 * model else radius
                 state = replace(
-                    state, x=new, accepted=state.accepted + 1, radius=min(0.5 * length if poor and contradicted else grown, 4.0), verdict="accepted"
+                    state, x=new, accepted=state.accepted + 1, radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0), verdict="accepted"
                 )
                 return self._limited(self._carry(state, step, length))
-            at_fault = change > options.sure_z * compared.se or contradicted
+            at_fault = judged.is_worse or judged.contradicted
             if not at_fault:
                 break
             radius = 0.25 * min(length, radius)
@@ -230,7 +229,10 @@ class GaussNewton:
         compared = problem.compare(x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials)
         mean, precision = self.domain.prior
         change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-        if change > (0.0 if self.options.slope_error else self.options.sure_z * compared.se):
+        options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
+        model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model)
+        judged = Judged(change, compared.se, model + gain_by_noise(equations), model_se, options.sure_z)
+        if not judged.is_better(1.0) if options.slope_error else judged.is_worse:
             return state
         if length > 1:
             # Too far for one linear model: look again from there.
@@ -261,6 +263,32 @@ def gain_by_noise(equations: NormalEquations) -> float:
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
     spread = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise, vectors)
     return 0.5 * float(np.maximum(spread, 0.0) @ (1 / np.maximum(eigenvalues, floor)))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A step as two witnesses see it: the change of F by comparison and by a model, with their standard errors, and from how many of them on one is sure."""
+
+    change: float
+    change_se: float
+    model: float
+    model_se: float
+    sure_z: float = 3.0
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the comparison is surely against it."""
+        return self.change > self.sure_z * self.change_se
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the witnesses surely speak of different things."""
+        return abs(self.change - self.model) > self.sure_z * math.hypot(self.change_se, self.model_se)
+
+    def is_better(self, z: float) -> bool:
+        """Whether both together are for it by z standard errors; a comparison that is surely against it, or contradicts, has the last word."""
+        total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
+        return total + z * total_se < 0 and not self.is_worse and not (self.contradicted and self.change > 0)
 
 
 def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:

@@ -141,8 +141,6 @@ class LossChange:
 
     change: float
     variance: float
-    loss: float
-    """F at the new point, the reference's own noise included."""
 
     @property
     def se(self) -> float:
@@ -150,15 +148,30 @@ class LossChange:
         return float(np.sqrt(self.variance))
 
     def __add__(self, other: LossChange) -> LossChange:
-        return LossChange(self.change + other.change, self.variance + other.variance, self.loss + other.loss)
+        return LossChange(self.change + other.change, self.variance + other.variance)
 
 
-def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array, lights: int) -> LossChange:
+def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array, lights: int, cell: NDArray[np.int32] | None = None) -> LossChange:
     """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
 
     The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows from the same identity as above,
     applied to the bilinear form n1 n2 - o1 o2, and is summed by pixels, whose lights share their walks.
+
+    Few paths make the product of both seeds' noise its largest part. Sums over cells instead of pixels, of the cells' mean residuals, keep what changes
+    slowly from pixel to pixel, as what parameters do, and have a share of that noise that falls with the root of a cell's pixels.
+
+    Args:
+        cell: number (N,) of each pixel's cell; None where pixels stand alone.
     """
+    if cell is not None:
+        total = _by_cell(weight, cell, lights)
+        old1, old2, new1, new2 = (_by_cell(weight * r, cell, lights) / np.where(total > 0, total, 1.0) for r in (old1, old2, new1, new2))
+        weight = total
     terms = weight * (new1 * new2 - old1 * old2)
     deviations = per_pixel(weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))[None], lights)[0]
-    return LossChange(0.5 * float(terms.sum()), 0.25 * float(deviations @ deviations), 0.5 * float((weight * new1) @ new2))
+    return LossChange(0.5 * float(terms.sum()), 0.25 * float(deviations @ deviations))
+
+
+def _by_cell(terms: Array, cell: NDArray[np.int32], lights: int) -> Array:
+    # Sums (lights x cells,) of terms (lights x pixels,), cell by cell under each light.
+    return np.concatenate([np.bincount(cell, row) for row in terms.reshape(lights, -1)])
