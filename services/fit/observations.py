@@ -253,7 +253,7 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
         whole[f] = part
 
     coarse_pixels = COARSE_PIXELS * len(scene.teeth)
-    cells = {v.camera.name: _cells(v, coarse_pixels) for v in views}
+    cells = {v.camera.name: comparison_cells(v, coarse_pixels) for v in views}
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         chosen = replace(scene, light_positions_mm=scene.light_positions_mm[lights], light_intensities=scene.light_intensities[lights])
@@ -299,8 +299,8 @@ def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: 
     return np.asarray(kept)
 
 
-def _cells(view: ViewStack, most: int) -> NDArray[np.int32]:
-    # Squares of some pixels of the coarse grid, of one part each, at any resolution; (N,).
+def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
+    """Number (N,) of each pixel's cell: squares of some pixels of the coarse grid, which has no more than ``most`` fitted ones, each of one part alone."""
     counted = np.asarray(view.fitted.any(axis=0))
     coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, most)]
     if not len(coarse):

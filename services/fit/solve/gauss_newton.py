@@ -190,11 +190,11 @@ class GaussNewton:
                 raise NonFiniteError(f"The loss is not finite at step {state.step}; check the capture for invalid radiance.")
 
             # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
-            model, model_se = noise_gain - promised, math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * length) * promised)
-            judged = Judged(change, compared.se, model, model_se, options.sure_z)
+            model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * length) * promised)
+            judged = Judged(change, compared.se, noise_gain - promised, model_se, options.sure_z)
             if judged.is_better(options.sure_z):
-                poor = change > 0.25 * model
-                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * model else radius
+                poor = change > 0.25 * judged.model
+                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * judged.model else radius
                 state = replace(
                     state, x=new, accepted=state.accepted + 1, radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0), verdict="accepted"
                 )
@@ -232,7 +232,8 @@ class GaussNewton:
         options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
         model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model)
         judged = Judged(change, compared.se, model + gain_by_noise(equations), model_se, options.sure_z)
-        if not judged.is_better(1.0) if options.slope_error else judged.is_worse:
+        refused = not judged.is_better(1.0) if options.slope_error else judged.is_worse
+        if refused:
             return state
         if length > 1:
             # Too far for one linear model: look again from there.
