@@ -22,7 +22,7 @@ from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
 from services.fit.solve.covariance import Uncertainty, closing_model, uncertainty, whitening
-from services.fit.solve.gauss_newton import Judged, Options, Result, Solution, State
+from services.fit.solve.gauss_newton import LAST_STEP_Z, Judged, Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 
 IMAGE_TOLERANCE = 0.004
@@ -212,7 +212,7 @@ class Stages(ABC, Generic[Optics]):
                 change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
                 promised, promised_se = model.promise(step)
                 judged = Judged(change, compared.se, promised, math.hypot(promised_se, SLOPE_ERROR * promised))
-                if judged.is_better(1.0):
+                if judged.is_better(LAST_STEP_Z):
                     return {"sums": sums.record(), "step": step.tolist()}
                 if not (judged.is_worse or judged.contradicted):
                     break

@@ -61,6 +61,8 @@ ADVICE = {
 
 DETERMINED = 3.0
 """A direction counts as determined when its curvature exceeds so many of its own standard deviations."""
+LAST_STEP_Z = 1.0
+"""Standard errors by which both witnesses have to be for a fit's last step: nothing comes after it that a wrong one could mislead."""
 
 
 class Problem(Protocol):
@@ -232,7 +234,7 @@ class GaussNewton:
         options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
         model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model)
         judged = Judged(change, compared.se, model + gain_by_noise(equations), model_se, options.sure_z)
-        refused = not judged.is_better(1.0) if options.slope_error else judged.is_worse
+        refused = not judged.is_better(LAST_STEP_Z) if options.slope_error else judged.is_worse
         if refused:
             return state
         if length > 1:
