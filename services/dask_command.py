@@ -10,6 +10,8 @@ from typing import Literal, NoReturn
 
 import typer
 
+from services.core.dask_config import as_environment
+
 _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
@@ -33,4 +35,4 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
     certificates = Certificates.of(folder) if folder is not None else None
     secured = [scheduler_address(argument, certificates) for argument in arguments]
     command = [sys.executable, "-m", "dask", part, *secured, *(certificates.arguments() if certificates else ())]
-    os.execv(sys.executable, command)  # noqa: S606
+    os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

@@ -62,7 +62,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
 
     jobs = Jobs(settings, run_in_turn)
     dome = Dome(settings.dome, jobs)
-    readers, openers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1)
+    readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
     feed = EventFeed(jobs.repository, readers.ask)
     observation = Observation(jobs, settings, readers, openers, certificates)
 
@@ -78,12 +78,12 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
-            for close in (dome.close, readers.close, openers.close, auditors.close, jobs.close, workers.close):
+            for close in (dome.close, readers.close, openers.close, lookers.close, auditors.close, jobs.close, workers.close):
                 await closing.ask(close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     problems.install(app)
-    app.include_router(build_router(jobs, feed, readers, openers))
+    app.include_router(build_router(jobs, feed, readers, openers, lookers))
     app.include_router(build_captures_router(jobs.captures))
     app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
     app.include_router(build_masks_router(jobs, Masks(jobs)))

@@ -18,7 +18,7 @@ from services.core.errors import JobStateError, UnknownMaskError
 from services.core.geometry import Camera, Record
 from services.core.masks import ALL_LIGHTS, LONGEST_NAME, is_stale, mask_path, read_masks
 from services.core.records import FolderCapture, PreparedManifest
-from services.core.store import is_published, open_stage, reading, write_atomic
+from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
 _AT_WORK = frozenset({JobState.RUNNING, JobState.CANCELLING, JobState.DELETING})
 
@@ -100,8 +100,8 @@ class Masks:
         if camera not in cameras or light not in lights:
             raise UnknownMaskError(f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and {', '.join(lights)}.")
         width, height = manifest.cameras[cameras.index(camera)].size
-        with reading(folder / "prepared.zarr" / "valid") as valid:
-            return picture_of(np.asarray(valid[cameras.index(camera), lights.index(light), :height, :width], dtype=np.uint8))
+        valid = StoredArray(folder / "prepared.zarr" / "valid")
+        return picture_of(valid[cameras.index(camera), lights.index(light), :height, :width].astype(np.uint8))
 
     def _camera(self, job: Job, camera: str, light: str) -> Camera:
         description = self._description(job)

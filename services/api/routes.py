@@ -46,11 +46,10 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks) -> APIRouter:
-    """Routes over the given jobs; ``openers`` read their files."""
+def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, lookers: Clerks) -> APIRouter:
+    """Routes over the given jobs; ``openers`` read their files, ``lookers`` their captures, which may hang."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
-    lookers = Clerks(1)
 
     @in_json
     def tell(job: Job, remaining: TimeRange | None) -> JobDetail:

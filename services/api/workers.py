@@ -8,12 +8,12 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import cache
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from services.api.collector import leave_alone_what_is_loaded
 from services.api.dask_tls import Certificates, scheduler_address
+from services.core.dask_config import DASK_CONFIG
 from services.core.errors import SchedulerLostError
 
 if TYPE_CHECKING:
@@ -21,19 +21,7 @@ if TYPE_CHECKING:
 
     from distributed import Client
 
-WORKER_CONFIG: Mapping[str, Any] = MappingProxyType(
-    {
-        "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],  # Ctrl-C is the parent's to handle
-        # What Dask samples and remembers for its developers, in this process too: the stack a hundred times a second, the loop's delay fifty times, a thousand
-        # messages and transitions with their tasks at each end of each connection.
-        "distributed.worker.profile.enabled": False,
-        "distributed.admin.tick.interval": "500ms",
-        "distributed.admin.low-level-log-length": 50,
-        "distributed.admin.log-length": 500,
-        "distributed.admin.system-monitor.interval": "10s",
-        "distributed.admin.system-monitor.log-length": 120,
-    }
-)
+SIGINT_IS_THE_PARENTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 CONNECT_S = 10.0
 PROBE_S = 1.0
 LOOK_S = 3.0
@@ -118,7 +106,8 @@ class Workers:
         from distributed import Client, LocalCluster
 
         _leave_dask_alone()
-        dask.config.set(WORKER_CONFIG)  # for good, as connections that are made later read it too
+        # For good, and in this process too, as connections that are made later read it.
+        dask.config.set({**DASK_CONFIG, "distributed.worker.preload": [SIGINT_IS_THE_PARENTS]})
         if self._scheduler is not None:
             try:
                 security = self._certificates.security() if self._certificates else None

@@ -27,7 +27,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import zarr
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -211,14 +213,28 @@ def create_array(
     )
 
 
-@contextmanager
-def reading(path: Path) -> Iterator[zarr.Array[Any]]:
-    """Open an array for reading; a damaged chunk becomes a CorruptStoreError that names the array."""
-    try:
-        array = zarr.open_array(path, mode="r")
-        yield array
-    except (FileNotFoundError, ValueError, RuntimeError) as problem:
-        raise CorruptStoreError(f"{path} cannot be read ({problem}); restore it or run its stage again.") from problem
+class StoredArray:
+    """An array on disk, read by indexing.
+
+    Raises:
+        CorruptStoreError: there is none, or a chunk of what is asked for is damaged; names the array.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with self._telling_damage():
+            self._array = zarr.open_array(path, mode="r")
+
+    def __getitem__(self, selection: Any) -> NDArray[Any]:
+        with self._telling_damage():
+            return np.asarray(self._array[selection])
+
+    @contextmanager
+    def _telling_damage(self) -> Iterator[None]:
+        try:
+            yield
+        except (FileNotFoundError, ValueError, RuntimeError) as problem:
+            raise CorruptStoreError(f"{self._path} cannot be read ({problem}); restore it or run its stage again.") from problem
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import MaskBit
-from services.core.store import reading
+from services.core.store import StoredArray
 from services.fit.evaluate import Evaluation
 from services.fit.observations import Observations, ViewStack
 
@@ -86,21 +86,21 @@ def _compared(
     names = [camera.name for camera in observations.manifest.cameras]
     centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
     pairs = []
-    with reading(store / "radiance") as radiance, reading(store / "variance") as variance, reading(store / "valid") as bits:
-        for view in views:
-            (width, height), number, images = view.camera.size, names.index(view.camera.name), []
-            for (camera, shown), (pixels, values) in evaluation.renders.items():
-                if camera != view.camera.name:
-                    continue
-                light = int(seen[shown])
-                # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels that tell.
-                usable = np.asarray(bits[number, light])[:height, :width] & ~np.uint16(MaskBit.OUTSIDE) == 0
-                photo = np.where(usable, np.asarray(radiance[number, light])[:height, :width, index].astype(np.float64), np.nan)
-                noise = np.nan_to_num(np.asarray(variance[number, light])[:height, :width, index].astype(np.float64))
-                render = np.full((height, width), np.nan)
-                render[pixels[:, 1], pixels[:, 0]] = values
-                images.append(_Compared(photo, noise, render, view.camera.pixel_mm(centre_mm)))
-            pairs.append((view, images))
+    radiance, variance, bits = (StoredArray(store / name) for name in ("radiance", "variance", "valid"))
+    for view in views:
+        (width, height), number, images = view.camera.size, names.index(view.camera.name), []
+        for (camera, shown), (pixels, values) in evaluation.renders.items():
+            if camera != view.camera.name:
+                continue
+            light = int(seen[shown])
+            # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels that tell.
+            usable = bits[number, light][:height, :width] & ~np.uint16(MaskBit.OUTSIDE) == 0
+            photo = np.where(usable, radiance[number, light][:height, :width, index].astype(np.float64), np.nan)
+            noise = np.nan_to_num(variance[number, light][:height, :width, index].astype(np.float64))
+            render = np.full((height, width), np.nan)
+            render[pixels[:, 1], pixels[:, 0]] = values
+            images.append(_Compared(photo, noise, render, view.camera.pixel_mm(centre_mm)))
+        pairs.append((view, images))
     return pairs
 
 

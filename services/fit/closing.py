@@ -14,7 +14,7 @@ from services.fit.derivatives import Differentiation
 from services.fit.engine_host import EngineHost
 from services.fit.optics.domain import similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
-from services.fit.passes import JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
@@ -41,11 +41,10 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
     ends = tuple((_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd)) for parts, (mean, sd) in held.items())
     pending = []
     for task in problem.passes.tasks(label, tissue, samples):
-        jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, first)
-        arguments = (whiten, slopes, borrowed, second, images, ends)
-        pending.append(run.submit(f"{label}-{task.index}", closing_task, task, jacobian, *arguments))
-    parts: list[tuple[ClosingSums, tuple[TraceRow, ...]]] = run.gather(pending)
-    problem.passes.record([row for _, trace in parts for row in trace])
+        arguments = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
+        pending.append(run.submit(f"{label}-{task.index}", closing_task, task, *arguments))
+    parts: list[tuple[ClosingSums, TraceRow]] = run.gather(pending)
+    problem.passes.record([row for _, row in parts])
     total = parts[0][0]
     for sums, _ in parts[1:]:
         total = total + sums
@@ -55,15 +54,17 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
 def closing_task(
     host: EngineHost,
     task: BlockTask,
-    jacobian: JacobianBlock,
+    similar: Tissue | Mouth,
+    how: Differentiation,
+    similar_seeds: tuple[int, int],
     whiten: Array,
     slopes: Differentiation,
     borrowed: NDArray[np.bool_],
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
-) -> tuple[ClosingSums, tuple[TraceRow, ...]]:
-    """One block's share. Rows of ``slopes`` that are ``borrowed`` are those of the Jacobian instead."""
+) -> tuple[ClosingSums, TraceRow]:
+    """One block's share. Rows of ``slopes`` that are ``borrowed`` are those of the similar media's Jacobian instead."""
     start, block = time.time(), read_block(task.block)
     view = block.fitted_view
 
@@ -73,11 +74,11 @@ def closing_task(
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
     few = max(task.samples // SHIFT_SAMPLES, 1)
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
-    similar = jacobian.derivatives(host)
-    exact = similar if borrowed.all() else slopes.render(host, task, view, seeds, block.parts)
+    believed = how.render(host, replace(task, tissue=similar), view, similar_seeds, block.parts)
+    exact = believed if borrowed.all() else slopes.render(host, task, view, seeds, block.parts)
     sums = closing_sums(
         whiten,
-        similar,
+        (believed[0], believed[1]),
         (exact[0], exact[1]),
         borrowed,
         (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
@@ -85,7 +86,7 @@ def closing_task(
         block.fit_weight.reshape(-1),
         len(block.reference),
     )
-    return sums, (jacobian.trace, trace_row("closing", task, start))
+    return sums, trace_row("closing", task, start)
 
 
 def _with_cosine(tissue: Optics, parts: tuple[str, ...], dual: float) -> Optics:

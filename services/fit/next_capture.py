@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera
 from services.core.records import Estimate
 from services.fit.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.derivatives import Differentiation
 from services.fit.engine_host import EngineHost
 from services.fit.identifiability import QUANTITIES, in_words
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import JacobianBlock, StackProblem, TraceRow, jacobian_task, trace_row
+from services.fit.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_with
 from services.fit.transport.recipe import SceneRecipe, View
@@ -94,8 +95,7 @@ def advice(
     run, label, pending = problem.passes.executor, f"{problem.passes.seeds.channel}-advice", []
     for index, probe in enumerate(probes):
         task = BlockTask(probe.block, index, recipe, label, similar, samples)
-        jacobian = run.submit(f"{label}-jacobian-{index}", jacobian_task, task, how, seeds)
-        pending.append(run.submit(f"{label}-{index}", advice_task, task, jacobian, known.sandwich, images, probe, sensor, weight))
+        pending.append(run.submit(f"{label}-{index}", advice_task, task, how, seeds, known.sandwich, images, probe, sensor, weight))
     parts_found: list[tuple[dict[str, tuple[Addition, Addition]], TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts_found])
     sums: dict[str, tuple[Addition, Addition]] = {}
@@ -198,13 +198,21 @@ def seen_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.in
 
 
 def advice_task(
-    host: EngineHost, task: BlockTask, jacobian: JacobianBlock, known: Sandwich, seeds: tuple[int, int], probe: Probe, sensor: Sensor, weight: float
+    host: EngineHost,
+    task: BlockTask,
+    how: Differentiation,
+    seeds: tuple[int, int],
+    known: Sandwich,
+    image_seeds: tuple[int, int],
+    probe: Probe,
+    sensor: Sensor,
+    weight: float,
 ) -> tuple[dict[str, tuple[Addition, Addition]], TraceRow]:
     """What one view adds by candidate, from its even and its odd pixels."""
-    start, view = time.time(), read_block(task.block).fitted_view
-    half = max(task.samples // 2, 1)
-    images = [np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64) for seed in seeds]
-    slopes = [flat.reshape(len(flat), *images[0].shape) for flat in jacobian.derivatives(host)]
+    start, block = time.time(), read_block(task.block)
+    view, half = block.fitted_view, max(task.samples // 2, 1)
+    images = [np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64) for seed in image_seeds]
+    slopes = [flat.reshape(len(flat), *images[0].shape) for flat in how.render(host, task, view, seeds, block.parts)]
     variance = sensor.variance(0.5 * (images[0] + images[1]))
     out = {}
     for words in dict.fromkeys(word for word in probe.words if word):

@@ -13,7 +13,7 @@ from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.meshfiles import read_mesh, read_teeth
 from services.core.records import JobSpec, Loss, PreparedManifest
-from services.core.store import open_stage, reading
+from services.core.store import StoredArray, open_stage
 from services.fit.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
 from services.fit.solve.losses import first_weights
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
@@ -180,25 +180,24 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
     manifest, index = observations.manifest, observations.manifest.channels.index(channel)
     store = observations.folder / "prepared.zarr"
     views = []
-    with reading(store / "radiance") as radiance, reading(store / "variance") as variance, reading(store / "valid") as bits:
-        for c, camera in enumerate(manifest.cameras):
-            width, height = camera.size
-            valid = np.asarray(bits[c])[:, :height, :width] == 0
-            valid[:, np.arange(height) % spec.pixel_step != 0] = False
-            valid[:, :, np.arange(width) % spec.pixel_step != 0] = False
-            y, x = np.nonzero(valid.any(axis=0))
-            if len(x) == 0:
-                continue
-            reference, spread = (
-                np.stack([np.asarray(stack[c, light])[y, x, index] for light in range(len(manifest.lights))]).astype(np.float64)
-                for stack in (radiance, variance)
-            )
-            chosen = valid[:, y, x] & np.isfinite(reference)
-            reference = np.where(chosen, reference, 0.0)
-            assumed = (spec.sensor_noise_relative * reference) ** 2 + (spec.sensor_noise_floor * reference.max(initial=0.0)) ** 2
-            known = np.isfinite(spread) & (spread > 0)
-            pixels = np.stack([x, y], axis=-1).astype(np.int32)
-            views.append(ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c]))
+    radiance, variance, bits = (StoredArray(store / name) for name in ("radiance", "variance", "valid"))
+    for c, camera in enumerate(manifest.cameras):
+        width, height = camera.size
+        valid = bits[c][:, :height, :width] == 0
+        valid[:, np.arange(height) % spec.pixel_step != 0] = False
+        valid[:, :, np.arange(width) % spec.pixel_step != 0] = False
+        y, x = np.nonzero(valid.any(axis=0))
+        if len(x) == 0:
+            continue
+        reference, spread = (
+            np.stack([stack[c, light][y, x, index] for light in range(len(manifest.lights))]).astype(np.float64) for stack in (radiance, variance)
+        )
+        chosen = valid[:, y, x] & np.isfinite(reference)
+        reference = np.where(chosen, reference, 0.0)
+        assumed = (spec.sensor_noise_relative * reference) ** 2 + (spec.sensor_noise_floor * reference.max(initial=0.0)) ** 2
+        known = np.isfinite(spread) & (spread > 0)
+        pixels = np.stack([x, y], axis=-1).astype(np.int32)
+        views.append(ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c]))
     if not views:
         raise CaptureInputError("No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres.")
     require_signal(views, f"Channel {channel}")

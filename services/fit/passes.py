@@ -1,14 +1,11 @@
-"""One step's tasks: image and Jacobian passes over blocks of pixels, side by side on any worker.
+"""One step's tasks over blocks of pixels: images of some beside Jacobians of others, on any worker.
 
 ::
 
-    image(block)     ──── residual, at most 4 MB ───┐
-                                                    ├── products(block) ── ordered sum ── solve
-    jacobian(block)  ──── JacobianBlock, stays ─────┘
+    image(block) ── residual, at most 4 MB ── jacobian(block) ── products ── ordered sum ── solve
 
-The Jacobian task renders its two seeds in one process. Its result keeps the arrays where they were made: pickled, it is only the recipe for making them
-again. The scheduler is told its true size and so sends the small residual to it; should it move all the same, or its worker die, the block is computed
-again from the same seeds, with the same result. What leaves a worker are sums over the block.
+The Jacobian task renders its two seeds in one process and multiplies them there, by each other and by the residual. So Jacobians never leave their task,
+and what leaves a worker are residuals and sums over the block. A task whose worker dies runs again elsewhere from the same seeds, with the same result.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Generic
 
 import numpy as np
@@ -62,29 +59,6 @@ class Residual:
     trace: TraceRow
 
 
-@dataclass
-class JacobianBlock:
-    """Two estimates of a block's derivatives to the fit's coordinates, (F, L N) each. Pickles without them."""
-
-    task: BlockTask
-    how: Differentiation
-    seeds: tuple[int, int]
-    trace: TraceRow
-    arrays: tuple[Array, Array] | None = field(default=None, repr=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"arrays": None}
-
-    def __sizeof__(self) -> int:
-        return 1000 + sum(a.nbytes for a in self.arrays or ())
-
-    def derivatives(self, host: EngineHost) -> tuple[Array, Array]:
-        """The two estimates, rendered again where they are not at hand."""
-        if self.arrays is None:
-            self.arrays = _render_jacobians(host, self.task, self.how, self.seeds)
-        return self.arrays
-
-
 @dataclass(frozen=True)
 class Products:
     """A block's share of the normal equations and the trace of the tasks that made it."""
@@ -101,21 +75,15 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     return Residual(stacks[0].mean - block.reference, stacks[1].mean - block.reference, trace_row("image", task, start))
 
 
-def jacobian_task(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int]) -> JacobianBlock:
-    """Render a block's derivatives with two seeds."""
-    start = time.time()
-    arrays = _render_jacobians(host, task, how, seeds)
-    return JacobianBlock(task, how, seeds, trace_row("jacobian", task, start), arrays)
-
-
-def products_task(host: EngineHost, jacobian: JacobianBlock, residual: Residual, near: Near | None) -> Products:
-    """Multiply where the Jacobian lies."""
-    start, block = time.time(), read_block(jacobian.task.block)
-    j1, j2 = jacobian.derivatives(host)
+def jacobian_task(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int], residual: Residual, near: Near | None) -> Products:
+    """Render a block's derivatives with two seeds and multiply them by each other and by the residual."""
+    start, block = time.time(), read_block(task.block)
+    j1, j2 = how.render(host, task, block.fitted_view, seeds, block.parts)
+    rendered, start = trace_row("jacobian", task, start), time.time()
     r1, r2, variance, weight = (a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight))
     regions = None if near is None else _regions(block, near)
     equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions)
-    return Products(equations, (residual.trace, jacobian.trace, trace_row("products", jacobian.task, start)))
+    return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 
 def _regions(block: Block, near: Near) -> list[Region]:
@@ -195,16 +163,15 @@ class StackProblem(Generic[Optics]):
     """Of a jaw's teeth: coordinates between which the curvature's noise is known, and which of them are told apart when moved at once."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
-        """See Problem: image ∥ Jacobian tasks, then products, summed in block order."""
+        """See Problem: an image and a Jacobian task per block, summed in block order."""
         run, label = self.passes.executor, f"{self._prefix}-{step}"
         tissue, similar, how = self.jacobian_media(x)
         seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
         near = None if self.neighbours is None else self.neighbours.near(self.domain)
         pending = []
         for task in self.passes.tasks(label, tissue, samples):
-            jacobian = run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, seeds)
             image = run.submit(f"{label}-image-{task.index}", image_task, task, (self.seed(step, "image-1"), self.seed(step, "image-2")))
-            pending.append(run.submit(f"{label}-products-{task.index}", products_task, jacobian, image, near))
+            pending.append(run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, seeds, image, near))
         products: list[Products] = run.gather(pending)
         self.passes.record([row for p in products for row in p.trace])
         total = products[0].equations
@@ -256,12 +223,6 @@ class StackProblem(Generic[Optics]):
     def seed(self, step: int, *purpose: str | int) -> int:
         """Seed of a pass of this stage."""
         return self.passes.seeds(self.stage, step, *purpose)
-
-
-def _render_jacobians(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int]) -> tuple[Array, Array]:
-    block = read_block(task.block)
-    first, second = how.render(host, task, block.fitted_view, seeds, block.parts)
-    return first, second
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:

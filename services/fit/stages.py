@@ -196,8 +196,8 @@ class Stages(ABC, Generic[Optics]):
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where it is better by what it
-        # promises and by images together.
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where it promises more than
+        # noise does, and is better by that promise and by images together.
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             return problem, solution, uncertainty(domain, x, equations)
@@ -208,9 +208,11 @@ class Stages(ABC, Generic[Optics]):
             model, (mean, precision) = closing_model(domain, x, equations, sums), domain.prior
             step = model.step(self.things)
             for trial in range(CLOSING_TRIALS):
+                promised, promised_se = model.promise(step)
+                if promised >= 0:
+                    break
                 compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
                 change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-                promised, promised_se = model.promise(step)
                 judged = Judged(change, compared.se, promised, math.hypot(promised_se, SLOPE_ERROR * promised))
                 if judged.is_better(LAST_STEP_Z):
                     return {"sums": sums.record(), "step": step.tolist()}

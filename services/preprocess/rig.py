@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
-from services.core.store import reading
+from services.core.store import StoredArray
 from services.preprocess.motion import ViewMotion, jaws
 from services.preprocess.projection import Footprint
 from services.preprocess.radiometry import Merge, Radiometry
@@ -67,25 +67,25 @@ class RigSource:
     def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``: one frame at a time, its radiance and its variance."""
         width, height = self.description.cameras[camera].size
-        with reading(self.root / "capture.zarr") as array:
+        array = StoredArray(self.root / "capture.zarr")
 
-            def counts(frame: FrameRecord) -> NDArray[np.uint16]:
-                return np.asarray(array[camera, frame.index, :height, :width])
+        def counts(frame: FrameRecord) -> NDArray[np.uint16]:
+            return array[camera, frame.index, :height, :width]
 
-            black = np.zeros((height, width, len(self.description.channels)), dtype=np.float32)
-            for frame in self._black:
-                black += counts(frame) / np.float32(len(self._black))
-            radiometry = Radiometry(black, len(self._black), self._manifest)
-            # Without the black image, whose noise would be the same in every frame and speak for no motion at all
-            level = np.float32(np.median(black))
+        black = np.zeros((height, width, len(self.description.channels)), dtype=np.float32)
+        for frame in self._black:
+            black += counts(frame) / np.float32(len(self._black))
+        radiometry = Radiometry(black, len(self._black), self._manifest)
+        # Without the black image, whose noise would be the same in every frame and speak for no motion at all
+        level = np.float32(np.median(black))
 
-            def brightness(frame: FrameRecord) -> Image:
-                return np.asarray(counts(frame).mean(axis=-1, dtype=np.float32) - level, dtype=np.float32)
+        def brightness(frame: FrameRecord) -> Image:
+            return np.asarray(counts(frame).mean(axis=-1, dtype=np.float32) - level, dtype=np.float32)
 
-            view = self.description.cameras[camera].name
-            motion = ViewMotion(footprint, jaws(sorted(self._manifest.fdi)), self._manifest.frames, brightness, view)
-            for light, frames in enumerate(self._frames):
-                yield light, _image(frames, radiometry, motion, counts)
+        view = self.description.cameras[camera].name
+        motion = ViewMotion(footprint, jaws(sorted(self._manifest.fdi)), self._manifest.frames, brightness, view)
+        for light, frames in enumerate(self._frames):
+            yield light, _image(frames, radiometry, motion, counts)
 
 
 def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion, counts: Counts) -> LightImage:

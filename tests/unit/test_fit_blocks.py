@@ -83,8 +83,8 @@ def task(tmp_path: Path) -> BlockTask:
 
 def test_every_task_of_the_fit_asks_for_fitted_lights_alone(task: BlockTask) -> None:
     host = Recorder()
-    image_task(host, task, (1, 2))
-    jacobian_task(host, task, Differentiation(("enamel.sigma",), np.ones((1, 1))), (1, 2))
+    residual = image_task(host, task, (1, 2))
+    jacobian_task(host, task, Differentiation(("enamel.sigma",), np.ones((1, 1))), (1, 2), residual, None)
     compare_task(host, task, task.tissue, (1, 2))
     orders_task(host, task, np.array([0, 2, 9]), 1)
     assert host.asked == [(1, 2)] * 9

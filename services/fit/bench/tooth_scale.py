@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from services.core.dask_config import DASK_CONFIG
 from services.core.errors import InputError
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
@@ -77,7 +78,7 @@ def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
     idle = (os.cpu_count() or 1) - os.getloadavg()[0]
     with (
         tempfile.TemporaryDirectory() as name,
-        dask.config.set({"distributed.worker.daemon": False}),
+        dask.config.set({**DASK_CONFIG, "distributed.worker.daemon": False}),
         LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
         Client(cluster) as client,
     ):

@@ -1,0 +1,25 @@
+"""How Dask is told to behave wherever stages run on workers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
+    {
+        # What Dask samples and remembers for its developers: the stack a hundred times a second, the loop's delay fifty times, a thousand messages and
+        # transitions with their tasks at each end of each connection.
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.tick.interval": "500ms",
+        "distributed.admin.low-level-log-length": 50,
+        "distributed.admin.log-length": 500,
+        "distributed.admin.system-monitor.interval": "10s",
+        "distributed.admin.system-monitor.log-length": 120,
+    }
+)
+
+
+def as_environment() -> dict[str, str]:
+    """The same as environment variables, for processes that are Dask's own commands."""
+    return {f"DASK_{name.replace('.', '__').replace('-', '_').upper()}": str(value) for name, value in DASK_CONFIG.items()}

@@ -1,0 +1,41 @@
+"""An array that is read tells damage of its own, and leaves errors of its readers theirs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.core.errors import CorruptStoreError
+from services.core.store import StoredArray, create_array
+
+SHAPE = (2, 8)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    array = create_array(tmp_path, "numbers.zarr", SHAPE, (1, 8), "uint16", ("row", "column"))
+    array[:] = np.arange(16, dtype=np.uint16).reshape(SHAPE)
+    return tmp_path / "numbers.zarr"
+
+
+def test_what_was_written_is_read(path: Path) -> None:
+    np.testing.assert_array_equal(StoredArray(path)[1], np.arange(8, 16))
+
+
+def test_a_missing_array_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CorruptStoreError, match=r"nothing\.zarr cannot be read"):
+        StoredArray(tmp_path / "nothing.zarr")
+
+
+def test_a_damaged_shard_is_told_when_it_is_read_and_the_rest_stays_readable(path: Path) -> None:
+    shard = path / "c" / "1" / "0"
+    shard.write_bytes(shard.read_bytes()[:-3])
+    array = StoredArray(path)
+    np.testing.assert_array_equal(array[0], np.arange(8))
+    with pytest.raises(CorruptStoreError, match=r"numbers\.zarr cannot be read"):
+        array[1]
+
+
+def test_an_index_beyond_the_end_is_not_called_damage(path: Path) -> None:
+    with pytest.raises(IndexError):
+        StoredArray(path)[7]
