@@ -120,15 +120,17 @@ class ChannelSchedule(Stages[Tissue]):
         domain = self._domain(("sigma", "alpha"))
         tissue, reached = self._neighbourhood(domain, options) if domain.coordinates else (self._given(), 2 * samples)
         domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
+        before: Solution | None = None
         if self.modes:
             problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
-            tissue, _ = self._iterate(problem, options, reached)
+            tissue, before = self._iterate(problem, options, reached)
 
         options = self.at_full_resolution()
         exact_samples = max(self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))), LEAST_EXACT_SAMPLES)
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
-        tissue, solution = self._iterate(problem, options, exact_samples)
+        is_same = self.files.full.blocks == self.files.coarse.blocks and not is_reweighted(spec.loss)
+        tissue, solution = self._iterate(problem, options, exact_samples, before if is_same else None)
         for again in range(1, REWEIGHTINGS + 1) if is_reweighted(spec.loss) else ():
             self._reweight(f"exact.{again}", tissue)
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
@@ -168,8 +170,8 @@ class ChannelSchedule(Stages[Tissue]):
         # The exact media and their own derivatives, at constant samples.
         self._reweight(stage, tissue)
         problem = StackProblem(self.passes, domain, tissue, stage)
-        options = adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps)
-        return problem, *self._run(adam.Adam(domain, options), adam, problem, samples, ADAM_BURST)
+        solver = adam.Adam(domain, adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps))
+        return problem, *self._run(solver, adam, problem, solver.init(domain.x_of(tissue), samples), ADAM_BURST)
 
     def _reweight(self, stage: str, tissue: Tissue) -> None:
         # New weights where the loss follows residuals; all later stages have them.

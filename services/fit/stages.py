@@ -155,20 +155,19 @@ class Stages(ABC, Generic[Optics]):
         """Paths per pixel of full images, for as many in all as ``samples`` are per pixel of coarse ones."""
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
 
-    def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int) -> tuple[Optics, Solution]:
+    def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int, before: Solution | None = None) -> tuple[Optics, Solution]:
         if problem.jacobian_g != problem.image_g:
             options = replace(options, slope_error=SLOPE_ERROR)
         solver = gauss_newton.GaussNewton(problem.domain, options)
-        return self._run(solver, gauss_newton, problem, min(samples, options.max_samples))
+        return self._run(solver, gauss_newton, problem, solver.init(problem.domain.x_of(problem.base), min(samples, options.max_samples), before))
 
-    def _run(self, solver: Any, kind: Any, problem: StackProblem[Optics], samples: int, burst: int = 1) -> tuple[Optics, Solution]:
-        # A solver's loop; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
+    def _run(self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1) -> tuple[Optics, Solution]:
+        # A solver's loop from its first state; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
         def advance(state: Any) -> Any:
             for _ in range(burst):
                 state = state if solver.terminate(state) else solver.step(problem, state)
             return kind.state_record(state)
 
-        state = solver.init(problem.domain.x_of(problem.base), samples)
         while not solver.terminate(state):
             self.pause()
             entry, _ = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))

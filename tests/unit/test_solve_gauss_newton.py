@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -194,6 +194,20 @@ def test_state_survives_the_journal_exactly() -> None:
     state = solver.step(problem, solver.init(np.array([2.0, 3.0]), 64))
     again = state_from(json.loads(json.dumps(state_record(state))))
     assert state_record(solver.step(problem, again)) == state_record(solver.step(problem, state))
+
+
+def test_a_stage_that_goes_on_with_the_same_measurements_forgets_nothing() -> None:
+    # Noise is all that is left at the start, so that nothing moves; variances of pooled gradients add like those of 256 and 512 paths in one.
+    problem, domain = Quadratic(np.eye(2), np.array([1.0, 2.0]), gradient_noise=1.0, loss_noise=100.0), _domain(2)
+    solver = GaussNewton(domain, Options(max_samples=512))
+    first = solver.step(problem, solver.init(problem.best, 256))
+    ended = solver.finish(first)
+    again = solver.init(ended.x, 128, ended)
+    assert (again.samples, again.memory_samples) == (ended.samples, 256.0)
+    second = solver.step(replace(problem, seed=1), again)
+    assert second.memory_samples == 256.0 + again.samples
+    assert second.memory is not None
+    np.testing.assert_allclose(second.memory.gradient_noise, np.eye(2) / second.memory_samples)
 
 
 def test_trust_region_step_is_the_constrained_minimum() -> None:

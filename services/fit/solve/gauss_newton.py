@@ -136,6 +136,8 @@ class Solution:
     samples: int
     equations: NormalEquations | None
     """All that is known around x; None where the last step discarded it."""
+    known_samples: float = 0.0
+    """Paths per pixel that it is worth."""
 
 
 @dataclass(frozen=True)
@@ -145,10 +147,15 @@ class GaussNewton:
     domain: Domain
     options: Options = Options()
 
-    def init(self, x: Array, samples: int) -> State:
-        """State at a start, moved inside the bounds."""
+    def init(self, x: Array, samples: int, before: Solution | None = None) -> State:
+        """State at a start, moved inside the bounds.
+
+        Args:
+            before: an end at this very x for the same measurements; what it knew is not forgotten.
+        """
         low, high = self.domain.bounds
-        return State(np.clip(x, low, high), samples)
+        state = State(np.clip(x, low, high), samples)
+        return state if before is None else replace(state, samples=max(samples, before.samples), memory=before.equations, memory_samples=before.known_samples)
 
     def terminate(self, state: State) -> bool:
         """Whether nothing is left to do."""
@@ -156,7 +163,7 @@ class GaussNewton:
 
     def finish(self, state: State) -> Solution:
         """The outcome as a value."""
-        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples, state.memory)
+        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples, state.memory, state.memory_samples)
 
     def step(self, problem: Problem, state: State) -> State:
         """One linearisation and up to ``max_trials`` comparisons.
