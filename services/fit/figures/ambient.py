@@ -97,18 +97,21 @@ def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Ro
     return row
 
 
-def moved(row: Row, without: Row, quantity: str) -> float:
-    """Relative change against the fit without ambient light."""
-    return float(row[quantity]["value"] / without[quantity]["value"] - 1)
+def found_over_true(row: Row, quantity: str) -> str:
+    """A quantity's ratio to the truth, with its standard error."""
+    point = row[quantity]
+    ratio = f"{point['value'] / point['truth']:.2f}"
+    return ratio if point["se"] is None else f"{ratio} ± {point['se'] / point['truth']:.2f}"
 
 
 def sentence(rows: Sequence[Row]) -> str:
-    """How far each quantity moved."""
+    """What each fit found, over what is true."""
     parts = []
-    for row in rows[1:]:
-        changes = ", ".join(f"{100 * moved(row, rows[0], quantity):+.0f} %" for quantity in QUANTITIES)
-        parts.append(f"{100 * row['fraction']:.0f} % of the mean radiance: {changes}, held-out error {100 * row['held_out_error']:.1f} %")
-    return f"Change of σs' and 1 − α' of enamel and of dentin by {'; '.join(parts)}; without it {100 * rows[0]['held_out_error']:.1f} %."
+    for row in rows:
+        found = ", ".join(found_over_true(row, quantity) for quantity in QUANTITIES)
+        strength = f"with {100 * row['fraction']:.0f} % of the mean radiance" if row["fraction"] else "without it"
+        parts.append(f"{strength} {found}, held-out error {100 * row['held_out_error']:.1f} %")
+    return f"Found over true, σs' and 1 − α' of enamel and then of dentin: {'; '.join(parts)}."
 
 
 def table(rows: Sequence[Row]) -> str:
