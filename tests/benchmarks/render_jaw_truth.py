@@ -20,8 +20,8 @@ from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.transport.platform import prepare_device
 from tests.support.jaw_truth import CHANNEL, STORED, SUBJECT, cameras, lights, pack
 
-PASSES, SAMPLES = 64, 16
-"""Independent passes, and paths per pixel in each; a pass of 21 images takes 15 s of processor time."""
+PASSES, SAMPLES = 100, 64
+"""Independent passes, and paths per pixel in each; a pass of 21 images takes 70 s of processor time."""
 
 
 def load(folder: Path) -> Any:
