@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.core.records import JobSpec
 from services.fit.closing import Held, measure_closing
@@ -21,16 +22,18 @@ from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
-from services.fit.solve.covariance import Uncertainty, closing_model, uncertainty, whitening
+from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
 from services.fit.solve.gauss_newton import LAST_STEP_Z, Judged, Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
+
+Array = NDArray[np.float64]
 
 IMAGE_TOLERANCE = 0.004
 """A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SIMILAR_TOLERANCE = 0.02
 """The same of a stage in similar media."""
 SLOPE_ERROR = 0.5
-"""Relative error of what Jacobians of similar media promise for exact images, however short the step."""
+"""Relative error of what Jacobians of similar media promise for one tooth's exact images, however short the step; several are wrong independently."""
 CLOSING_SHARE = 2
 """The closing measurement has so many times fewer paths: it joins what all exact steps know."""
 CLOSING_TRIALS = 2
@@ -63,6 +66,30 @@ class StepReport:
 def history_key(channel: str, step: int) -> str:
     """The journal's key of a step's report."""
     return f"{channel}/history/{step}"
+
+
+def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, things: int, samples: int) -> Array:
+    """The step from x (F,) by the closing measurement, or a shorter one; zeros where it promises no more than noise does, or is not better.
+
+    Args:
+        things: how many things the fit is about that images tell apart; what one of them promises is wrong independently of the others.
+        samples: paths per pixel of a comparison.
+    """
+    mean, precision = problem.domain.prior
+    step, slope_error = model.step(things), SLOPE_ERROR / math.sqrt(things)
+    for trial in range(CLOSING_TRIALS):
+        promised, promised_se = model.promise(step)
+        if promised >= 0:
+            break
+        compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
+        change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+        judged = Judged(change, compared.se, promised, math.hypot(promised_se, slope_error * promised))
+        if judged.is_better(LAST_STEP_Z):
+            return step
+        if not (judged.is_worse or judged.contradicted):
+            break
+        step = 0.3 * step
+    return np.zeros(len(x))
 
 
 @dataclass(frozen=True)
@@ -204,21 +231,7 @@ class Stages(ABC, Generic[Optics]):
 
         def compute() -> dict[str, Any]:
             sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
-            model, (mean, precision) = closing_model(domain, x, equations, sums), domain.prior
-            step = model.step(self.things)
-            for trial in range(CLOSING_TRIALS):
-                promised, promised_se = model.promise(step)
-                if promised >= 0:
-                    break
-                compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
-                change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
-                judged = Judged(change, compared.se, promised, math.hypot(promised_se, SLOPE_ERROR * promised))
-                if judged.is_better(LAST_STEP_Z):
-                    return {"sums": sums.record(), "step": step.tolist()}
-                if not (judged.is_worse or judged.contradicted):
-                    break
-                step = 0.3 * step
-            return {"sums": sums.record(), "step": np.zeros(len(x)).tolist()}
+            return {"sums": sums.record(), "step": last_step(problem, x, closing_model(domain, x, equations, sums), self.things, samples).tolist()}
 
         self.pause()
         entry, _ = self.journal.once(f"{self.scope}/closing", compute)
