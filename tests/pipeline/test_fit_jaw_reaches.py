@@ -27,6 +27,6 @@ def test_jaw_of_fourteen(tmp_path: Path) -> None:
     # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43 honest numbers on its limit falls in 17 runs.
     missed = [f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}" for one in found if one.is_beyond_noise]
     assert not missed
-    # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is known to 8 to 23 % from these photographs.
+    # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is known to 3 to 16 % from these photographs.
     assert found[0].resolution < IMAGE_MUST
     assert median(one.resolution for one in found if one.figure.startswith("enamel")) < ENAMEL_MUST
