@@ -38,6 +38,8 @@ CLOSING_SHARE = 2
 """The closing measurement has so many times fewer paths: it joins what all exact steps know."""
 CLOSING_TRIALS = 2
 """Lengths tried of the step after the closing measurement."""
+CLOSING_LEAST_SHARE = 0.1
+"""No step is tried that is shorter than so much of the one before."""
 LEAST_SAMPLES = 4
 """Paths per pixel, however many pixels there are."""
 
@@ -88,7 +90,9 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, things:
             return step
         if not (judged.is_worse or judged.contradicted):
             break
-        step = 0.3 * step
+        # Least on the parabola of slope and comparison (Nocedal and Wright 2006, section 3.5).
+        slope = model.slope(step)
+        step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_LEAST_SHARE) * step
     return np.zeros(len(x))
 
 

@@ -160,14 +160,21 @@ class ClosingModel:
         low, high = domain.bounds
         return np.asarray(np.clip(self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - self.x)
 
+    def slope(self, step: Array) -> float:
+        """Slope of F at x along a step, per length of the step."""
+        return float(self.gradient @ self._moved(step))
+
     def promise(self, step: Array) -> tuple[float, float]:
         """Change of F by a step and its standard error by noise; what noise alone would promise is taken off.
 
         If the images' derivatives are J = J~ M as far as they matter, F changes by g'z + z'z / 2, z = M y.
         """
-        moved = np.linalg.solve(self.inverse, np.linalg.solve(self.known.transform, step))
+        moved = self._moved(step)
         change = float(self.gradient @ moved + 0.5 * moved @ moved) + 0.5 * float(np.trace(self.noise))
         return change, float(np.sqrt(max(float(moved @ self.noise @ moved), 0.0)))
+
+    def _moved(self, step: Array) -> Array:
+        return np.asarray(np.linalg.solve(self.inverse, np.linalg.solve(self.known.transform, step)))
 
 
 def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
