@@ -67,7 +67,7 @@ def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
 
 
 def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
-    # With a slope of its own upwards the shorter step, 2000 / 6200 of the whole, is worse by 645, 5.6 standard errors.
+    # With a slope of its own upwards the shorter step, 2000 / 6200 of the whole, is worse by 639, 5.5 standard errors.
     problem = FakeProblem(1100.0, slope=2400.0)
     assert taken(problem, things=14) == 0
     assert len(problem.asked) == CLOSING_TRIALS

@@ -161,7 +161,7 @@ class ClosingModel:
         return np.asarray(np.clip(self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - self.x)
 
     def slope(self, step: Array) -> float:
-        """Slope of F at x along a step, per length of the step."""
+        """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what noise alone would give."""
         return float(self.gradient @ self._moved(step))
 
     def promise(self, step: Array) -> tuple[float, float]:
