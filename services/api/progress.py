@@ -102,8 +102,11 @@ class ProgressView:
 
 
 def _note(event: JobEvent) -> str:
-    held_out = event.data.get("held_out_error") if event.kind == "step" else None
-    return f"{event.message.rstrip('.')}; held-out error {100 * held_out:.1f} %." if isinstance(held_out, float) else event.message
+    held_out, se = event.data.get("held_out_error"), event.data.get("held_out_se")
+    if event.kind != "step" or not isinstance(held_out, float):
+        return event.message
+    spread = f" ± {100 * se:.1f}" if isinstance(se, float) else ""
+    return f"{event.message.rstrip('.')}; held-out error {100 * held_out:.1f}{spread} %."
 
 
 def describe(remaining: dict[str, Any] | None) -> str:

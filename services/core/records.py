@@ -235,7 +235,7 @@ class FitReport(Record):
     told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
     notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
     next_capture: str = Field(default="", description="in plain words, which further light or view would help most; empty where none was looked for")
-    seconds: float
+    seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
 
 
 class AssetManifest(Record):

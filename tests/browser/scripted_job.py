@@ -52,6 +52,7 @@ class ScriptedJob:
                 "step": step,
                 "loss": factor * 0.3**step,
                 "held_out_error": factor * 0.4 * 0.5**step if step % 2 else None,
+                "held_out_se": 0.012 if step % 2 else None,
                 "parameters": {"enamel.sigma": 4.0 + 0.01 * step},
             }
             log.append(attempt, StageEvent(stage="fit", kind="step", message=f"{channel} step {step}.", done=(step + 1) / STEPS, data=data))

@@ -74,6 +74,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     for step in range(STEPS - 1):
         job.steps.release()
         expect(page.locator(".chart figcaption")).to_contain_text(f"{step + 1} steps.")
+    expect(page.locator(".chart figcaption")).to_contain_text("± 1.2 %; red: loss")
     expect(page.locator(".chart canvas")).to_be_visible()
     expect(page.locator(".comparison output")).to_have_text(str(STEPS - 2))
     expect(page.locator("td.number").first).to_have_text("4.04")

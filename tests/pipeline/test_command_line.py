@@ -121,7 +121,7 @@ def test_submit_watch_and_retry_through_a_server(tmp_path: Path, job_file: Path)
         watched = dentine("watch", job, "--server", server, "--json")
         assert watched.returncode == 0
         assert json.loads(watched.stdout)["state"] == "SUCCEEDED"
-        assert "fit 100 %: Step 9; held-out error" in watched.stderr
+        assert "fit 100 %: Step 9; held-out error 1.0 ± 0.2 %." in watched.stderr
         assert dentine("cancel", job, "--server", server).returncode == 2
         assert "There is no job none" in sentence(dentine("watch", "none", "--server", server))
 

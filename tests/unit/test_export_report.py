@@ -19,7 +19,7 @@ from services.fit.export.report import THIN_CAVEAT, ReportPictures, write_report
 HISTORY = [
     {"channel": "green", "stage": "homogeneous", "step": 1, "loss": 0.2, "held_out_error": 0.3},
     {"channel": "green", "stage": "layered", "step": 2, "loss": 0.02, "held_out_error": None},
-    {"channel": "green", "stage": "layered", "step": 3, "loss": 0.002, "held_out_error": 0.04},
+    {"channel": "green", "stage": "layered", "step": 3, "loss": 0.002, "held_out_error": 0.04, "held_out_se": 0.013},
 ]
 
 
@@ -105,6 +105,11 @@ def test_held_out_error_leads(tmp_path: Path) -> None:
     text = page(tmp_path, report(), pictures()).text
     assert text.index("4.1 %") < text.index("2.3 %") < text.index("Parameters")
     assert "did not converge" not in text
+
+
+def test_errors_on_the_way_come_with_their_noise(tmp_path: Path) -> None:
+    text = " ".join(page(tmp_path, report(), pictures()).text.split())
+    assert "homogeneousgreen10.230.0 % layeredgreen30.0024.0 ± 1.3 %" in text
 
 
 def test_a_fit_that_did_not_converge_says_so_first(tmp_path: Path) -> None:

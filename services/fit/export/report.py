@@ -65,7 +65,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
     """Write the report as one HTML file without any outside reference.
 
     Args:
-        history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``stage`` and ``channel``.
+        history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``, ``stage`` and ``channel``.
         context: ``title``, ``boundary``, ``ior`` and ``provenance`` (a dict of label -> text); all optional.
     """
     from jinja2 import Environment, StrictUndefined
@@ -168,10 +168,9 @@ def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
             last[str(entry.get("channel", "")), str(entry["stage"])] = entry
     rows = []
     for (channel, stage), entry in last.items():
-        error = entry.get("held_out_error")
-        rows.append(
-            {"channel": channel, "stage": stage, "step": str(entry["step"]), "loss": f"{entry['loss']:.3g}", "error": "" if error is None else _percent(error)}
-        )
+        error, se = entry.get("held_out_error"), entry.get("held_out_se")
+        told = "" if error is None else _percent(error) if se is None else f"{100 * error:.1f} ± {100 * se:.1f} %"
+        rows.append({"channel": channel, "stage": stage, "step": str(entry["step"]), "loss": f"{entry['loss']:.3g}", "error": told})
     return rows
 
 

@@ -23,8 +23,8 @@ export function significant(value: number): string {
   return Number(value.toPrecision(4)).toString();
 }
 
-export function percent(fraction: number): string {
-  return `${(100 * fraction).toFixed(1)} %`;
+export function percent(fraction: number, se: number | null = null): string {
+  return `${(100 * fraction).toFixed(1)}${se === null ? "" : ` ± ${(100 * se).toFixed(1)}`} %`;
 }
 
 export function bytes(count: number): string {

@@ -8,6 +8,7 @@ import { percent, significant } from "./format";
 interface Point {
   loss: number | null;
   heldOut: number | null;
+  heldOutSe: number | null;
 }
 
 const positive = (value: unknown): number | null => (typeof value === "number" && value > 0 ? value : null);
@@ -47,10 +48,10 @@ export class LossChart {
 
   /** Take in a step of a channel; a step that a later attempt repeats replaces the earlier one. */
   add(name: string, event: JobEvent): void {
-    const { step, loss, held_out_error: heldOut } = event.data;
+    const { step, loss, held_out_error: heldOut, held_out_se: heldOutSe } = event.data;
     if (typeof step !== "number") return;
     const points = this.channels.get(name) ?? new Map<number, Point>();
-    this.channels.set(name, points.set(step, { loss: positive(loss), heldOut: positive(heldOut) }));
+    this.channels.set(name, points.set(step, { loss: positive(loss), heldOut: positive(heldOut), heldOutSe: positive(heldOutSe) }));
     if (!this.stale) requestAnimationFrame(() => this.draw());
     this.stale = true;
   }
@@ -102,8 +103,8 @@ export class LossChart {
     const latest = [...this.channels].map(([name, points]) => {
       const last = [...points.values()];
       const loss = last.at(-1)?.loss;
-      const heldOut = last.findLast((point) => point.heldOut !== null)?.heldOut;
-      return `${name}: loss ${loss ? significant(loss) : "not yet"}${heldOut ? `, held-out error ${percent(heldOut)}` : ""}`;
+      const told = last.findLast((point) => point.heldOut !== null);
+      return `${name}: loss ${loss ? significant(loss) : "not yet"}${told?.heldOut ? `, held-out error ${percent(told.heldOut, told.heldOutSe)}` : ""}`;
     });
     const text = `${count} steps. ${latest.join("; ")}.`;
     this.caption.textContent = text;
