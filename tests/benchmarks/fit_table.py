@@ -153,15 +153,18 @@ def free(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
     """What dentin leaves of the homogeneous tooth's loss, each by a fit of its own, in exact media.
 
+    The photographs' noise is part of every loss, and the note says how much: no fit goes below it.
     These truths are clean; what stains leave of it, on a stained truth, is in ``tests/pipeline/test_fit_stained_truth.py``.
     """
     for subject in subjects:
         losses = []
         for dentin in ("none", "fit"):
             fit = bench.fit(subject, dentin, dentin=dentin)
-            losses.append(fit.prepared.errors(fit.tissue, samples=JUDGE_SAMPLES, seed=23)[0].loss or 0.0)
+            sums = fit.prepared.errors(fit.tissue, samples=JUDGE_SAMPLES, seed=23)[0]
+            losses.append(sums.loss or 0.0)
         before, after = losses
-        yield Figure("stages", subject, "loss with dentin over the loss before", after / before, 0.8, None, fit.seconds, f"{before:.2e} to {after:.2e}")
+        note = f"{before:.2e} to {after:.2e}, of which noise {sums.reference_variance / sums.reference_squared:.2e}"
+        yield Figure("stages", subject, "loss with dentin over the loss before", after / before, 0.8, None, fit.seconds, note)
 
 
 def cameras(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
