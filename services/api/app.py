@@ -28,7 +28,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
     """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
 
     Args:
-        run: in place of the stages.
+        run: in place of the stages. ``app.state.darken`` asks all that lights a dome to stop, from any thread, and waits for nothing but that.
         workers: those that ``run`` runs on, closed with the application; default its own.
     """
     from fastapi import FastAPI
@@ -62,6 +62,13 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
 
     jobs = Jobs(settings, run_in_turn)
     dome = Dome(settings.dome, jobs)
+
+    def darken() -> None:
+        try:
+            jobs.stop()
+        finally:
+            dome.close()
+
     readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
     feed = EventFeed(jobs.repository, readers.ask)
     observation = Observation(jobs, settings, readers, openers, certificates)
@@ -78,10 +85,11 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
-            for close in (dome.close, readers.close, openers.close, lookers.close, auditors.close, jobs.close, workers.close):
+            for close in (darken, readers.close, openers.close, lookers.close, auditors.close, jobs.close, workers.close):
                 await closing.ask(close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.darken = darken
     problems.install(app)
     app.include_router(build_router(jobs, feed, readers, openers, lookers))
     app.include_router(build_captures_router(jobs.captures))

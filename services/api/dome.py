@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 
 import sqlalchemy as sql
@@ -12,6 +13,7 @@ from pydantic import Field
 
 from services.api.dome_process import DomeProcess
 from services.api.jobs import Jobs, require_server_path
+from services.api.light_limits import LightLimits
 from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError, UnknownDomeError
 from services.core.geometry import Record
@@ -59,6 +61,7 @@ class Dome:
     """Use-cases over the server's dome; ``start`` and ``close`` frame the time in which it is worked."""
 
     def __init__(self, settings: DomeSettings, jobs: Jobs) -> None:
+        self._settings, self._limits = settings, LightLimits(settings)
         self._address, self._jobs, self._process = settings.address, jobs, DomeProcess(settings)
         self._driving = threading.Lock()
 
@@ -92,10 +95,12 @@ class Dome:
         Raises:
             UnknownDomeError: this server has none. RigError: darkness could not be confirmed.
         """
-        with suppress(DentineError):
-            self._switch_off()
-        stopped = self._stop_captures()
-        return AllOff(status=self._switch_off(), stopped=stopped)
+        with ThreadPoolExecutor(1, "stop captures") as stopping:
+            # Beside each other: captures may have other domes, and neither a dome nor a database that hangs keeps the other from being told.
+            stopped = stopping.submit(self._stop_captures)
+            with suppress(DentineError):
+                self._switch_off()
+        return AllOff(status=self._switch_off(), stopped=stopped.result())
 
     def light(self, wanted: LightRequest) -> DomeStatus:
         """Switch one light on for a while.
@@ -103,6 +108,8 @@ class Dome:
         Raises:
             UnknownDomeError: this server has none. DomeBusyError: a capture or a preflight has it. SettingsError: no such light. RigError and its kinds.
         """
+        if wanted.level > self._settings.max_level:
+            raise SettingsError(f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g} (DENTINE__SERVER__DOME__MAX_LEVEL); lower it.")
         with self._driven_by_hand():
             return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
 
@@ -122,6 +129,8 @@ class Dome:
         """
         if "dome" in rig.model_fields_set and rig.dome != self._address:
             raise SettingsError(f"'dome': this server works the dome at {self._address} and no other; leave it out.")
+        if self._address is not None:
+            self._limits.require(rig.model_copy(update={"dome": self._address}))
         require_server_path("mouth", rig.mouth)
         with self._driven_by_hand():
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)

@@ -15,8 +15,9 @@ from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
 from services.api.data_folder import require_own_folder
 from services.api.erasure import erase, forget_listing
-from services.api.events import JobEvent
+from services.api.events import EventAddress, JobEvent
 from services.api.lifecycle import Instruction, JobState, Trigger
+from services.api.light_limits import LightLimits
 from services.api.machine_class import machine_class
 from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, JobFilter, Repository
@@ -60,16 +61,25 @@ class Jobs:
             require_own_folder(self.repository.engine, self._data)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self.calibrations = Calibrations(self._data)
+        self._light_limits = LightLimits(settings.dome)
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
         machine = machine_class() if settings.scheduler is None else None
         self._time_ranges = TimeRanges(self.repository, self.locate, self.waits_for, machine)
-        self._runner = Runner(self.repository, self.folder, self.locate, run, self._admission, self._tidy, self._time_ranges.learn)
+
+        def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
+            return run(self._light_limits.lowered(spec), folder, events)
+
+        self._runner = Runner(self.repository, self.folder, self.locate, run_within_limits, self._admission, self._tidy, self._time_ranges.learn)
         self._is_alone = settings.database is None
         self._deleting = threading.Lock()
 
     def start(self) -> None:
         """Queue again what an earlier server left unfinished, then run jobs."""
         self._runner.start(alone=self._is_alone)
+
+    def stop(self) -> None:
+        """Ask the running job to stop, and wait for nothing: what it lights goes dark at once."""
+        self._runner.stop()
 
     def close(self) -> None:
         """Stop the running job cooperatively; it stays queued and resumes when the server starts again."""
@@ -89,13 +99,14 @@ class Jobs:
 
         Raises:
             SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
-            JobStateError: the key belongs to another job.
+            ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another job.
         """
         if key is not None and (earlier := self.repository.submitted(spec, key)) is not None:
             return Creation(earlier, is_new=False)
         if spec.capture is not None and not is_uploaded(spec.capture):
             require_server_path("capture", spec.capture)
         if spec.rig is not None:
+            self._light_limits.require(spec.rig)
             require_server_path("rig.mouth", spec.rig.mouth)
         if spec.calibration is not None and is_stored(spec.calibration):
             self.calibrations.require(spec.calibration)
@@ -150,6 +161,14 @@ class Jobs:
     def capturing(self) -> list[Job]:
         """Jobs under way, of any server of the database, whose capture is not published yet."""
         return self._to_capture(self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
+
+    def lights_again(self, job_id: str) -> bool:
+        """Whether a retry of a job would light a dome that is not simulated.
+
+        Raises:
+            UnknownJobError: there is no such job.
+        """
+        return any(job.spec.rig is not None and not job.spec.rig.is_simulated for job in self._to_capture([self.repository.get(job_id)]))
 
     def cancel_captures(self) -> list[str]:
         """Cancel every job that captures or will capture next; returns their ids."""

@@ -38,7 +38,7 @@ from services.core.errors import (
     WorkerLostError,
 )
 from services.core.masks import is_stale
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
 
@@ -323,4 +323,5 @@ def _claim_folder(root: Path, spec: JobSpec) -> None:
 
 
 def _options(spec: JobSpec) -> dict[str, Any]:
-    return spec.model_dump(mode="json")
+    # A server that lowers how far a rig may go does not make another job of it.
+    return spec.model_dump(mode="json", exclude={"rig": set(LIMITS_OF_A_RIG)})

@@ -12,12 +12,13 @@ from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_ar
 from services.api.clerks import Clerks
 from services.api.database import MOST_ID
 from services.api.feed import EVENT_ANSWERS, EventFeed
-from services.api.guard import needs
+from services.api.guard import needs, require
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import refusals
 from services.api.repository import Deletion, Job, JobFilter
 from services.api.time_ranges import TimeRange
+from services.api.tokens import Scope
 from services.core.geometry import Record
 from services.core.records import JobSpec
 
@@ -69,7 +70,12 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
     def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
-        """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200."""
+        """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200.
+
+        A job with a rig needs scope operate-dome too, unless its dome is simulated.
+        """
+        if spec.rig is not None and not spec.rig.is_simulated:
+            require(request.scope.get("caller"), Scope.OPERATE_DOME)
         creation = jobs.submit(spec, idempotency_key, request.state.request_id)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
@@ -104,8 +110,13 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         return jobs.cancel(job_id)
 
     @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
-    def retry(job_id: str) -> Job:
-        """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from what it had published."""
+    def retry(job_id: str, request: Request) -> Job:
+        """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from what it had published.
+
+        A job that has yet to capture needs scope operate-dome too, unless its dome is simulated.
+        """
+        if jobs.lights_again(job_id):
+            require(request.scope.get("caller"), Scope.OPERATE_DOME)
         return jobs.retry(job_id)
 
     @router.delete("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])

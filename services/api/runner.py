@@ -66,12 +66,16 @@ class Runner:
         for thread in self._threads:
             thread.start()
 
-    def close(self) -> None:
-        """Stop the running job cooperatively; it stays queued and resumes when a server starts again."""
+    def stop(self) -> None:
+        """Ask the running job to stop, and wait for nothing; it stays queued and resumes when a server starts again."""
         self._closing.set()
         self._wake.set()
         if (lease := self._current) is not None:
             request_cancel(self._folder(lease.job.id))
+
+    def close(self) -> None:
+        """Stop the running job cooperatively, and wait for that."""
+        self.stop()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join()

@@ -6,9 +6,11 @@ import fcntl
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app
@@ -18,6 +20,11 @@ from services.api.runner import RunJob
 from services.api.workers import Workers
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from uvicorn import Server
 
 
 def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers | None = None) -> None:
@@ -39,9 +46,9 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
-        proxies = settings.trusted_proxies
+        proxies, app = settings.trusted_proxies, create_app(settings, run, workers)
         config = uvicorn.Config(
-            create_app(settings, run, workers),
+            app,
             log_config=None,
             log_level="warning",
             access_log=False,
@@ -49,11 +56,24 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
             proxy_headers=bool(proxies),
             forwarded_allow_ips=proxies,
         )
-        server = uvicorn.Server(config)
+        server = _dark_at_once(uvicorn.Server(config), app.state.darken)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
         leave_alone_what_is_loaded()
         server.run(sockets=[listener])
+
+
+def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
+    """Have a signal darken the domes before open requests are waited for."""
+    leave = server.handle_exit
+
+    def leave_dark(sig: int, frame: FrameType | None) -> None:
+        # A thread, as whoever is interrupted by a signal may hold any lock.
+        threading.Thread(target=darken, name="darken", daemon=True).start()
+        leave(sig, frame)
+
+    server.handle_exit = leave_dark  # type: ignore[method-assign]
+    return server
 
 
 def _listen(settings: ServerSettings) -> socket.socket:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from services.core.errors import SettingsError
+from services.core.records import SIMULATED_DOME
 
 
 @contextmanager
@@ -15,7 +16,7 @@ def dome_address(address: str, lights: int, watchdog_s: float) -> Iterator[tuple
     Raises:
         SettingsError: neither 'simulated' nor host:port.
     """
-    if address == "simulated":
+    if address == SIMULATED_DOME:
         from services.capture.simulator import simulated_dome
 
         with simulated_dome(lights, watchdog_s) as place:

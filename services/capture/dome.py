@@ -39,6 +39,12 @@ class Dome(Protocol):
     def dark(self) -> None:
         """Switch every light off and check it."""
 
+    def pause(self, seconds: float) -> None:
+        """Let time pass with the light as it is; raises what ``interrupt`` was given as soon as it is called."""
+
+    def interrupt(self, why: Exception) -> None:
+        """Go dark at once, called from any thread; whoever drives the dome gets no further light and meets ``why``."""
+
     def status(self) -> DomeStatus:
         """Read the controller's state."""
 

@@ -4,6 +4,7 @@
 * The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when a light
   has been on for its strobe time (a hung one).
 * Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
+* ``interrupt`` darkens in mid-exposure, from another thread and over the keep-alive's connection; the driver lights nothing after it.
 * ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the watchdog anew.
 * A device that says it is no dome gets no write. One that does not say what it is may be a dome under light, and is switched off.
 """
@@ -120,6 +121,8 @@ class ModbusDome:
         self._light_count = 0
         self._lit: tuple[range, float, float] | None = None
         self._previous_handlers: dict[int, object] = {}
+        self._interrupted = threading.Event()
+        self._why_interrupted: Exception | None = None
 
     def __enter__(self) -> Self:
         try:
@@ -146,6 +149,8 @@ class ModbusDome:
             if kind is not None:
                 self._link.close()
             self.dark()
+            if self._why_interrupted is not None and isinstance(problem, RigError):
+                raise self._why_interrupted from problem
         except RigError:
             # A light that may still burn matters more than a cancel; another rig error has said it already.
             if not isinstance(problem, RigError):
@@ -166,6 +171,7 @@ class ModbusDome:
         lights = range(self._light_count) if index is None else range(index, index + 1)
         with self._dark_on_error():
             self._account()
+            self._require_wanted()
             if not lights or lights.stop > self._light_count or lights.start < 0:
                 raise RigError(f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the plan.")
             self._budget.require(lights, level, on_s)
@@ -180,6 +186,7 @@ class ModbusDome:
             # Where the answer is lost or odd, the read-back decides whether the light was set; it is not sent again.
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
+            self._require_wanted()
             return self._confirmed()
 
     def confirm(self) -> Rgb:
@@ -218,6 +225,23 @@ class ModbusDome:
             f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within {self.watchdog_s:g} s, switch the dome off."
         ) from problem
 
+    def pause(self, seconds: float) -> None:
+        """Let time pass with the light as it is; see ``Dome.pause``."""
+        self._interrupted.wait(seconds)
+        with self._dark_on_error():
+            self._require_wanted()
+
+    def interrupt(self, why: Exception) -> None:
+        """Go dark at once, from any thread; see ``Dome.interrupt``."""
+        # The reason comes before the order, so that a light that the driver sends meanwhile is found unwanted after it was sent.
+        self._why_interrupted = why
+        self._interrupted.set()
+        with suppress(LinkError):
+            self._keepalive.darken()
+        # Confirmed here too, as the driver's own thread may be held by a camera. Where it fails, the watchdog is starved.
+        with suppress(RigError):
+            self.dark()
+
     def give_up(self) -> None:
         """Go dark if that can be, and stop feeding the watchdog, from any thread: whoever drives gets no more light."""
         try:
@@ -236,8 +260,13 @@ class ModbusDome:
         try:
             yield
         except BaseException as problem:
+            is_dark = False
             with suppress(RigError):
                 self.dark()
+                is_dark = True
+            if is_dark and self._why_interrupted is not None and isinstance(problem, (LinkError, RigError)):
+                # An interrupted light is dark, which is no fault of the dome.
+                raise self._why_interrupted from problem
             if isinstance(problem, LinkError):
                 # ALL OFF or an open interlock is why a controller refuses; say that rather than the code.
                 if isinstance(problem, RefusedError):
@@ -290,6 +319,10 @@ class ModbusDome:
             raise InterlockError(f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and run again.")
         if not closed:
             raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
+
+    def _require_wanted(self) -> None:
+        if self._why_interrupted is not None:
+            raise self._why_interrupted
 
     def _require_armed(self) -> None:
         if self._link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS:

@@ -6,7 +6,7 @@ import threading
 import time
 
 from services.capture.modbus_link import LinkError, ModbusLink
-from services.capture.registers import KEEPALIVE
+from services.capture.registers import ALL_OFF, KEEPALIVE
 from services.core.errors import RigError
 
 FEEDS_PER_WATCHDOG = 5
@@ -36,6 +36,14 @@ class KeepAlive:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._link.close()
+
+    def darken(self) -> None:
+        """Order all off over this connection, which no slow transaction of the driver holds.
+
+        Raises:
+            LinkError: it may or may not have happened.
+        """
+        self._link.write(ALL_OFF, [1])
 
     def require_alive(self) -> None:
         """Raise RigError when no feed has succeeded for a watchdog period."""

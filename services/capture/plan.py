@@ -19,7 +19,10 @@ from services.capture.dome import ExposureBudget
 from services.capture.registers import FULL_SCALE, level_word
 from services.core.errors import SettingsError
 from services.core.geometry import Record
-from services.core.records import RigSpec
+from services.core.records import MAX_ON_TIME_S, RigSpec
+
+GLIMPSE_S = 0.005
+"""How long a preflight lights each light to see that it emits."""
 
 
 class PlannedFrame(Record):
@@ -40,11 +43,21 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
         lights: lights to capture, indices 0 to lights - 1 of the dome.
 
     Raises:
-        SettingsError: the level is below one register step. ExposureLimitError: the plan passes a dose limit.
+        SettingsError: the level is below one register step, or an exposure is longer than a light may be on. ExposureLimitError: the plan passes a
+            dose limit.
     """
     frames = tuple(_frame(rig, lights, index, light) for index, light in enumerate(_order(rig, lights)))
     require_exposure(frames, lights, rig)
+    if (on_s := rig.settle_s + rig.exposure_s) > MAX_ON_TIME_S:
+        what = f"rig.exposure_s {rig.exposure_s:g} s with rig.settle_s is longer than a light may be on at once ({MAX_ON_TIME_S:g} s)"
+        raise SettingsError(f"{what}; shorten it by {on_s - MAX_ON_TIME_S:.3g} s.")
     return frames
+
+
+def preflight_frames(plan: Sequence[PlannedFrame]) -> tuple[PlannedFrame, ...]:
+    """What a preflight lights: every light for a glimpse, then one whole frame, with all lights on where the plan has such frames."""
+    glimpses = (frame.model_copy(update={"on_s": GLIMPSE_S}) for frame in plan if frame.light is not None)
+    return (*glimpses, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
 
 
 def require_exposure(frames: Sequence[PlannedFrame], lights: int, rig: RigSpec) -> None:

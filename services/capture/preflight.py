@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 
 from services.capture.camera import Cameras
 from services.capture.dome import Dome
-from services.capture.plan import PlannedFrame
+from services.capture.plan import PlannedFrame, preflight_frames
 from services.capture.sequence import CLIPPED_FRACTION, clipped_fraction, expose
 from services.core.errors import RigError
 from services.core.records import RigSpec
 
-GLIMPSE_S = 0.005
 BLACK_TOLERANCE = 0.005
 
 
@@ -27,11 +26,11 @@ def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: R
     Raises:
         RigError: a light does not emit what it should, or the black level is wrong by more than 0.5 % of full scale.
     """
-    for frame in plan:
-        if frame.light is not None:
-            raise_if_unwanted()
-            dome.light(frame.light, frame.level, GLIMPSE_S)
-            dome.dark()
+    *glimpses, lit = preflight_frames(plan)
+    for glimpse in glimpses:
+        raise_if_unwanted()
+        dome.light(glimpse.light, glimpse.level, glimpse.on_s)
+        dome.dark()
 
     black = next(frame for frame in plan if frame.kind == "black")
     full_scale = 2**cameras.bits - 1
@@ -44,7 +43,6 @@ def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: R
 
     raise_if_unwanted()
     findings = []
-    lit = next((frame for frame in plan if frame.kind == "tracking"), plan[-1])
     images = expose(lit, dome, cameras, rig.settle_s)[1]
     raise_if_unwanted()
     for camera, image in enumerate(images):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from services.capture.camera import Cameras
 from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import ModbusDome
 from services.capture.motion import SubjectMotion
-from services.capture.plan import PlannedFrame, plan_capture
+from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
 from services.capture.simulated_cameras import PlaybackCameras, SimulatedCameras
 from services.capture.stills import Stills
 from services.core.errors import CaptureInputError, RigError
@@ -37,7 +37,11 @@ class PlannedRig:
             CaptureInputError: the mouth folder. SettingsError, ExposureLimitError: the plan cannot be.
         """
         description = _read_description(spec.mouth / "capture.json")
-        return cls(spec, description, plan_capture(spec, len(description.lights)), Stills(spec.mouth, description))
+        lights = len(description.lights)
+        plan = plan_capture(spec, lights)
+        # The preflight takes its part of the dose: without it the plan would end at the limit before its last frames.
+        require_exposure((*preflight_frames(plan), *plan), lights, spec)
+        return cls(spec, description, plan, Stills(spec.mouth, description))
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -61,16 +65,16 @@ class PlannedRig:
                 if dome.light_count < len(self.lights):
                     listing = f"{spec.mouth / 'capture.json'} lists {len(self.lights)}"
                     raise RigError(f"The dome at {dome.address} has {dome.light_count} lights and {listing}; correct rig.dome.")
-                with self._cameras(host, port) as cameras:
+                with self._cameras(host, port, dome.pause) as cameras:
                     yield dome, cameras
 
-    def _cameras(self, host: str, port: int) -> PlaybackCameras | SimulatedCameras:
+    def _cameras(self, host: str, port: int, wait: Callable[[float], None]) -> PlaybackCameras | SimulatedCameras:
         spec, plan = self.spec, self.plan
         level = next(frame.level for frame in plan if frame.kind == "light")
         if spec.cameras == "playback":
-            return PlaybackCameras(self.stills, spec, level, plan)
+            return PlaybackCameras(self.stills, spec, level, plan, wait)
         motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
-        return SimulatedCameras(self.stills, spec, level, motion, host, port)
+        return SimulatedCameras(self.stills, spec, level, motion, host, port, wait)
 
 
 def _read_description(path: Path) -> FolderCapture:

@@ -59,7 +59,7 @@ def expose(frame: PlannedFrame, dome: Dome, cameras: Cameras, settle_s: float) -
         cameras.arm(frame.exposure_s, frame.index)
         if frame.kind != "black":
             dome.light(frame.light, frame.level, frame.on_s)
-        time.sleep(settle_s)
+        dome.pause(settle_s)
         dome.trigger()
         images = cameras.read()
         # The light must have lasted the exposure: a watchdog or strobe that ended it early makes the frame worthless.

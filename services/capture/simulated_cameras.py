@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -50,8 +50,17 @@ class SimulatedCameras:
     undisturbed one.
     """
 
-    def __init__(self, stills: Stills, rig: RigSpec, level: float, motion: SubjectMotion, host: str, port: int) -> None:
-        self._stills, self._motion, self._address = stills, motion, (host, port)
+    def __init__(
+        self,
+        stills: Stills,
+        rig: RigSpec,
+        level: float,
+        motion: SubjectMotion,
+        host: str,
+        port: int,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._stills, self._motion, self._address, self._wait = stills, motion, (host, port), wait
         self._sensor = SensorModel(rig.simulation, stills.peak_radiance, level, rig.exposure_s)
         self._rgb = [RGB_OF_CHANNEL.get(channel.lower()) for channel in stills.description.channels]
         self._observer: DomeObserver | None = None
@@ -91,7 +100,7 @@ class SimulatedCameras:
         if self._observer.trigger_count() == self._triggers_before:
             raise RigError(f"The cameras got no trigger for frame {self._frame}; check the trigger line.")
         at_start = self._observer.outputs()
-        time.sleep(self._exposure_s)
+        self._wait(self._exposure_s)
         levels = (at_start + self._observer.outputs()) / 2
         return tuple(self._see(camera, levels) for camera in range(len(self._stills.description.cameras)))
 
@@ -109,8 +118,8 @@ class SimulatedCameras:
 class PlaybackCameras:
     """``Cameras`` that play a folder's images for the planned lights, whatever the dome does: no motion, no noise."""
 
-    def __init__(self, stills: Stills, rig: RigSpec, level: float, plan: Sequence[PlannedFrame]) -> None:
-        self._stills, self._plan = stills, plan
+    def __init__(self, stills: Stills, rig: RigSpec, level: float, plan: Sequence[PlannedFrame], wait: Callable[[float], None] = time.sleep) -> None:
+        self._stills, self._plan, self._wait = stills, plan, wait
         self._sensor = SensorModel(rig.simulation, stills.peak_radiance, level, rig.exposure_s)
         self._frame = 0
         self.bits = rig.simulation.bits
@@ -130,7 +139,7 @@ class PlaybackCameras:
     def read(self) -> tuple[NDArray[np.uint16], ...]:
         """See ``Cameras``."""
         planned = self._plan[self._frame]
-        time.sleep(planned.exposure_s)
+        self._wait(planned.exposure_s)
         lights = {"black": range(0), "tracking": range(len(self._stills.description.lights))}.get(planned.kind)
         if lights is None:
             assert planned.light is not None

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.core.records import CaptureManifest, JobSpec
+from services.core.records import LIMITS_OF_A_RIG, CaptureManifest, JobSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter
 
@@ -21,6 +21,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
         RigError and its kinds: the dome or a camera; lights are dark. StoreError: the disk. JobCancelledError.
     """
     from services.capture.frames import FrameStore, fingerprint
+    from services.capture.lookout import interrupting
     from services.capture.preflight import preflight
     from services.capture.rig import PlannedRig
     from services.capture.sequence import capture_frames
@@ -37,10 +38,10 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     widths, heights = zip(*(camera.size for camera in description.cameras), strict=True)
     shape = (len(description.cameras), len(plan), max(heights), max(widths), len(description.channels))
     # Where the dome is and how far it may go do not change a frame; everything else does.
-    pixels = spec.rig.model_dump(mode="json", exclude={"dome", "watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
+    pixels = spec.rig.model_dump(mode="json", exclude=set(LIMITS_OF_A_RIG))
     store = FrameStore(writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance))
 
-    with rig.in_use() as (dome, cameras):
+    with rig.in_use() as (dome, cameras), interrupting(context.raise_if_cancelled, dome.interrupt):
         # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by the dome.
         context.raise_if_cancelled()
         for finding in preflight(plan, dome, cameras, spec.rig, context.raise_if_cancelled):

@@ -74,10 +74,16 @@ class SimulatedCameraSpec(Record):
     seed: Whole = 0
 
 
+SIMULATED_DOME = "simulated"
+"""In place of a dome's address: one that is started for the capture, on loopback, and lights nobody."""
+MAX_ON_TIME_S = 60.0
+"""Longest time that a light may be on at once: the controller's strobe counts 65.5 s in its 16 bits, and 2 s of them are its margin."""
+
+
 class RigSpec(Record):
     """Which dome and cameras to capture with."""
 
-    dome: str = Field(default="simulated", description="host:port of the Modbus controller, or 'simulated' to start one on loopback")
+    dome: str = Field(default=SIMULATED_DOME, description="host:port of the Modbus controller, or 'simulated' to start one on loopback")
     cameras: Literal["simulated", "playback"] = "simulated"
     mouth: Path = Field(description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see")
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
@@ -90,7 +96,14 @@ class RigSpec(Record):
     total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
+    @property
+    def is_simulated(self) -> bool:
+        """Whether no light is lit but on paper."""
+        return self.dome == SIMULATED_DOME
 
+
+LIMITS_OF_A_RIG = frozenset({"dome", "watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
+"""Options of a rig that change no frame: where its dome is, and how far it may go."""
 HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)})
 """Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
 

@@ -12,7 +12,7 @@ from pydantic import Field, SecretStr, ValidationError
 
 from services.core.errors import SettingsError
 from services.core.geometry import Record
-from services.core.records import JobSpec
+from services.core.records import MAX_ON_TIME_S, SIMULATED_DOME, JobSpec
 
 DATABASE_FILE = "dentine.sqlite"
 """Name of the database in the data folder."""
@@ -40,12 +40,26 @@ class UploadLimits(Record):
 
 
 class DomeSettings(Record):
-    """The dome that a server works by hand. Captures take theirs from the job."""
+    """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less, never for more."""
 
     address: str | None = Field(default=None, description="host:port of the Modbus controller, or 'simulated' for one of the server's own; default is none")
+    job_addresses: str = Field(
+        default="",
+        description="host:port of further domes that jobs may capture with, separated by commas; the server's own and 'simulated' always may",
+    )
     watchdog_s: float = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
     light_exposure_limit_s: float = Field(default=10.0, gt=0, description="most level x on-time of one light, from the rig's photobiological assessment")
     total_exposure_limit_s: float = Field(default=100.0, gt=0, description="most level x on-time of all lights together")
+    max_level: float = Field(default=1.0, gt=0, le=1, description="highest LED level, fraction of full scale")
+    max_exposure_s: float = Field(
+        default=10.0, gt=0, le=MAX_ON_TIME_S, description="longest exposure, settling included: one light at full level then takes the whole default limit"
+    )
+
+    @property
+    def allowed_addresses(self) -> frozenset[str]:
+        """Where jobs may capture."""
+        further = (one.strip() for one in self.job_addresses.split(","))
+        return frozenset(one for one in (SIMULATED_DOME, self.address, *further) if one)
 
 
 class ServerSettings(Record):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import resource
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from services.capture.dome import ExposureBudget
 from services.capture.dome_modbus import DomeObserver, ModbusDome
 from services.capture.frames import FrameStore
 from services.capture.motion import SubjectMotion
-from services.capture.plan import plan_capture
+from services.capture.plan import PlannedFrame, plan_capture
 from services.capture.preflight import preflight
 from services.capture.registers import FaultKind
 from services.capture.simulated_cameras import SimulatedCameras
@@ -36,7 +38,7 @@ from services.core.errors import (
     StoreError,
 )
 from services.core.records import CaptureManifest, FolderCapture, FrameRecord, JobSpec, RigSpec, SimulatedCameraSpec
-from services.core.stage import LocalContext, StageEvent
+from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, open_stage, read_record
 from tests.support.mouth import smooth_image, write_mouth
 from tests.support.shared_data import shared_path
@@ -201,7 +203,9 @@ class CancelAfter(LocalContext):
         self._left -= event.kind == "progress"
 
     def raise_if_cancelled(self) -> None:
-        assert not outputs(self._address).any()
+        # The lookout asks too, from a thread of its own and under light.
+        if threading.current_thread() is threading.main_thread():
+            assert not outputs(self._address).any()
         if self._left == 0:
             raise JobCancelledError("The job was cancelled.")
 
@@ -224,6 +228,82 @@ def test_a_cancelled_capture_is_dark_and_resumes(tmp_path: Path, job: Callable[.
     assert exposed == [3] * damage + list(range(5, len(fresh.frames)))
     assert np.array_equal(frames_of(root), frames_of(tmp_path / "fresh"))
     assert [frame.index for frame in resumed.frames] == [frame.index for frame in fresh.frames]
+
+
+LONG_S = 58.0
+"""An exposure that outlasts every wait of a test: whoever waits for its end has failed. At a level of 0.1 it is within the dose of a light."""
+WAIT_S = 30.0
+
+
+@pytest.fixture
+def long_job(job: Callable[..., JobSpec], monkeypatch: pytest.MonkeyPatch) -> Callable[..., JobSpec]:
+    """A job that exposes for so long as soon as a light is on; without the preflight's glimpses, and with short black frames."""
+
+    def plan(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
+        frames = plan_capture(rig, lights)
+        return tuple(frame.model_copy(update={"exposure_s": 0.01}) if frame.kind == "black" else frame for frame in frames)
+
+    monkeypatch.setattr("services.capture.rig.plan_capture", plan)
+    monkeypatch.setattr("services.capture.preflight.preflight", lambda *_: ())
+    return lambda **options: job(exposure_s=LONG_S, level=0.1, **options)
+
+
+def begin(spec: JobSpec, root: Path) -> tuple[threading.Thread, list[Exception]]:
+    """Capture in a thread; what it raises is put into the list."""
+    raised: list[Exception] = []
+
+    def capture() -> None:
+        try:
+            stage.run(spec, LocalContext(root))
+        except Exception as problem:
+            raised.append(problem)
+
+    thread = threading.Thread(target=capture)
+    thread.start()
+    return thread, raised
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s, f"waited for {WAIT_S:g} s in vain"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("cameras", ["simulated", "playback"])
+def test_a_cancel_in_mid_exposure_ends_the_capture_in_the_dark(tmp_path: Path, long_job: Callable[..., JobSpec], address: Address, cameras: str) -> None:
+    thread, raised = begin(long_job(cameras=cameras), tmp_path / "job")
+    try:
+        wait_until(lambda: outputs(address).any())
+    finally:
+        (tmp_path / "job" / CANCEL_FLAG).touch()
+    thread.join(WAIT_S)
+    assert not thread.is_alive(), "the capture waits for the end of its exposure"
+    assert [type(problem) for problem in raised] == [JobCancelledError]
+    assert not outputs(address).any()
+
+
+def test_a_cancel_darkens_a_camera_that_is_still_exposing(
+    tmp_path: Path, long_job: Callable[..., JobSpec], address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_out, reads = threading.Event(), SimulatedCameras.read
+
+    def read_late(cameras: SimulatedCameras) -> tuple[NDArray[np.uint16], ...]:
+        if outputs(address).any():
+            read_out.wait(2 * WAIT_S)
+        return reads(cameras)
+
+    monkeypatch.setattr(SimulatedCameras, "read", read_late)
+    thread, raised = begin(long_job(), tmp_path / "job")
+    try:
+        wait_until(lambda: outputs(address).any())
+        (tmp_path / "job" / CANCEL_FLAG).touch()
+        wait_until(lambda: not outputs(address).any())
+        assert thread.is_alive(), "the camera has ended, so it is not known what darkened the dome"
+    finally:
+        read_out.set()
+        thread.join(WAIT_S)
+    assert [type(problem) for problem in raised] == [JobCancelledError]
 
 
 def test_frames_of_another_capture_are_not_mixed_in(tmp_path: Path, job: Callable[..., JobSpec], address: Address) -> None:

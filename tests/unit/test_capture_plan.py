@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.capture.plan import plan_capture
+from services.capture.plan import plan_capture, preflight_frames
 from services.capture.registers import FULL_SCALE, MAX_LIGHTS
+from services.capture.rig import PlannedRig
 from services.core.errors import ExposureLimitError, SettingsError
 from services.core.records import RigSpec
+from tests.support.mouth import write_mouth
 
 LEVELS = st.floats(0.01, 1.0)
 
@@ -71,3 +73,23 @@ def test_the_total_limit_counts_every_light_and_tracking_frame(lights: int, marg
 def test_a_level_below_one_register_step_is_refused() -> None:
     with pytest.raises(SettingsError, match="below one step"):
         plan_capture(rig(level=0.0), 4)
+
+
+def test_an_exposure_that_the_controller_cannot_time_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"longer than a light may be on at once \(60 s\)"):
+        plan_capture(rig(level=0.1, exposure_s=59.0, settle_s=1.1), 4)
+    plan_capture(rig(level=0.1, exposure_s=59.0, settle_s=1.0), 4)
+
+
+@pytest.mark.parametrize(("lights", "every"), [(1, 0), (5, 0), (5, 2)])
+def test_a_dose_of_which_the_preflight_leaves_too_little_is_refused_before_any_light(lights: int, every: int, tmp_path: Path) -> None:
+    write_mouth(tmp_path, lights)
+    generous = rig(mouth=tmp_path, tracking_every=every, level=0.5, exposure_s=0.1, settle_s=0.0)
+    plan = PlannedRig.read(generous).plan
+    # The last light has the most: without tracking frames the preflight's whole frame is its.
+    planned_s, glimpsed_s = (
+        sum(frame.level * frame.on_s for frame in frames if frame.light in {lights - 1, None}) for frames in (plan, preflight_frames(plan))
+    )
+    with pytest.raises(ExposureLimitError, match="would reach"):
+        PlannedRig.read(generous.model_copy(update={"light_exposure_limit_s": planned_s + 0.99 * glimpsed_s}))
+    PlannedRig.read(generous.model_copy(update={"light_exposure_limit_s": planned_s + 1.01 * glimpsed_s}))

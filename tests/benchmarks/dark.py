@@ -1,0 +1,198 @@
+"""How long the dome stays lit after a cancel, an ALL OFF and a signal that strike in mid-exposure.
+
+python -m tests.benchmarks.dark --json dark.json --times 300
+
+A real capture lights a simulated dome over Modbus while an observer reads the registers of what is emitted, again and again, over a
+connection of its own. Each time is from just before the request or the signal was sent to the answer of the first reading that saw no
+light, with none lit after it. Exposures last 1.5 s and are struck in their first 0.6 s, so that whoever waits for the end of one takes
+0.9 s at least. Strikes are added to those in the file, which a killed run has kept. A hundred of one way take about ten minutes.
+
+==========  ==================================================================================================================
+cancel      POST /v1/jobs/<id>/cancel
+all-off     POST /v1/dome/off, for the dome of the server
+signal      SIGTERM to ``dentine capture``
+serve       SIGTERM to ``dentine serve``, with an event stream open
+==========  ==================================================================================================================
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from services.capture.dome_modbus import DomeObserver
+from services.capture.simulator import simulated_dome
+from services.core.store import write_atomic
+from tests.support.live_server import running_server
+from tests.support.mouth import write_mouth
+
+LIGHTS = 6
+EXPOSURE_S = 1.5
+STEADY_S = 0.1
+"""Lit for so long without a break, it is an exposure and none of the preflight's glimpses."""
+STRIKE_WITHIN_S = 0.5
+PATIENCE_S = 120.0
+QUIET_S = 0.3
+"""Dark for so long, nobody lights the dome any more."""
+
+
+class Observer:
+    """Reads what the dome emits all the time, from a thread of its own."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._dome, self._ending = DomeObserver(host, port), threading.Event()
+        self._lit_since_s: float | None = None
+        self._dark_since_s = time.monotonic()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._ending.is_set():
+            asked_s = time.monotonic()
+            is_lit = bool(self._dome.outputs().any())
+            if is_lit:
+                self._lit_since_s = self._lit_since_s if self._lit_since_s is not None else asked_s
+            elif self._lit_since_s is not None:
+                self._lit_since_s, self._dark_since_s = None, time.monotonic()
+
+    def await_exposure(self) -> None:
+        """Wait until a light has been on for a while, then for a random time."""
+        _wait(lambda: (since_s := self._lit_since_s) is not None and time.monotonic() > since_s + STEADY_S)
+        time.sleep(random.uniform(0, STRIKE_WITHIN_S))
+        if self._lit_since_s is None:
+            raise RuntimeError("The exposure was over before it could be struck; is the machine too busy?")
+
+    def await_dark(self) -> float:
+        """The time at which the dome was seen dark for good."""
+        _wait(lambda: self._lit_since_s is None and time.monotonic() > self._dark_since_s + QUIET_S)
+        return self._dark_since_s
+
+    def close(self) -> None:
+        """Stop looking."""
+        self._ending.set()
+        self._thread.join()
+        self._dome.close()
+
+
+class Bench:
+    """A dome, its observer, and a mouth for the cameras."""
+
+    def __init__(self, folder: Path, host: str, port: int, observer: Observer) -> None:
+        self.folder, self.observer, self._address = folder, observer, f"{host}:{port}"
+        write_mouth(folder / "mouth", LIGHTS)
+        self._count = 0
+
+    @property
+    def rig(self) -> dict[str, Any]:
+        """A rig that exposes for so long."""
+        mouth = str(self.folder / "mouth")
+        return {"mouth": mouth, "dome": self._address, "exposure_s": EXPOSURE_S, "level": 0.5, "black_frames": 1, "tracking_every": 0}
+
+    def new_folder(self) -> Path:
+        """A folder that was not used before."""
+        self._count += 1
+        return self.folder / f"run-{self._count}"
+
+    @contextmanager
+    def server(self) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
+        """``dentine serve`` with this dome."""
+        environment = os.environ | {"DENTINE__SERVER__DOME__ADDRESS": self._address}
+        command = [sys.executable, "-m", "services", "serve", "--port", "0", "--data", str(self.new_folder())]
+        with (self.folder / "server.log").open("a") as log, running_server(command, log, environment=environment) as running:
+            yield running
+
+    def strike(self, how: Callable[[], object]) -> float:
+        """Seconds from the strike in mid-exposure until it is dark."""
+        self.observer.await_exposure()
+        began_s = time.monotonic()
+        how()
+        return self.observer.await_dark() - began_s
+
+
+def strike_by_request(bench: Bench, path: str) -> Iterator[float]:
+    """Cancel, or press ALL OFF, in one capture after the other of one server."""
+    with bench.server() as (client, _):
+        while True:
+            job = client.post("/v1/jobs", json={"rig": bench.rig, "workers": 1}).raise_for_status().json()["id"]
+            yield bench.strike(lambda job=job: client.post(path.format(job=job)).raise_for_status())  # type: ignore[misc]
+            client.get(f"/v1/jobs/{job}/events")
+
+
+def strike_capture(bench: Bench) -> Iterator[float]:
+    """Send SIGTERM to one ``dentine capture`` after the other."""
+    job = bench.folder / "JOB.toml"
+    job.write_text("[rig]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in bench.rig.items()))
+    while True:
+        command = [sys.executable, "-m", "services", "capture", str(job), "--out", str(bench.new_folder())]
+        with (bench.folder / "capture.log").open("a") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+            yield bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
+
+
+def strike_server(bench: Bench) -> Iterator[float]:
+    """Send SIGTERM to one ``dentine serve`` after the other while a page follows its job."""
+    while True:
+        with bench.server() as (client, process):
+            job = client.post("/v1/jobs", json={"rig": bench.rig, "workers": 1}).raise_for_status().json()["id"]
+            with client.stream("GET", f"/v1/jobs/{job}/events"):
+                taken_s = bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
+            process.wait(PATIENCE_S)
+        yield taken_s
+
+
+WAYS: dict[str, Callable[[Bench], Iterator[float]]] = {
+    "cancel": lambda bench: strike_by_request(bench, "/v1/jobs/{job}/cancel"),
+    "all-off": lambda bench: strike_by_request(bench, "/v1/dome/off"),
+    "signal": strike_capture,
+    "serve": strike_server,
+}
+
+
+def _wait(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline_s:
+            raise RuntimeError(f"Nothing was lit or dark within {PATIENCE_S:g} s; see the logs.")
+        time.sleep(0.002)
+
+
+def main() -> None:
+    """Strike so many times each way and print the worst."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=int, default=300)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    wanted = parser.parse_args()
+    told: dict[str, Any] = json.loads(wanted.json.read_text()) if wanted.json.exists() else {}
+    with tempfile.TemporaryDirectory() as folder, simulated_dome(LIGHTS, 2.0) as (host, port):
+        observer = Observer(host, port)
+        try:
+            for way in wanted.ways:
+                seconds: list[float] = told.get(way, {}).get("seconds", [])
+                strikes = WAYS[way](Bench(Path(folder) / way, host, port, observer))
+                while len(seconds) < wanted.times:
+                    seconds.append(round(next(strikes), 4))
+                    told[way] = {"n": len(seconds), "worst_s": max(seconds), "median_s": statistics.median(seconds), "seconds": seconds}
+                    write_atomic(wanted.json, json.dumps(told, indent=1).encode())
+                strikes.close()  # type: ignore[attr-defined]
+                print(f"{way}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s", flush=True)
+        finally:
+            observer.close()
+
+
+if __name__ == "__main__":
+    main()
