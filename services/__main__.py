@@ -16,11 +16,10 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from services.core.errors import DentineError, InputError, JobCancelledError
+from services.core.errors import DentineError, InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the job's.")]
-Server = Annotated[str | None, typer.Option(help="Address of the server, such as http://127.0.0.1:8000; default: the settings'.")]
 JobFile = Annotated[Path, typer.Argument(metavar="JOB.toml", help="Options of the job.")]
 
 
@@ -55,6 +54,7 @@ def main() -> NoReturn:
 
 def build_app() -> typer.Typer:
     """Put the commands together."""
+    from services.client_commands import add_client_commands
     from services.core.settings import read_settings
     from services.dask_command import add_dask_commands
     from services.slab_command import simulate_slab_command
@@ -62,8 +62,9 @@ def build_app() -> typer.Typer:
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
-    for command in (serve, dome_sim, capture, run, upload, submit, watch, cancel, retry, export, phantom, bench):
+    for command in (serve, dome_sim, capture, run, export, phantom, bench):
         app.command()(command)
+    add_client_commands(app, lambda: read_settings(os.environ))
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
@@ -237,87 +238,6 @@ def phantom(
 
         write_phantom(out, outer=outer, dentin=dentin, fdi=fdi, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
     print(f"phantom: {out}")
-
-
-def upload(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder capture, or a published capture.")],
-    server: Server = None,
-    subject: Annotated[str | None, typer.Option(help="Pseudonymous label of the person; never a name.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Upload a capture to a server; the same command again goes on with an upload that broke."""
-    from services.upload_command import upload_folder
-
-    with _client(server) as client:
-        uploaded = upload_folder(client, folder, subject)
-    print(uploaded.model_dump_json() if as_json else uploaded.path)
-
-
-def submit(
-    job: JobFile,
-    server: Server = None,
-    send: Annotated[bool, typer.Option("--upload", help="Upload the job's capture folder first.")] = False,
-    calibration: Annotated[str | None, typer.Option(metavar="NAME", help="Calibration that the server stores, in place of the job's own.")] = None,
-    key: Annotated[str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")] = None,
-    follow: Annotated[bool, typer.Option("--watch", help="Watch the job until it ends.")] = False,
-    as_json: Json = False,
-) -> None:
-    """Submit a job to a server."""
-    from services.core.settings import read_job
-
-    spec = read_job(job)
-    with _client(server) as client:
-        if send:
-            from services.upload_command import with_uploaded_capture
-
-            spec = with_uploaded_capture(client, spec, job)
-        if calibration is not None:
-            spec = spec.model_copy(update={"calibration": Path(client.calibration(calibration)["option"])})
-        created = client.submit(spec, key)
-        print(json.dumps(created) if as_json else created["id"])
-        if follow:
-            _watch(client, created["id"])
-
-
-def watch(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None, as_json: Json = False) -> None:
-    """Watch a job until it ends; the exit status is the job's."""
-    with _client(server) as client:
-        _watch(client, job_id, as_json=as_json)
-
-
-def cancel(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None) -> None:
-    """Cancel a job; the lights go off first and what is published is kept."""
-    with _client(server) as client:
-        print(client.cancel(job_id)["state"])
-
-
-def retry(job_id: Annotated[str, typer.Argument(metavar="ID", help="Id that submit printed.")], server: Server = None) -> None:
-    """Queue a failed or cancelled job again; it resumes from what it had published."""
-    with _client(server) as client:
-        print(client.retry(job_id)["state"])
-
-
-def _client(server: str | None) -> Any:
-    from services.api.client import Client
-    from services.core.settings import read_settings
-
-    settings = read_settings(os.environ)
-    return Client(server or f"http://{settings.server.host}:{settings.server.port}", settings.client.token)
-
-
-def _watch(client: Any, job_id: str, *, as_json: bool = False) -> None:
-    from services.api.progress import ProgressView
-
-    with ProgressView(lambda: client.get(job_id)["remaining"]) as view:
-        for event in client.events(job_id):
-            view(event)
-    job = client.get(job_id)
-    print(json.dumps(job) if as_json else job["state"])
-    if job["state"] == "CANCELLED":
-        raise JobCancelledError(f"Job {job_id} was cancelled; dentine retry {job_id} resumes it.")
-    if failure := job["failure"]:
-        print(f"dentine: {failure['message']}", file=sys.stderr)
-        raise typer.Exit(failure["exit_status"])
 
 
 _BENCHMARKS = MappingProxyType(

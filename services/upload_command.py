@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.core.errors import InputError
-
 if TYPE_CHECKING:
     from services.api.client import Client
     from services.api.uploader import UploadResult
@@ -26,8 +24,10 @@ def upload_folder(client: Client, folder: Path, subject: str | None = None) -> U
     return uploaded
 
 
-def with_uploaded_capture(client: Client, spec: JobSpec, job: Path) -> JobSpec:
-    """The job with its capture uploaded and named as the server names it."""
-    if spec.capture is None:
-        raise InputError(f"Job file {job} names no capture to upload; leave out --upload.")
+def with_uploaded_source(client: Client, spec: JobSpec) -> JobSpec:
+    """The job with its capture, or its rig's mouth, uploaded and named as the server names it."""
+    if spec.rig is not None:
+        mouth = Path(upload_folder(client, spec.rig.mouth).path)
+        return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": mouth})})
+    assert spec.capture is not None
     return spec.model_copy(update={"capture": Path(upload_folder(client, spec.capture).path)})

@@ -75,9 +75,10 @@ def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors
     from services.api.body_limit import BodyLimit
     from services.api.gate import Gate
     from services.api.rates import Rates
+    from services.api.setup_links import SetupLinks
 
     sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
-    app.include_router(build_access_router(access, audit, secure=not settings.is_loopback))
+    app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
     app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
     app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors)

@@ -3,16 +3,17 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import Field
+from pydantic import Field, SecretStr
 
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
 from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import refusals
-from services.api.sessions import COOKIE
+from services.api.sessions import COOKIE, Sessions
+from services.api.setup_links import SetupLinks
 from services.api.tokens import NAME, Caller, IssuedToken, Scope, Token
-from services.core.errors import UnauthenticatedError
+from services.core.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
 from services.core.records import Number
 
@@ -23,6 +24,12 @@ class TokenRequest(Record):
     name: str = Field(description="who or what uses it", json_schema_extra={"pattern": f"^{NAME}$"})
     scopes: tuple[Scope, ...] = Field(description="what it may do", json_schema_extra={"minItems": 1})
     expires_days: Number | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
+
+
+class SetupRequest(Record):
+    """A setup link, as the server's log shows it."""
+
+    secret: SecretStr = Field(max_length=200, description="what follows #/setup/ in the link")
 
 
 class Session(Record):
@@ -40,7 +47,7 @@ class AuditPage(Record):
     next_before: int | None = Field(description="give as 'before' to get the next page; null on the last")
 
 
-def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> APIRouter:
+def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, secure: bool) -> APIRouter:
     """Routes over the given callers; ``secure`` cookies travel over TLS only."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
 
@@ -61,6 +68,20 @@ def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> API
         """End a token now, with the sessions and streams that it has opened."""
         return access.tokens.revoke(token_id, request.scope["deed"])
 
+    def open_session(sessions: Sessions, token: Token, response: Response) -> None:
+        value, lifetime_s = sessions.issue(token)
+        response.set_cookie(COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure)
+
+    @router.post("/setup", status_code=201, tags=["access"])
+    def set_up(link: SetupRequest, request: Request, response: Response) -> IssuedToken:
+        """Make the first administrator's token by the link in the server's log, which works once, and open a browser session for it."""
+        if access.sessions is None:
+            raise SetupLinkError("This server asks nobody for a token, so there is nothing to set up; open its page.")
+        issued = links.redeem(link.secret.get_secret_value(), request.scope["deed"])
+        open_session(access.sessions, issued, response)
+        response.headers["Location"] = f"/v1/tokens/{issued.id}"
+        return issued
+
     @router.get("/session", tags=["access"], dependencies=[needs("read")])
     def whoami(request: Request) -> Session:
         """Whom the server takes the caller for."""
@@ -73,8 +94,7 @@ def build_access_router(access: Access, audit: AuditLog, *, secure: bool) -> API
         if access.sessions is not None:
             if caller.token is None or caller.by_session:
                 raise UnauthenticatedError("A session does not open another one; send the token itself as 'Authorization: Bearer …'.")
-            value, lifetime_s = access.sessions.issue(caller.token)
-            response.set_cookie(COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure)
+            open_session(access.sessions, caller.token, response)
         return _session(caller, access)
 
     @router.delete("/session", status_code=204, tags=["access"], dependencies=[needs("read")])

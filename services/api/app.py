@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from services.api.dask_tls import Certificates
 from services.api.events import EventAddress
@@ -100,7 +101,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine, auditors)
     app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
-    names = {"127.0.0.1", "localhost", "::1", settings.host, *settings.names.split(",")} - {""}
+    names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
     app.add_middleware(Shield, names=names, secure=not settings.is_loopback)
     observation.watch_requests(app)
     return app

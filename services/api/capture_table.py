@@ -11,7 +11,7 @@ import sqlalchemy as sql
 
 from services.api.capture_records import Capture, CaptureState, ManifestFile, UploadManifest
 from services.api.database import metadata, writing
-from services.api.repository import job_table
+from services.api.job_table import job_table
 from services.core.errors import CaptureStateError, UnknownCaptureError
 
 capture_table = sql.Table(

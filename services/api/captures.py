@@ -172,24 +172,28 @@ class Captures:
                     self._table.delete(capture.id)
 
     @contextmanager
-    def keeping(self, path: Path | None) -> Iterator[None]:
-        """Keep an uploaded capture from being deleted while a job that names it is recorded; other paths pass.
+    def keeping(self, spec: JobSpec) -> Iterator[None]:
+        """Keep an uploaded capture from being deleted while a job that names it, as capture or mouth, is recorded; other paths pass.
 
         Raises:
             SettingsError: no such capture, or it is not committed.
         """
+        option, path = ("capture", spec.capture) if spec.rig is None else ("rig.mouth", spec.rig.mouth)
         with self._guard:
             if path is not None and is_uploaded(path):
                 try:
                     found = self._table.get(path.name)
                 except UnknownCaptureError as problem:
-                    raise SettingsError(f"Option 'capture': {problem.message}") from problem
+                    raise SettingsError(f"Option '{option}': {problem.message}") from problem
                 if found.state is not CaptureState.COMMITTED:
-                    raise SettingsError(f"Option 'capture': capture {path.name} is {found.state}; commit it first with POST /v1/captures/{path.name}/commit.")
+                    what = f"capture {path.name} is {found.state}; commit it first with POST /v1/captures/{path.name}/commit"
+                    raise SettingsError(f"Option '{option}': {what}.")
             yield
 
     def locate(self, spec: JobSpec) -> JobSpec:
-        """The job with an uploaded capture's folder instead of its name."""
+        """The job with the folder of an uploaded capture, or of an uploaded mouth of its rig, instead of its name."""
+        if spec.rig is not None and is_uploaded(spec.rig.mouth):
+            return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": self._data / spec.rig.mouth})})
         if spec.capture is None or not is_uploaded(spec.capture):
             return spec
         return spec.model_copy(update={"capture": self._data / spec.capture})

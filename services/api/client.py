@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from pydantic import SecretStr
 
+from services.api.downloads import telling_lost, whole_file
 from services.api.events import JobEvent
 from services.api.exchange import RECONNECT_S, Ask, EventCursor, Exchange, Flow, Pause, Work, error_in
 from services.core.records import JobSpec
@@ -38,9 +39,29 @@ class Client:
     def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
         self._http.close()
 
-    def submit(self, spec: JobSpec, key: str | None = None) -> dict[str, Any]:
-        """Submit a job; the same key and options give the same job."""
-        return self.run(self._exchange.submit(spec, key))
+    def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
+        """Submit a job, under a label where it is given one; the same key and options give the same job."""
+        return self.run(self._exchange.submit(spec, key, name))
+
+    def jobs(self, limit: int = 50, before: int | None = None, **only: Any) -> dict[str, Any]:
+        """Some jobs, newest first; ``only`` are the filters of GET /v1/jobs."""
+        return self.run(self._exchange.jobs(limit, before, **only))
+
+    def delete(self, job_id: str) -> dict[str, Any]:
+        """Remove what is stored of a job that has ended; the answer is the receipt."""
+        return self.run(self._exchange.delete(job_id))
+
+    def download(self, job_id: str, out: Path) -> int:
+        """Write all files of a job into one zip; returns its size in bytes. A broken download leaves no file."""
+        ask = self._exchange.archive(job_id)
+        with telling_lost(self._exchange.server), self._http.stream(ask.method, ask.path) as response:
+            if response.is_error:
+                response.read()
+                raise error_in(response)
+            with whole_file(out) as stream:
+                for piece in response.iter_bytes():
+                    stream.write(piece)
+        return out.stat().st_size
 
     def calibration(self, name: str) -> dict[str, Any]:
         """A stored calibration; its 'option' is what a job takes."""
@@ -134,9 +155,30 @@ class AsyncClient:
     async def __aexit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
         await self._http.aclose()
 
-    async def submit(self, spec: JobSpec, key: str | None = None) -> dict[str, Any]:
+    async def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.submit(spec, key))
+        return await self.run(self._exchange.submit(spec, key, name))
+
+    async def jobs(self, limit: int = 50, before: int | None = None, **only: Any) -> dict[str, Any]:
+        """See ``Client``."""
+        return await self.run(self._exchange.jobs(limit, before, **only))
+
+    async def delete(self, job_id: str) -> dict[str, Any]:
+        """See ``Client``."""
+        return await self.run(self._exchange.delete(job_id))
+
+    async def download(self, job_id: str, out: Path) -> int:
+        """See ``Client``."""
+        ask = self._exchange.archive(job_id)
+        with telling_lost(self._exchange.server):
+            async with self._http.stream(ask.method, ask.path) as response:
+                if response.is_error:
+                    await response.aread()
+                    raise error_in(response)
+                with whole_file(out) as stream:
+                    async for piece in response.aiter_bytes():
+                        stream.write(piece)
+        return out.stat().st_size
 
     async def calibration(self, name: str) -> dict[str, Any]:
         """See ``Client``."""

@@ -63,19 +63,34 @@ class Exchange:
         """Arguments of ``httpx.Client`` and of ``httpx.AsyncClient``.
 
         Raises:
-            PlatformError: httpx is not installed.
+            PlatformError: httpx is not installed, as in a broken environment.
         """
         try:
             import httpx
         except ModuleNotFoundError as problem:
-            raise PlatformError("The client's packages are not installed; install dentine[api].") from problem
+            raise PlatformError("The client's package httpx is not installed; install dentine again, which brings it.") from problem
         headers = {} if self._token is None else {"Authorization": f"Bearer {self._token.get_secret_value()}"}
         return {"base_url": f"{self.server.rstrip('/')}/v1", "headers": headers, "timeout": httpx.Timeout(10.0, read=60.0), "trust_env": False}
 
-    def submit(self, spec: JobSpec, key: str | None = None) -> Flow[dict[str, Any]]:
+    def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> Flow[dict[str, Any]]:
         """Submit a job."""
         headers = {"Idempotency-Key": key} if key is not None else {}
-        return self._answer("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True), headers=headers)
+        label = {} if name is None else {"name": name}
+        return self._answer("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True) | label, headers=headers)
+
+    def jobs(self, limit: int, before: int | None = None, **only: Any) -> Flow[dict[str, Any]]:
+        """Some jobs, newest first; ``only`` are the list's filters."""
+        asked = {"limit": limit, "before": before} | only
+        return self._answer("GET", "/jobs", params={name: value for name, value in asked.items() if value is not None})
+
+    def delete(self, job_id: str) -> Flow[dict[str, Any]]:
+        """Remove what is stored of a job."""
+        return self._answer("DELETE", f"/jobs/{quote(job_id, safe='')}")
+
+    @staticmethod
+    def archive(job_id: str) -> Ask:
+        """The request for a job's files as one zip; its answer is to be streamed."""
+        return Ask("GET", f"/jobs/{quote(job_id, safe='')}/artifacts.zip")
 
     def calibration(self, name: str) -> Flow[dict[str, Any]]:
         """A stored calibration; its 'option' is what a job takes."""

@@ -17,7 +17,7 @@ from starlette.responses import Response
 from services.api.access import Access
 from services.api.audit import AuditLog, Deed
 from services.api.clerks import Clerks
-from services.api.guard import LIVENESS, Found, GuardedRoute, find_route, guarded_routes
+from services.api.guard import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
 from services.api.problems import MEDIA_TYPE, Problem, database_lost, response_of
 from services.api.rates import Rates, network_of
 from services.api.requests import method_of
@@ -52,7 +52,7 @@ class Gate:
         request = HTTPConnection(scope)
         deed = Deed(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
         try:
-            refusal = await self._refusal(request, found, deed)
+            refusal = await (self._stranger_refusal(request, deed) if _is_setup(found) else self._refusal(request, found, deed))
         except SQLAlchemyError:
             refusal = database_lost(scope["path"])
         if refusal is not None:
@@ -85,13 +85,24 @@ class Gate:
         request.scope["caller"], request.scope["deed"] = caller, deed
         return None
 
+    async def _stranger_refusal(self, request: HTTPConnection, deed: Deed) -> Response | None:
+        """The answer to somebody with a setup link who may not even try it: each try counts as a request without a valid token."""
+        deed.who, request.scope["deed"] = "setup link", deed
+        if wait_s := self._rates.count_refusal(network_of(deed.address)):
+            await self._tell_of_many(deed)
+            return _too_many(f"Address {deed.address} asked", wait_s, request.scope["path"])
+        return None
+
+    async def _tell_of_many(self, deed: Deed) -> None:
+        if self._rates.is_worth_telling(network_of(deed.address)):
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+
     async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, deed: Deed) -> Response:
         """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
         credential = Access.credential(request)
         deed.token = public_id(credential) if credential else None
         if wait_s := self._rates.count_refusal(network_of(deed.address)):
-            if self._rates.is_worth_telling(network_of(deed.address)):
-                await self._auditors.ask(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+            await self._tell_of_many(deed)
             return _too_many(f"Address {deed.address} was refused", wait_s, request.scope["path"])
         await self._auditors.ask(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
         challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
@@ -147,6 +158,10 @@ def _is_public(scope: Scope, found: Found) -> bool:
     if found.route is not None:
         return found.route.template == LIVENESS
     return not scope["path"].startswith("/v1/") and not found.allowed_methods
+
+
+def _is_setup(found: Found) -> bool:
+    return found.route is not None and found.route.template == SETUP
 
 
 def _address(scope: Scope) -> str:

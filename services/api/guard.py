@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 LIVENESS = "/v1/health/live"
 """The one route that needs no scope: who asks it has no token, and it tells nothing."""
+SETUP = "/v1/setup"
+"""Takes a setup link, which stands for no caller; the gate counts and audits who comes with one."""
 PAGE = "dashboard"
 """Name of the mount with the static page, which holds no data."""
 

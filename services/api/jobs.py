@@ -16,11 +16,12 @@ from services.api.captures import Captures, is_uploaded
 from services.api.data_folder import require_own_folder
 from services.api.erasure import erase, forget_listing
 from services.api.events import EventAddress, JobEvent
+from services.api.job_table import JobFilter
 from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.light_limits import LightLimits
 from services.api.machine_class import machine_class
 from services.api.pipeline import request_cancel, stages_of
-from services.api.repository import Creation, Deletion, Job, JobFilter, Repository
+from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
 from services.api.time_ranges import TimeRange, TimeRanges
 from services.core.errors import JobStateError, SettingsError, StoreError, UnknownJobError
@@ -94,8 +95,8 @@ class Jobs:
         """A job's options with the files of what the server stores for it."""
         return self.calibrations.locate(self.captures.locate(spec))
 
-    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None) -> Creation:
-        """Queue a job.
+    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None, name: str | None = None) -> Creation:
+        """Queue a job, under a label where it is given one.
 
         Raises:
             SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
@@ -104,17 +105,18 @@ class Jobs:
         if key is not None and (earlier := self.repository.submitted(spec, key)) is not None:
             return Creation(earlier, is_new=False)
         if spec.capture is not None and not is_uploaded(spec.capture):
-            require_server_path("capture", spec.capture)
+            require_server_path("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
         if spec.rig is not None:
             self._light_limits.require(spec.rig)
-            require_server_path("rig.mouth", spec.rig.mouth)
+        if spec.rig is not None and not is_uploaded(spec.rig.mouth):
+            require_server_path("rig.mouth", spec.rig.mouth, "upload it with dentine submit --upload, or try the demonstration with dentine demo")
         if spec.calibration is not None and is_stored(spec.calibration):
             self.calibrations.require(spec.calibration)
         elif spec.calibration is not None:
             require_server_path("calibration", spec.calibration)
         self._admission.refuse_too_large(self.locate(spec))  # before other submissions have to wait, as it walks through the capture
-        with self.captures.keeping(spec.capture):
-            creation = self.repository.create(spec, key, request_id)
+        with self.captures.keeping(spec):
+            creation = self.repository.create(spec, key, request_id, name)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
         return creation
@@ -215,8 +217,8 @@ class Jobs:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
 
 
-def require_server_path(option: str, path: Path) -> None:
-    """Refuse a path that means nothing on the server.
+def require_server_path(option: str, path: Path, remedy: str = "check the path") -> None:
+    """Refuse a path that means nothing on the server; ``remedy`` says what to do about one that is absent.
 
     Raises:
         SettingsError: it is relative or absent.
@@ -224,7 +226,7 @@ def require_server_path(option: str, path: Path) -> None:
     if not path.is_absolute():
         raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
     if not _is_there(path):
-        raise SettingsError(f"Option '{option}': {path} does not exist on the server; check the path.")
+        raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
 
 
 def _is_there(path: Path) -> bool:

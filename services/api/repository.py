@@ -9,55 +9,28 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import Query, metadata, open_database, writing
+from services.api.database import Query, open_database, writing
 from services.api.events import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
+from services.api.job_table import JobFilter, deletion_table, job_table
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
 from services.api.past_runs import PastRuns, past_run_table
 from services.api.webhook_outbox import collect_changes
 from services.core.errors import DentineError, FencedError, JobStateError, UnknownJobError
 from services.core.geometry import Record
-from services.core.records import JobSpec
+from services.core.records import JobName, JobSpec
 from services.core.stage import StageName
 
 KNOWN_JOBS = 1024
 """Jobs, and their options, that are kept as they were read."""
-
-job_table = sql.Table(
-    "job",
-    metadata,
-    sql.Column("number", sql.Integer, primary_key=True),
-    sql.Column("id", sql.Text, nullable=False, unique=True),
-    sql.Column("key", sql.Text, unique=True),
-    sql.Column("state", sql.Text, nullable=False, index=True),
-    sql.Column("created_s", sql.Float, nullable=False),
-    sql.Column("changed_s", sql.Float, nullable=False),
-    sql.Column("spec", sql.Text, nullable=False),
-    sql.Column("failure", sql.Text),
-    sql.Column("request_id", sql.Text),
-    sql.Column("kind", sql.Text),
-    sql.Column("source", sql.Text),
-    sqlite_autoincrement=True,
-)
-
-deletion_table = sql.Table(
-    "deletion",
-    metadata,
-    sql.Column("job", sql.Text, primary_key=True),
-    sql.Column("deleted_s", sql.Float, nullable=False),
-    sql.Column("submitted_s", sql.Float, nullable=False),
-    sql.Column("files", sql.Integer, nullable=False),
-    sql.Column("bytes", sql.BigInteger, nullable=False),
-    sql.Column("digest", sql.Text, nullable=False),
-)
 
 
 class Failure(Record):
@@ -86,29 +59,7 @@ class Job(Record):
     spec: JobSpec
     failure: Failure | None
     request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
-
-
-class JobFilter(Record):
-    """Which jobs to list; what is left out allows any."""
-
-    states: tuple[JobState, ...] = ()
-    kind: Literal["tooth", "jaw"] | None = None
-    created_after_s: float | None = Field(default=None, description="Unix time")
-    created_before_s: float | None = Field(default=None, description="Unix time")
-    source: str | None = Field(default=None, description="text in the path of the capture or of the rig's mouth, in any case")
-
-    def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
-        """What a row of the job table must fulfil."""
-        if self.states:
-            yield sql.or_(*(job_table.c.state == state.value for state in sorted(set(self.states))))  # each once, as SQLite nests no more than 1000 of them
-        if self.kind is not None:
-            yield job_table.c.kind == self.kind
-        if self.created_after_s is not None:
-            yield job_table.c.created_s > self.created_after_s
-        if self.created_before_s is not None:
-            yield job_table.c.created_s < self.created_before_s
-        if self.source is not None:
-            yield job_table.c.source.icontains(self.source, autoescape=True)
+    name: JobName | None = Field(default=None, description="label that a person gave it")
 
 
 class Deletion(Record):
@@ -176,7 +127,7 @@ class Repository:
         """Close every connection."""
         self.engine.dispose()
 
-    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None) -> Creation:
+    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None, name: str | None = None) -> Creation:
         """Insert a job as QUEUED, or find the one that was submitted with this idempotency key.
 
         Raises:
@@ -188,11 +139,21 @@ class Repository:
                 return Creation(self._same(earlier, spec, key), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
             row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
-            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture)}
+            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture), "name": name}
             connection.execute(_INSERT, row)
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
             return Creation(self._find(connection, job_id), is_new=True)
+
+    def rename(self, job_id: str, name: str | None) -> Job:
+        """Give a job another label, or none.
+
+        Raises:
+            UnknownJobError: there is no such job.
+        """
+        with writing(self.engine) as connection:
+            connection.execute(job_table.update().where(job_table.c.id == job_id).values(name=name))
+            return self._find(connection, job_id)
 
     def submitted(self, spec: JobSpec, key: str) -> Job | None:
         """The job that was submitted with this idempotency key, if there is one.
@@ -372,7 +333,7 @@ class Repository:
         return self._known(*row)
 
     def _read(self, *row: Any) -> Job:
-        job_id, number, state, created_s, changed_s, spec, failure, request_id = row
+        job_id, number, state, created_s, changed_s, spec, failure, request_id, name = row
         return Job(
             id=job_id,
             number=number,
@@ -382,6 +343,7 @@ class Repository:
             spec=self._spec_of(spec),
             failure=Failure.model_validate_json(failure) if failure else None,
             request_id=request_id,
+            name=name,
         )
 
     def _apply(self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:

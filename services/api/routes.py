@@ -13,17 +13,34 @@ from services.api.clerks import Clerks
 from services.api.database import MOST_ID
 from services.api.feed import EVENT_ANSWERS, EventFeed
 from services.api.guard import needs, require
+from services.api.job_table import JobFilter
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
 from services.api.problems import refusals
-from services.api.repository import Deletion, Job, JobFilter
+from services.api.repository import Deletion, Job
 from services.api.time_ranges import TimeRange
 from services.api.tokens import Scope
 from services.core.geometry import Record
-from services.core.records import JobSpec
+from services.core.records import JobName, JobSpec
 
 LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
+
+
+class Submission(JobSpec):
+    """A job's options and, besides, its label."""
+
+    name: JobName | None = Field(default=None, description="label of the job, for people")
+
+    def spec(self) -> JobSpec:
+        """The options alone."""
+        return JobSpec.model_construct(self.model_fields_set - {"name"}, **{name: getattr(self, name) for name in JobSpec.model_fields})
+
+
+class Label(Record):
+    """What a person calls a job."""
+
+    name: JobName | None = Field(description="null takes the label away")
 
 
 class JobPage(Record):
@@ -69,14 +86,14 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
             return TimeRange(reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again.")
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
-    def submit(spec: JobSpec, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
+    def submit(wanted: Submission, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200.
 
         A job with a rig needs scope operate-dome too, unless its dome is simulated.
         """
-        if spec.rig is not None and not spec.rig.is_simulated:
+        if wanted.rig is not None and not wanted.rig.is_simulated:
             require(request.scope.get("caller"), Scope.OPERATE_DOME)
-        creation = jobs.submit(spec, idempotency_key, request.state.request_id)
+        creation = jobs.submit(wanted.spec(), idempotency_key, request.state.request_id, wanted.name)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
         return creation.job
@@ -103,6 +120,11 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         """One job with its stages."""
         found = await readers.ask(find, job_id)
         return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found))
+
+    @router.patch("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
+    def rename(job_id: str, label: Label) -> Job:
+        """Give a job another label, or none; nothing else of it can be changed."""
+        return jobs.repository.rename(job_id, label.name)
 
     @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def cancel(job_id: str) -> Job:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import signal
 import socket
 import sys
@@ -15,8 +16,10 @@ from typing import TYPE_CHECKING
 from services.api.access import refuse_open_network
 from services.api.app import STATIC, create_app
 from services.api.collector import leave_alone_what_is_loaded
+from services.api.database import open_database
 from services.api.logs import configure_logs
 from services.api.runner import RunJob
+from services.api.setup_links import SetupLinks, setup_address
 from services.api.workers import Workers
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
@@ -47,6 +50,8 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
         proxies, app = settings.trusted_proxies, create_app(settings, run, workers)
+        if settings.access == "tokens":
+            _tell_setup_link(settings, port)
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -61,6 +66,18 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
         leave_alone_what_is_loaded()
         server.run(sockets=[listener])
+
+
+def _tell_setup_link(settings: ServerSettings, port: int) -> None:
+    """Write to the log how to make the first token, where there is none."""
+    engine = open_database(settings.database_url)
+    try:
+        secret = SetupLinks(engine).issue()
+    finally:
+        engine.dispose()
+    if secret is not None:
+        link = f"{setup_address(settings, port)}/#/setup/{secret.get_secret_value()}"
+        logging.getLogger(__name__).info("Nobody has a token yet. Open this link within an hour to make the administrator's: %s", link)
 
 
 def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:

@@ -154,18 +154,12 @@ class Tokens:
             raise InputError(f"Token name {name!r} does not serve; {what}.")
         if not (wanted := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
-        token_id, now = secrets.token_hex(6), self._clock()
-        secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
-        row = {"id": token_id, "name": name, "scopes": " ".join(wanted), "sha256": _hash(secret.get_secret_value()), "created_s": now}
-        row |= {"expires_s": None if expires_days is None else now + expires_days * DAY_S, "revoked_s": None, "last_used_s": None}
+        now = self._clock()
         with writing(self._engine) as connection:
             namesake = sql.select(token_table).where(token_table.c.name == name, token_table.c.revoked_s.is_(None))
             if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
                 raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
-            connection.execute(token_table.insert().values(row))
-            deed.ids["token_id"] = token_id
-            deed.write(connection, 201)
-        return IssuedToken(**_fields(row), token=secret)
+            return insert_token(connection, name, wanted, now, None if expires_days is None else now + expires_days * DAY_S, deed)
 
     def list(self) -> list[Token]:
         """Every token, newest first, revoked and expired ones too."""
@@ -240,6 +234,18 @@ class Tokens:
         if row["last_used_s"] is None or now - row["last_used_s"] >= LAST_USE_STEP_S:
             with suppress(sql.exc.OperationalError), writing(self._engine) as connection:  # a full disk must not refuse a reader
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
+
+
+def insert_token(connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, deed: Deed) -> IssuedToken:
+    """Add a token, and the audit's row of it, inside the caller's transaction."""
+    token_id = secrets.token_hex(6)
+    secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
+    row = {"id": token_id, "name": name, "scopes": " ".join(scopes), "sha256": _hash(secret.get_secret_value()), "created_s": now_s}
+    row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None}
+    connection.execute(token_table.insert().values(row))
+    deed.ids["token_id"] = token_id
+    deed.write(connection, 201)
+    return IssuedToken(**_fields(row), token=secret)
 
 
 def public_id(credential: str) -> str | None:

@@ -11,8 +11,9 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.database import Query
+from services.api.job_table import job_table
 from services.api.lifecycle import JobState
-from services.api.repository import Repository, job_table
+from services.api.repository import Repository
 from services.api.workers import Workers
 from services.core.geometry import Record
 from services.core.stage import StageName

@@ -35,6 +35,7 @@
     ├── AccessError           the caller may not do this
     │   ├── UnauthenticatedError no token, or one that is unknown, expired or revoked
     │   ├── ScopeError        the token lacks the scope that the route needs
+    │   ├── SetupLinkError    the link that makes the first token is void
     │   └── RateError         too many requests in a short time
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
@@ -223,6 +224,12 @@ class ScopeError(AccessError):
     """The caller's token lacks the scope that the route needs."""
 
     code = "scope-missing"
+
+
+class SetupLinkError(AccessError):
+    """The link that makes the first token was used, has expired, or never was."""
+
+    code = "setup-link-void"
 
 
 class RateError(AccessError):

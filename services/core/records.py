@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, StringConstraints, model_validator
 from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Name, Record, Vector3
@@ -23,6 +23,8 @@ Number = Annotated[float, Strict()]
 """Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level": true."""
 Whole = Annotated[int, BeforeValidator(_no_stand_in)]
 """The same, but 2.0 is whole too."""
+JobName = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""A label that a person gives a job: one line, as long as a list of jobs can show."""
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]

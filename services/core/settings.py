@@ -74,6 +74,9 @@ class ServerSettings(Record):
     keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
     private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
     access: Literal["tokens", "open"] = Field(default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only")
+    public_url: str | None = Field(
+        default=None, pattern=r"^https?://[^\s#?]+$", description="address of the page as people reach it, such as https://teeth.example.org"
+    )
     names: str = Field(default="", description="further host names that clients use for this server, separated by commas")
     trusted_proxies: str = Field(default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas")
     session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")

@@ -12,12 +12,13 @@ import sqlalchemy as sql
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from services.api import audit, capture_table, data_folder, tokens, webhook_tables
+from services.api import audit, capture_table, data_folder, setup_links, tokens, webhook_tables
 from services.api.database import Query, metadata, open_database, patiently, sqlite_url, writing
 from services.api.events import event_table
+from services.api.job_table import JobFilter, job_table
 from services.api.lifecycle import JobState, Trigger
 from services.api.migrations import FIRST, upgrade
-from services.api.repository import Failure, JobFilter, Repository, job_table
+from services.api.repository import Failure, Repository
 from services.core.errors import FencedError, JobStateError, SettingsError, UnknownJobError
 from services.core.records import JobSpec
 from tests.support.postgres import PostgresServer, new_database, postgres_server
@@ -225,7 +226,8 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
-    for table in (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table, data_folder.data_folder_table):
+    known = (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table, data_folder.data_folder_table)
+    for table in (*known, setup_links.setup_link_table):
         assert table.metadata is metadata
     with repository.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []

@@ -12,6 +12,8 @@ export interface Job {
   changed_s: number;
   spec: { capture: string | null; rig: { mouth: string } | null };
   failure: { code: string; message: string; stage: string | null } | null;
+  /** Label that a person gave it. */
+  name: string | null;
 }
 
 export interface Stage {
@@ -36,6 +38,13 @@ export interface JobDetail extends Job {
   waits_for: string | null;
   /** Null unless the job waits or runs. */
   remaining: TimeRange | null;
+}
+
+/** The receipt of a deleted job. */
+export interface Deletion {
+  job: string;
+  files: number;
+  bytes: number;
 }
 
 export interface JobEvent {
@@ -93,6 +102,12 @@ export interface Session {
   is_open: boolean;
 }
 
+/** A token on the one occasion when its secret is shown. */
+export interface IssuedToken {
+  name: string;
+  token: string;
+}
+
 export interface DomeStatus {
   firmware: string;
   light_count: number;
@@ -140,7 +155,7 @@ export function sentenceOf(problem: unknown): string {
   return problem instanceof Error ? problem.message : String(problem);
 }
 
-async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
+export async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
   const sent = body ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) } : { method, headers };
   const answer = await fetch(`/v1${path}`, sent);
   if (!answer.ok) {
@@ -152,11 +167,14 @@ async function ask<T>(path: string, method = "GET", headers: Record<string, stri
 
 export const getSession = (): Promise<Session> => ask("/session");
 export const signIn = (token: string): Promise<Session> => ask("/session", "POST", { Authorization: `Bearer ${token}` });
+export const setUp = (secret: string): Promise<IssuedToken> => ask("/setup", "POST", {}, { secret });
 export const signOut = (): Promise<void> => ask("/session", "DELETE");
 
 export const listJobs = (limit: number, before?: number): Promise<JobPage> => ask(`/jobs?limit=${limit}${before === undefined ? "" : `&before=${before}`}`);
 export const listWorkers = (): Promise<Workers> => ask("/workers");
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
+export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
+export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
 export const getDome = (): Promise<DomeState> => ask("/dome");
@@ -166,6 +184,8 @@ export const darken = (): Promise<DomeStatus> => ask("/dome/light", "DELETE");
 export const preflight = (mouth: string): Promise<{ findings: string[] }> => ask("/dome/preflight", "POST", {}, { mouth });
 export const listArtifacts = (id: string): Promise<Artifact[]> => ask(`/jobs/${id}/artifacts`);
 export const getParameters = (id: string): Promise<Parameters> => ask(`/jobs/${id}/artifacts/parameters.json`);
+
+export const archiveUrl = (id: string): string => `/v1/jobs/${id}/artifacts.zip`;
 
 export function artifactUrl(id: string, path: string): string {
   return `/v1/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;

@@ -5,11 +5,13 @@ import { DomeView } from "./domeView";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
 import { JobView } from "./jobView";
+import { SetupView } from "./setupView";
 import { SignIn } from "./signIn";
 import { WorkerList } from "./workerList";
 
 const REFRESH_MS = 3000;
 const DOME = "#/dome";
+const SETUP = /^#\/setup\/([\w-]+)$/;
 const LOST = "Connection lost; trying again.";
 
 const main = find("main");
@@ -69,7 +71,7 @@ async function open(): Promise<void> {
     showProblem(`No job has the address ${location.hash}; choose one from the list.`);
     return;
   }
-  const opened = isDome ? new DomeView(showViewConnection) : new JobView(id, () => void refreshList(), showViewConnection);
+  const opened = isDome ? new DomeView(showViewConnection) : new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection);
   view = opened;
   try {
     await opened.start();
@@ -81,6 +83,15 @@ async function open(): Promise<void> {
     isViewDue = mayPass(problem);
     showProblem(isViewDue ? `${sentenceOf(problem)} Trying again.` : sentenceOf(problem));
   }
+}
+
+/** Where a job was deleted: the newest one that is left. */
+async function showNewest(): Promise<void> {
+  leave();
+  main.replaceChildren();
+  history.replaceState(null, "", "#");
+  isViewDue = true;
+  await refreshList();
 }
 
 function leave(): void {
@@ -99,13 +110,17 @@ function askForToken(): void {
   if (isSignedOut) return;
   isSignedOut = true;
   leave();
+  hideAll();
+  const form = new SignIn(() => void start());
+  main.replaceChildren(form.root);
+  form.root.querySelector("input")?.focus();
+}
+
+function hideAll(): void {
   jobs.hidden = true;
   domeLink.hidden = true;
   workers.hidden = true;
   account.replaceChildren();
-  const form = new SignIn(() => void start());
-  main.replaceChildren(form.root);
-  form.root.querySelector("input")?.focus();
 }
 
 async function showAccount(): Promise<void> {
@@ -126,6 +141,13 @@ async function showAccount(): Promise<void> {
 }
 
 async function start(): Promise<void> {
+  const secret = location.hash.match(SETUP)?.[1];
+  if (secret) {
+    isSignedOut = true;
+    hideAll();
+    main.replaceChildren(new SetupView(secret, () => void start()).root);
+    return;
+  }
   isSignedOut = false;
   isViewDue = true;
   isAccountDue = true;

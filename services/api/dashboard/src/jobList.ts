@@ -12,7 +12,7 @@ export class JobList {
   private readonly items = element("ul");
   private readonly more = element("button", { type: "button" }, "Older jobs");
   private readonly refusal = element("p", { class: "failure", role: "alert" });
-  private readonly empty = element("p", { class: "soft" }, "No job yet. Submit one: dentine submit JOB.toml");
+  private readonly empty = element("p", { class: "soft" }, "No job yet.");
   /** Newest first, without a gap. */
   private jobs: Job[] = [];
   private showsOlder = false;
@@ -64,7 +64,7 @@ export class JobList {
 
   private draw(jobs: Job[]): void {
     this.jobs = jobs;
-    const state = JSON.stringify(jobs.map((job) => [job.id, job.state]));
+    const state = JSON.stringify(jobs.map((job) => [job.id, job.state, job.name]));
     this.empty.hidden = jobs.length > 0;
     if (state === this.drawn) return;
     this.drawn = state;
@@ -75,7 +75,8 @@ export class JobList {
 
   private link(job: Job): HTMLAnchorElement {
     const badge = element("span", { class: "badge", "data-state": job.state }, job.state.toLowerCase());
-    const link = element("a", { href: `#/${job.id}` }, element("strong", {}, `Job ${job.number}`), badge, element("span", { class: "soft" }, when(job.created_s)));
+    const label = job.name ? [element("span", { class: "name" }, job.name)] : [];
+    const link = element("a", { href: `#/${job.id}` }, element("strong", {}, `Job ${job.number}`), badge, ...label, element("span", { class: "soft" }, when(job.created_s)));
     this.mark(link);
     return link;
   }

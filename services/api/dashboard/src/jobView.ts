@@ -3,28 +3,25 @@
 import {
   type Artifact,
   artifactUrl,
-  cancelJob,
   followEvents,
   getJob,
   getParameters,
   type Job,
   type JobDetail,
   type JobEvent,
-  type JobState,
   listArtifacts,
   mayPass,
-  retryJob,
   sentenceOf,
   Unauthenticated,
 } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { bytes, remaining, when } from "./format";
+import { JobActions } from "./jobActions";
 import { LossChart } from "./lossChart";
 import { ParameterTable } from "./parameterTable";
 import { StageList } from "./stageList";
 
-const FINAL: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
 const ASK_AGAIN_MS = 5000;
 
 export class JobView {
@@ -34,7 +31,8 @@ export class JobView {
   private readonly remaining = element("p", { class: "soft remaining" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
-  private readonly action = element("button", { type: "button" });
+  private readonly title = element("h2");
+  private readonly actions: JobActions;
   private readonly report = element("a", { class: "report", target: "_blank", rel: "noopener" }, "Open the report");
   private readonly stages = new StageList();
   private readonly chart = new LossChart();
@@ -42,7 +40,6 @@ export class JobView {
   private readonly comparison: Comparison;
   private readonly filesRefusal = element("p", { class: "failure", role: "alert" });
   private readonly files = element("ul", { class: "files" });
-  private current: JobState = "SUBMITTED";
   /** Of a jaw: the tooth that is looked at alone, null for all together; undefined before the first step. */
   private tooth: number | null | undefined;
   private areFilesDue = false;
@@ -53,6 +50,7 @@ export class JobView {
   constructor(
     private readonly id: string,
     private readonly onChange: () => void,
+    onDeleted: () => void,
     private readonly onConnection: (open: boolean) => void,
   ) {
     this.comparison = new Comparison(id);
@@ -61,7 +59,7 @@ export class JobView {
     this.filesRefusal.hidden = true;
     this.report.hidden = true;
     this.report.href = artifactUrl(id, "report.html");
-    this.action.addEventListener("click", () => void this.act());
+    this.actions = new JobActions(id, { changed: (job, again) => this.changed(job, again), deleted: onDeleted, refused: (problem) => this.refuse(problem) });
   }
 
   /** Fill the view and follow the job until `stop`. */
@@ -71,11 +69,12 @@ export class JobView {
     const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
     const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
     this.root.replaceChildren(
-      element("header", {}, element("h2", {}, `Job ${job.number}`), this.state, this.action, this.report),
+      element("header", {}, this.title, this.state, this.report),
       element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
       this.waits,
       this.failure,
       this.refusal,
+      this.actions.root,
       section("Stages", this.stages.root, this.remaining),
       section("Fit", this.chart.root),
       section("Render and photograph", this.comparison.root),
@@ -163,28 +162,19 @@ export class JobView {
   }
 
   private showState(job: Job): void {
-    this.current = job.state;
+    this.title.textContent = job.name ? `Job ${job.number} · ${job.name}` : `Job ${job.number}`;
+    this.actions.show(job);
     this.state.textContent = job.state.toLowerCase();
     this.state.dataset["state"] = job.state;
     this.failure.hidden = job.failure === null;
     this.failure.textContent = job.failure ? `${job.failure.stage ?? "job"}: ${job.failure.message}` : "";
-    this.action.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
-    this.action.textContent = FINAL.includes(job.state) ? "Retry" : "Cancel";
   }
 
-  private async act(): Promise<void> {
-    const retry = FINAL.includes(this.current);
+  private changed(job: Job, again: boolean): void {
+    if (this.isStopped) return;
     this.refusal.hidden = true;
-    try {
-      const job = await (retry ? retryJob : cancelJob)(this.id);
-      if (this.isStopped) return;
-      this.showState(job);
-    } catch (problem) {
-      if (problem instanceof Unauthenticated) throw problem;
-      this.refuse(problem);
-      return;
-    }
-    if (retry) this.follow();
+    this.showState(job);
+    if (again) this.follow();
     this.onChange();
   }
 

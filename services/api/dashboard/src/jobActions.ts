@@ -1,0 +1,98 @@
+/** What a person does with one job: name, cancel, retry, download, delete. Deleting asks first, and says what goes. */
+
+import { archiveUrl, cancelJob, deleteJob, type Job, type JobState, listArtifacts, renameJob, retryJob, Unauthenticated } from "./api";
+import { element } from "./element";
+import { bytes } from "./format";
+
+const ENDED: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
+const LONGEST_NAME = 80;
+
+export interface Consequences {
+  /** The job's state has changed; `again` where it was queued again. */
+  changed: (job: Job, again: boolean) => void;
+  deleted: () => void;
+  refused: (problem: unknown) => void;
+}
+
+export class JobActions {
+  private readonly act = element("button", { type: "button" });
+  private readonly rename = element("button", { type: "button" }, "Name…");
+  private readonly download = element("a", { class: "button", download: "" }, "Download all (zip)");
+  private readonly remove = element("button", { type: "button", class: "danger" }, "Delete…");
+  private readonly dialog = element("dialog");
+  readonly root = element("div", { class: "actions" }, this.act, this.rename, this.download, this.remove, this.dialog);
+  private job: Job | null = null;
+
+  constructor(
+    private readonly id: string,
+    private readonly then: Consequences,
+  ) {
+    this.download.href = archiveUrl(id);
+    this.act.addEventListener("click", () => void this.cancelOrRetry());
+    this.rename.addEventListener("click", () => this.askForName());
+    this.remove.addEventListener("click", () => void this.askToDelete());
+  }
+
+  show(job: Job): void {
+    this.job = job;
+    const hasEnded = ENDED.includes(job.state);
+    this.act.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
+    this.act.textContent = hasEnded ? "Retry" : "Cancel";
+    this.remove.hidden = !hasEnded;
+    this.download.hidden = !hasEnded;
+  }
+
+  private async cancelOrRetry(): Promise<void> {
+    const again = this.job !== null && ENDED.includes(this.job.state);
+    await this.attempt(async () => this.then.changed(await (again ? retryJob : cancelJob)(this.id), again));
+  }
+
+  private askForName(): void {
+    const name = element("input", { id: "job-name", type: "text", maxlength: `${LONGEST_NAME}`, autocomplete: "off", value: this.job?.name ?? "" });
+    const keep = element("button", { class: "primary" }, "Keep the name");
+    this.ask("Name of this job", [element("label", { for: name.id }, `A label for people, up to ${LONGEST_NAME} characters; empty for none`), name], keep, async () => {
+      this.then.changed(await renameJob(this.id, name.value.trim() || null), false);
+    });
+    name.select();
+  }
+
+  private async askToDelete(): Promise<void> {
+    await this.attempt(async () => {
+      const files = await listArtifacts(this.id);
+      const size = files.reduce((sum, file) => sum + file.bytes, 0);
+      const what = `Its ${files.length} files that can be downloaded (${bytes(size)}) and all else that is stored of it, its checkpoints, events and curves, are gone for good.`;
+      const capture = this.job?.spec.rig ? "So is the capture that it took with its rig." : "The capture that it was made from stays.";
+      const kept = `${capture} A receipt with the number, size and digest of the files is kept.`;
+      const sure = element("button", { class: "danger" }, "Delete for good");
+      const called = this.job?.name ? `job ${this.job.number}, “${this.job.name}”` : `job ${this.job?.number ?? ""}`;
+      this.ask(`Delete ${called}?`, [element("p", {}, what), element("p", {}, kept)], sure, async () => {
+        await deleteJob(this.id);
+        this.then.deleted();
+      });
+    });
+  }
+
+  /** A question with one way on and one way back; Escape goes back as well. */
+  private ask(title: string, content: HTMLElement[], go: HTMLButtonElement, deed: () => Promise<void>): void {
+    const back = element("button", { type: "button" }, "Back");
+    const form = element("form", {}, element("h3", { id: "question" }, title), ...content, element("p", { class: "fields" }, go, back));
+    back.addEventListener("click", () => this.dialog.close());
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.dialog.close();
+      void this.attempt(deed);
+    });
+    this.dialog.setAttribute("aria-labelledby", "question");
+    this.dialog.replaceChildren(form);
+    this.dialog.showModal();
+  }
+
+  private async attempt(deed: () => Promise<void>): Promise<void> {
+    try {
+      await deed();
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.then.refused(problem);
+    }
+  }
+}

@@ -1,0 +1,66 @@
+/** What a setup link opens: makes the administrator's token, shows it this once, and signs the browser in. */
+
+import { sentenceOf, setUp } from "./api";
+import { element } from "./element";
+
+export class SetupView {
+  readonly root = element("article", { class: "setup" });
+  private readonly make = element("button", { type: "button", class: "primary" }, "Make the administrator's token");
+  private readonly refusal = element("p", { class: "failure", role: "alert" });
+
+  constructor(
+    private readonly secret: string,
+    private readonly onSuccess: () => void,
+  ) {
+    this.refusal.hidden = true;
+    this.make.addEventListener("click", () => void this.redeem());
+    this.root.append(
+      element("h2", {}, "Set up this server"),
+      element("p", {}, "Nobody has a token for this server yet. Make the first one: it may do everything, other tokens included, and this browser is signed in with it."),
+      this.make,
+      this.refusal,
+    );
+  }
+
+  private async redeem(): Promise<void> {
+    this.make.disabled = true;
+    this.refusal.hidden = true;
+    try {
+      const { token } = await setUp(this.secret);
+      history.replaceState(null, "", "#/"); // the link is void, and need not be seen again
+      this.show(token);
+    } catch (problem) {
+      this.refusal.hidden = false;
+      this.refusal.textContent = sentenceOf(problem);
+      this.make.disabled = false;
+    }
+  }
+
+  private show(token: string): void {
+    const shown = element("code", { class: "token", tabindex: "0" }, token);
+    const copied = element("span", { class: "done", role: "status" });
+    const copy = element("button", { type: "button" }, "Copy");
+    copy.addEventListener("click", () => void copyText(shown).then((sentence) => (copied.textContent = sentence)));
+    const go = element("button", { type: "button", class: "primary" }, "Go on to the page");
+    go.addEventListener("click", () => this.onSuccess());
+    this.root.replaceChildren(
+      element("h2", {}, "Your administrator's token"),
+      element("p", {}, "Keep it where you keep passwords: it is not shown again. This browser is signed in already; the command line reads it from the variable DENTINE__CLIENT__TOKEN."),
+      shown,
+      element("p", { class: "fields" }, copy, copied),
+      go,
+    );
+    go.focus();
+  }
+}
+
+/** Copies where the browser lets pages copy, else selects; answers with a sentence. */
+async function copyText(shown: HTMLElement): Promise<string> {
+  try {
+    await navigator.clipboard.writeText(shown.textContent ?? "");
+    return "Copied.";
+  } catch {
+    getSelection()?.selectAllChildren(shown);
+    return "Selected; copy it with the keyboard.";
+  }
+}

@@ -1,0 +1,46 @@
+"""What both clients do around a file that is sent to them: it is there whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from services.core.errors import InputError, PlatformError
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """A file that appears under its name once the block has ended well.
+
+    Raises:
+        InputError: it is there already, or cannot be written.
+    """
+    if path.exists():
+        raise InputError(f"{path} exists already; remove it or give another name with --out.")
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as stream:
+            yield stream
+        partial.rename(path)
+    except OSError as problem:
+        raise InputError(f"{path} cannot be written ({problem.strerror}); give another place with --out.") from problem
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def telling_lost(server: str) -> Iterator[None]:
+    """Say in one sentence that the connection broke.
+
+    Raises:
+        PlatformError: it did.
+    """
+    import httpx
+
+    try:
+        yield
+    except httpx.HTTPError as problem:
+        raise PlatformError(f"The download from {server} broke off ({problem}); repeat the command.") from problem

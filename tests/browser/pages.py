@@ -1,0 +1,47 @@
+"""A page whose errors fail the test: what the console says, what scripts throw, and what is asked of other servers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser, Page
+
+from services.api.app import STATIC
+from tests.browser.contrast import contrast_failures
+
+WIDE, PHONE = (1440, 900), (390, 844)
+
+
+@contextmanager
+def watched_page(chromium: Browser, address: str, scheme: str = "light", width: int = WIDE[0], expected: tuple[str, ...] = ()) -> Iterator[Page]:
+    """A page on a server.
+
+    Args:
+        expected: texts in console messages that the test provokes, such as the browser's own line on a refusal.
+    """
+    if not (STATIC / "app.js").exists():
+        pytest.skip("the dashboard is not built; run make dashboard")
+    context = chromium.new_context(base_url=address, color_scheme=scheme, viewport={"width": width, "height": 900})
+    page = context.new_page()
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text) if message.type in {"error", "warning"} else None)
+    page.on("pageerror", lambda problem: said.append(str(problem)))
+    page.on("request", lambda request: asked.append(request.url))
+    try:
+        yield page
+    finally:
+        context.close()
+    assert [line for line in said if not any(text in line for text in expected)] == []
+    assert all(url.startswith((address, "blob:")) for url in asked)
+
+
+def looked_at(page: Page, name: str) -> None:
+    """Hold what is shown to contrast and width; keeps a picture where the variable SCREENSHOTS names a folder."""
+    if folder := os.environ.get("SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/{name}.png", full_page=True)
+    assert contrast_failures(page) == []
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
