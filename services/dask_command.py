@@ -1,22 +1,23 @@
-"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS as the settings say."""
+"""``dentine scheduler``, ``dentine worker`` and ``dentine worker-health``: Dask's own commands, with TLS as the settings say, and checked workers."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import typer
 
 from services.core.dask_config import as_environment
+from services.core.placement import DOME, STAGES, UNLIMITED
 
 _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
 def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -> None:
-    """Add both commands."""
+    """Add the commands."""
 
     @app.command(context_settings=_ALL_TO_DASK)
     def scheduler(context: typer.Context) -> None:
@@ -24,9 +25,40 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
         _become("scheduler", context.args, tls_folder())
 
     @app.command(context_settings=_ALL_TO_DASK)
-    def worker(context: typer.Context) -> None:
-        """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address."""
-        _become("worker", context.args, tls_folder())
+    def worker(
+        context: typer.Context,
+        captures_only: Annotated[
+            bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")
+        ] = False,
+    ) -> None:
+        """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address.
+
+        A worker runs every stage but captures, after it has shown that it can; with `--resources DOME=1`, as it reaches the dome, captures too.
+        """
+        claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
+        _become("worker", [*_claiming(context.args, claims), "--preload", "services.api.worker_setup"], tls_folder())
+
+    @app.command("worker-health")
+    def worker_health() -> None:
+        """Say whether this machine's workers are connected and can work; for the health check of a container."""
+        from services.api.worker_health import require_healthy_workers
+
+        count = require_healthy_workers()
+        print(f"{count} worker{'s' if count > 1 else ''} of this machine can work.")
+
+
+def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:
+    """The arguments with resources added to those that they name themselves."""
+    others, named = list[str](), dict[str, str]()
+    rest = iter(arguments)
+    for argument in rest:
+        option, is_joined, value = argument.partition("=")
+        if option == "--resources":
+            named |= dict(part.split("=", 1) for part in (value if is_joined else next(rest, "")).split() if "=" in part)
+        else:
+            others.append(argument)
+    named = {name: str(amount) for name, amount in claims.items()} | named
+    return [*others, "--resources", " ".join(f"{name}={amount}" for name, amount in named.items())]
 
 
 def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], folder: Path | None) -> NoReturn:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -13,11 +13,12 @@ from urllib.parse import urlsplit
 from services.api.dask_tls import Certificates
 from services.api.events import EventAddress
 from services.api.jobs import Jobs
-from services.api.pipeline import run_job
+from services.api.pipeline import DOORS, run_job
 from services.api.runner import RunJob
 from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.core.stage import StageName
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -25,12 +26,13 @@ if TYPE_CHECKING:
 STATIC = Path(__file__).parent / "dashboard" / "static"
 
 
-def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Workers | None = None) -> FastAPI:
+def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> FastAPI:
     """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
 
     Args:
-        run: in place of the stages. ``app.state.darken`` asks all that lights a dome to stop, from any thread, and waits for nothing but that.
-        workers: those that ``run`` runs on, closed with the application; default its own.
+        run: in place of the stages and their workers. ``app.state.darken`` asks all that lights a dome to stop, from any thread,
+            and waits for nothing but that.
+        doors: where each stage is entered.
     """
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
@@ -51,17 +53,17 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
 
     access.refuse_open_network(settings)
     certificates = Certificates.of(settings.tls) if settings.tls is not None else None
-    workers = workers or Workers(settings.scheduler, certificates)
+    workers = Workers(settings.scheduler, certificates)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        run_job(spec, folder, events=events, cluster=workers, is_logged=True)
+        run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True, before=lambda: jobs.take_turn(events.job))
 
-    def run_in_turn(spec: JobSpec, folder: Path, events: EventAddress) -> None:
+    def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         if spec.rig is not None:
             dome.make_way()
         (run or run_on_workers)(spec, folder, events)
 
-    jobs = Jobs(settings, run_in_turn)
+    jobs = Jobs(settings, run_with_dome, workers.lacking if run is None else lambda _: None)
     dome = Dome(settings.dome, jobs)
 
     def darken() -> None:
@@ -72,11 +74,13 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, workers: Wor
 
     readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
     feed = EventFeed(jobs.repository, readers.ask)
-    observation = Observation(jobs, settings, readers, openers, certificates)
+    observation = Observation(jobs, settings, readers, openers, certificates, None if run else workers.condition)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         dome.start()
+        if run is None and doors is DOORS:  # stages of others need other packages
+            workers.begin_check()
         jobs.start()
         tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
         try:

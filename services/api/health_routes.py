@@ -31,7 +31,7 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
 
     @router.get("/health/ready", response_model=Ready, responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}}, dependencies=[needs("read")])
     def ready(request: Request) -> Response:
-        """Whether a submitted job would run: database, scheduler, store and disk are each tried."""
+        """Whether a submitted job would run: database, scheduler, workers, store and disk are each tried."""
         checks = readiness.checks()
         if bad := [check for check in checks if not check.ok]:
             told = Problem.of(HTTPStatus.SERVICE_UNAVAILABLE, "not-ready", " ".join(check.sentence for check in bad), request.scope["path"])

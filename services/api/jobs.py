@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -50,11 +51,14 @@ class StageProgress(Record):
 class Jobs:
     """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run.
 
+    Args:
+        lacks: see ``Admission``.
+
     Raises:
         SettingsError: the database belongs to another data folder.
     """
 
-    def __init__(self, settings: ServerSettings, run: RunJob) -> None:
+    def __init__(self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None) -> None:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(settings.database_url)
@@ -63,9 +67,12 @@ class Jobs:
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self.calibrations = Calibrations(self._data)
         self._light_limits = LightLimits(settings.dome)
-        self._admission = Admission(lambda: Machine.of(self._data, has_workers=settings.scheduler is None))
-        machine = machine_class() if settings.scheduler is None else None
-        self._time_ranges = TimeRanges(self.repository, self.locate, self.waits_for, machine)
+        has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
+        self._admission = Admission(
+            lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks
+        )
+        places, running = settings.jobs_at_once, lambda: self._admission.sharing
+        self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running)
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
             return run(self._light_limits.lowered(spec), folder, events)
@@ -79,13 +86,17 @@ class Jobs:
         self._runner.start(alone=self._is_alone)
 
     def stop(self) -> None:
-        """Ask the running job to stop, and wait for nothing: what it lights goes dark at once."""
+        """Ask the running jobs to stop, and wait for nothing: what they light goes dark at once."""
         self._runner.stop()
 
     def close(self) -> None:
-        """Stop the running job cooperatively; it stays queued and resumes when the server starts again."""
+        """Stop the running jobs cooperatively; they stay queued and resume when the server starts again."""
         self._runner.close()
         self.repository.close()
+
+    def take_turn(self, job_id: str) -> None:
+        """See ``Runner``."""
+        self._runner.take_turn(job_id)
 
     def folder(self, job_id: str) -> Path:
         """Where a job's stages and results lie."""
@@ -183,7 +194,12 @@ class Jobs:
 
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, None if nothing keeps it."""
-        return self._admission.reason(job.id) if job.state is JobState.QUEUED else None
+        if job.state is not JobState.QUEUED:
+            return None
+        return self._admission.reason(job.id) or (None if self.is_running() else "This server does not run jobs; restart it and read its log.")
+
+    def _is_kept_by(self, job: Job) -> str | None:
+        return self._admission.reason(job.id, besides_turn=True) if job.state is JobState.QUEUED else None
 
     def time_range(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fastapi import FastAPI
 
 from services.api.clerks import Clerks
@@ -23,9 +25,17 @@ from services.core.settings import ServerSettings
 class Observation:
     """Belongs to one application; ``webhook_sender`` is to be run while the application lives."""
 
-    def __init__(self, jobs: Jobs, settings: ServerSettings, readers: Clerks, openers: Clerks, certificates: Certificates | None = None) -> None:
+    def __init__(
+        self,
+        jobs: Jobs,
+        settings: ServerSettings,
+        readers: Clerks,
+        openers: Clerks,
+        certificates: Certificates | None = None,
+        workers: Callable[[], str] | None = None,
+    ) -> None:
         engine, policy = jobs.repository.engine, AddressPolicy(settings.private_webhooks)
-        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler, certificates)
+        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler, certificates, workers)
         deliveries = Deliveries(engine)
         self._registry = build_registry(engine, readiness, jobs.free_bytes)
         self._routers = (

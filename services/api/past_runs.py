@@ -39,6 +39,7 @@ class Course(Record):
     machine: str = Field(description="class of the machines that ran its stages")
     reached_s: dict[StageName, tuple[float, ...]] = Field(description="by stage, from the start of the run until each tenth of it, its beginning first")
     total_s: float
+    beside: float = Field(default=1.0, ge=1, description="how many jobs shared the workers, this one included; mean over the run")
 
 
 class PastRun(Record):
@@ -87,11 +88,12 @@ class PastRuns:
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine
 
-    def record(self, job_id: str, method: str, size: JobSize) -> None:
+    def record(self, job_id: str, method: str, size: JobSize, beside: float = 1.0) -> None:
         """Learn from a job that has succeeded, if it ran without a break."""
         course = course_of(EventLog(self._engine, job_id).every())
         if course is None:
             return
+        course = course.model_copy(update={"beside": beside})
         row = {"job": job_id, "method": method, "machine": course.machine, "size": size.model_dump_json(), "course": course.model_dump_json()}
         with writing(self._engine) as connection:
             ended_s = connection.scalar(sql.select(sql.func.max(event_table.c.time_s)).where(event_table.c.job == job_id))

@@ -2,7 +2,7 @@
 
 ::
 
-    capture {DOME: 1} -> prepare -> fit -> export        capture only where the job names a rig
+    capture {DOME: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}        capture only where the job names a rig
 
 Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its part: a rig may go away
 after its capture. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task whose worker dies is run again by
@@ -38,6 +38,7 @@ from services.core.errors import (
     WorkerLostError,
 )
 from services.core.masks import is_stale
+from services.core.placement import DOME, STAGES, rank
 from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
@@ -75,6 +76,11 @@ def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
     return (*(("capture",) if spec.rig is not None else ()), "prepare", "fit", "export")
 
 
+def first_stage(spec: JobSpec, root: Path) -> StageName | None:
+    """The first stage of a job that is not published yet; None where all are."""
+    return next((stage for stage in stages_of(spec) if not is_published(root, _PUBLISHED_AS[stage])), None)
+
+
 def run_job(
     spec: JobSpec,
     root: Path,
@@ -85,6 +91,7 @@ def run_job(
     cluster: Workers | None = None,
     *,
     is_logged: bool = False,
+    before: Callable[[], None] | None = None,
 ) -> AssetManifest:
     """Run a job to its asset; needs no server.
 
@@ -96,11 +103,12 @@ def run_job(
         doors: where each stage is entered.
         cluster: where it runs, default workers of its own.
         is_logged: workers write log lines on standard error.
+        before: called before each stage but a capture; what it raises ends the run.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged)
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged, before=before)
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -116,6 +124,7 @@ def run_stages(
     *,
     again: bool = False,
     is_logged: bool = False,
+    before: Callable[[], None] | None = None,
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
     root = root.resolve()
@@ -132,7 +141,7 @@ def run_stages(
             if todo:
                 tasks = [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo]
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
-                    _run_tasks(processes, workers or spec.workers, tasks, watch)
+                    _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
             watch.tell()
 
 
@@ -222,14 +231,20 @@ class _Watch:
             self._after = new[-1].id
 
 
-def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _Watch) -> None:
+def _go_on() -> None:
+    """Nothing keeps the next stage."""
+
+
+def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _Watch, before: Callable[[], None]) -> None:
     """Submit each stage once the one before has ended, follow its events, and raise what it raises."""
     from distributed.comm import CommClosedError
 
-    client = processes.connect(count)
     try:
-        for task in tasks:
-            _follow_stage(client, lambda: processes.keep(count), task, watch)
+        with processes.serving(count, captures=any(task.stage == "capture" for task in tasks)) as client:
+            for task in tasks:
+                if task.stage != "capture":
+                    before()
+                _follow_stage(client, processes.keep, task, watch)
     except (CancelledError, CommClosedError) as problem:
         raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.") from problem
 
@@ -238,7 +253,8 @@ def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageT
     from distributed import KilledWorker, wait
 
     key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
-    stage: Future = client.submit(task, key=key, resources={"DOME": 1} if task.stage == "capture" else None, pure=False)
+    needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
+    stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
     while not stage.done():
         with suppress(TimeoutError):
@@ -250,7 +266,7 @@ def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageT
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S
         if give_up_at is not None and time.monotonic() > give_up_at and watch.stage != "capture":
-            _stop_workers(client)
+            _stop_workers_of(client, key)
             raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
     try:
         stage.result()
@@ -261,9 +277,10 @@ def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageT
         ) from problem
 
 
-def _stop_workers(client: Client) -> None:
-    # Those that are busy; each is started again.
-    busy = [worker for worker, keys in client.processing().items() if keys]
+def _stop_workers_of(client: Client, stage: str) -> None:
+    # Those that hold the stage or tasks that it has made, whose keys begin with its own. Each is started again, and what
+    # another job had there runs again.
+    busy = [worker for worker, keys in client.processing().items() if any(str(key).startswith(stage) for key in keys)]
     with suppress(TimeoutError):
         client.restart_workers(busy, timeout=GRACE_S)
 
@@ -312,7 +329,7 @@ def _withdraw_damaged(root: Path) -> None:
 
 def _claim_folder(root: Path, spec: JobSpec) -> None:
     """Write the job's options, or refuse a folder that holds the results of other ones."""
-    path, indifferent = root / JOB_FILE, {"workers"}
+    path, indifferent = root / JOB_FILE, {"workers", "priority"}
     if path.exists():
         earlier = read_record(path, JobSpec)
         theirs, ours = (_options(one) for one in (earlier, spec))

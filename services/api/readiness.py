@@ -26,7 +26,7 @@ STORE_PROBE_S = 3.0
 """How long the store may take for a small file."""
 _BLOCK = bytes(4096)
 
-CheckName = Literal["database", "scheduler", "store", "disk"]
+CheckName = Literal["database", "scheduler", "workers", "store", "disk"]
 
 
 class Check(Record):
@@ -46,6 +46,7 @@ class Readiness:
         free_bytes: free space where jobs are stored.
         scheduler: address of the workers' scheduler; None where workers are the server's own.
         certificates: what to show it; None without TLS.
+        workers: tells how many workers can run stages, and raises where none can; None where jobs need none.
     """
 
     def __init__(
@@ -56,9 +57,11 @@ class Readiness:
         free_bytes: Callable[[], int],
         scheduler: str | None = None,
         certificates: Certificates | None = None,
+        workers: Callable[[], str] | None = None,
     ) -> None:
         self._engine, self._jobs_folder = engine, jobs_folder
         self._is_running, self._free_bytes, self._address, self._certificates = is_running, free_bytes, scheduler, certificates
+        self._workers = workers or _no_workers
         self._file = _identity(engine)
         self._prober, self._store_prober = ThreadPoolExecutor(1, "readiness"), ThreadPoolExecutor(1, "store-readiness")
 
@@ -67,6 +70,7 @@ class Readiness:
         tries: tuple[tuple[CheckName, Callable[[], str]], ...] = (
             ("database", self._database),
             ("scheduler", self._scheduler),
+            ("workers", self._workers),
             ("store", self._store),
             ("disk", self._disk),
         )
@@ -127,6 +131,10 @@ class Readiness:
         if free_mib < needed_mib:
             raise StoreError(f"Only {free_mib} MiB of disk are free; free at least {needed_mib} MiB.")
         return f"{free_mib} MiB of disk are free."
+
+
+def _no_workers() -> str:
+    return "Jobs need no workers."
 
 
 def _check(name: CheckName, attempt: Callable[[], str]) -> Check:

@@ -235,17 +235,17 @@ class Repository:
         """Tell every job under way that no process works on it any more."""
         return self._lose(sql.true())
 
-    def lose_expired(self, keep: Lease | None = None, length_s: float = math.inf) -> list[str]:
+    def lose_expired(self, keep: Iterable[Lease] = (), length_s: float = math.inf) -> list[str]:
         """Tell those that have no lease, or one that ran out.
 
         Args:
-            keep: holds whatever the clock says: the caller's own, who knows that it works on that job.
+            keep: hold whatever the clock says: the caller's own, who knows that it works on those jobs.
             length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped back, and counts as run out.
         """
         now_s = self._clock()
         held: sql.ColumnElement[bool] = lease_table.c.until_s.between(now_s, now_s + 2 * length_s)
-        if keep is not None:
-            held |= (lease_table.c.job == keep.job.id) & (lease_table.c.number == keep.number)
+        for one in keep:
+            held |= (lease_table.c.job == one.job.id) & (lease_table.c.number == one.number)
         return self._lose(job_table.c.id.not_in(sql.select(lease_table.c.job).where(held)))
 
     def _lose(self, which: sql.ColumnElement[bool]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The threads of a server that run queued jobs, one after the other, and look after those that nobody runs any more."""
+"""The threads of a server that run queued jobs side by side, and look after those that nobody runs any more."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-from services.api.admission import Admission
+from services.api.admission import Admission, turn
 from services.api.database import patiently
 from services.api.events import EventAddress
 from services.api.lifecycle import JobState, Trigger
 from services.api.logs import log_context
-from services.api.pipeline import request_cancel, withdraw_cancel
+from services.api.pipeline import first_stage, request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
@@ -31,14 +30,18 @@ ROUND_S = 10.0
 """How often leases are renewed, lost ones found and waiting jobs looked at again."""
 
 
+class WaitsForItsTurnError(Exception):
+    """A job has captured, and there is no place for the rest of it yet."""
+
+
 class Runner:
-    """Runs jobs between ``start`` and ``close``.
+    """Runs jobs between ``start`` and ``close``, each in a thread of its own.
 
     Args:
         folder: of a job by its id.
         locate: a job's options with the folder of an uploaded capture.
         on_round: called every so often.
-        on_success: called with a job that has succeeded.
+        on_success: called with a job that has succeeded, and how many on average ran while it did.
     """
 
     def __init__(
@@ -49,14 +52,14 @@ class Runner:
         run: RunJob,
         admission: Admission,
         on_round: Callable[[], None],
-        on_success: Callable[[Job], None],
+        on_success: Callable[[Job, float], None],
     ) -> None:
         self._repository, self._folder, self._locate, self._run, self._admission = repository, folder, locate, run, admission
         self._on_round, self._on_success = on_round, on_success
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
-        self._wake, self._closing = threading.Event(), threading.Event()
-        self._current: Lease | None = None
-        self._threads = [threading.Thread(target=self._work, name="jobs"), threading.Thread(target=self._look_after, name="leases")]
+        self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
+        self._running: dict[str, tuple[Lease, threading.Thread]] = {}
+        self._threads = [threading.Thread(target=self._start_jobs, name="jobs"), threading.Thread(target=self._look_after, name="leases")]
 
     def start(self, *, alone: bool) -> None:
         """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left by one that died."""
@@ -67,75 +70,112 @@ class Runner:
             thread.start()
 
     def stop(self) -> None:
-        """Ask the running job to stop, and wait for nothing; it stays queued and resumes when a server starts again."""
+        """Ask the running jobs to stop, and wait for nothing; they stay queued and resume when a server starts again."""
         self._closing.set()
         self._wake.set()
-        if (lease := self._current) is not None:
+        for lease in self._leases():
             request_cancel(self._folder(lease.job.id))
 
     def close(self) -> None:
-        """Stop the running job cooperatively, and wait for that."""
+        """Stop the running jobs cooperatively, and wait for that."""
         self.stop()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join()
+        # A job that was started meanwhile has asked for its own end; see _prepare.
+        for _, thread in self._under_way():
+            thread.join()
 
     def wake(self) -> None:
         """There is something to run."""
         self._wake.set()
+
+    def take_turn(self, job_id: str) -> None:
+        """Called before each stage that follows a job's capture, in the job's own thread.
+
+        Raises:
+            WaitsForItsTurnError: all places are taken.
+        """
+        if not self._admission.takes_place(job_id):
+            raise WaitsForItsTurnError
 
     @property
     def is_running(self) -> bool:
         """Whether queued jobs will be run."""
         return all(thread.is_alive() for thread in self._threads) and not self._closing.is_set()
 
-    def _work(self) -> None:
+    def _under_way(self) -> list[tuple[Lease, threading.Thread]]:
+        with self._lock:
+            return list(self._running.values())
+
+    def _leases(self) -> list[Lease]:
+        return [lease for lease, _ in self._under_way()]
+
+    def _start_jobs(self) -> None:
         while not self._closing.is_set():
             self._wake.wait()
             self._wake.clear()
             try:
-                while not self._closing.is_set() and (lease := self._next()) is not None:
-                    with self._working_on(lease):
-                        self._run_one(lease)
-            except Exception:  # of the database or the data folder; what was leased is lost when its lease runs out
-                logging.getLogger(__name__).exception("running jobs failed; trying again in %g s", ROUND_S)
+                self._start_what_may()
+            except Exception:  # of the database or the data folder
+                logging.getLogger(__name__).exception("starting jobs failed; trying again in %g s", ROUND_S)
 
-    @contextmanager
-    def _working_on(self, lease: Lease) -> Iterator[None]:
-        self._current = lease
-        try:
-            with log_context(job=lease.job.id, request_id=lease.job.request_id):
-                yield
-        finally:
-            self._current = None
-
-    def _next(self) -> Lease | None:
-        # The oldest job that may start; those that wait for disk or workers let others pass.
-        queued = self._repository.queued()
-        self._admission.remember_only(job.id for job in queued)
+    def _start_what_may(self) -> None:
+        # In turn; those that wait for disk or workers let others pass.
+        queued = sorted(self._repository.queued(), key=turn)
+        self._admission.begin_round(job.id for job in queued)
         for job in queued:
-            if self._admission.holds(job.id, self._locate(job.spec)):
+            if self._closing.is_set():
+                return
+            if job.id in self._running or self._admission.holds(job.id, spec := self._locate(job.spec), is_to_capture=self._is_to_capture(job)):
                 continue
             try:
-                return self._repository.lease(job.id, self._holder, LEASE_S)
+                lease = self._repository.lease(job.id, self._holder, LEASE_S)
             except JobStateError:
                 continue  # cancelled, or another server's by now
-        return None
+            self._admission.start(job.id, job.number, spec, is_to_capture=self._is_to_capture(job))
+            thread = threading.Thread(target=self._run_in_thread, args=(lease,), name=f"job-{job.id}")
+            with self._lock:
+                self._running[job.id] = lease, thread
+            thread.start()
+
+    def _is_to_capture(self, job: Job) -> bool:
+        return first_stage(job.spec, self._folder(job.id)) == "capture"
+
+    def _run_in_thread(self, lease: Lease) -> None:
+        job = lease.job
+        try:
+            with log_context(job=job.id, request_id=job.request_id):
+                self._run_one(lease)
+        except Exception:  # of the database or the data folder; the job is lost when its lease runs out
+            logging.getLogger(__name__).exception("job %s broke off; it is queued again within %g s", job.id, LEASE_S)
+        finally:
+            with self._lock:
+                del self._running[job.id]
+            self._admission.end(job.id)
+            self._wake.set()
 
     def _look_after(self) -> None:
         log = logging.getLogger(__name__)
         while not self._closing.wait(ROUND_S):
             try:
-                if (lease := self._current) is not None and not self._repository.renew(lease, LEASE_S):
-                    log.warning("job %s was taken over by another server", lease.job.id)
-                for job_id in self._repository.lose_expired(lease, LEASE_S):
-                    log.warning("job %s was lost by its server and is queued again", job_id)
-                if lease is not None and self._is_cancelled(lease):
-                    request_cancel(self._folder(lease.job.id))
+                self._renew_leases()
                 self._on_round()
             except Exception:
                 log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
             self._wake.set()
+
+    def _renew_leases(self) -> None:
+        log = logging.getLogger(__name__)
+        leases = self._leases()
+        for lease in leases:
+            if not self._repository.renew(lease, LEASE_S):
+                log.warning("job %s was taken over by another server", lease.job.id)
+        for job_id in self._repository.lose_expired(leases, LEASE_S):
+            log.warning("job %s was lost by its server and is queued again", job_id)
+        for lease in leases:
+            if self._is_cancelled(lease):
+                request_cancel(self._folder(lease.job.id))
 
     def _run_one(self, lease: Lease) -> None:
         job, folder = lease.job, self._folder(lease.job.id)
@@ -149,6 +189,8 @@ class Runner:
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
+        except WaitsForItsTurnError:
+            trigger = Trigger.PAUSE
         except (DiskFullError, ReadOnlyStoreError, SchedulerLostError) as problem:
             self._admission.pause(job.id, problem)
             trigger = Trigger.PAUSE
@@ -160,14 +202,17 @@ class Runner:
             logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
+        self._settle(lease, trigger, failure)
+
+    def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:
         try:
             transition = patiently(lambda: self._repository.settle(lease, trigger, failure))
         except FencedError as problem:
-            logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
+            logging.getLogger(__name__).warning("job %s: %s", lease.job.id, problem)
             return
         logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
         if transition.state is JobState.SUCCEEDED:
-            self._on_success(job)
+            self._on_success(lease.job, self._admission.beside(lease.job.id))
 
     def _prepare(self, lease: Lease, folder: Path) -> None:
         with telling_disk_faults(folder):

@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,11 +18,12 @@ from services.api.app import STATIC, create_app
 from services.api.collector import leave_alone_what_is_loaded
 from services.api.database import open_database
 from services.api.logs import configure_logs
+from services.api.pipeline import DOORS
 from services.api.runner import RunJob
 from services.api.setup_links import SetupLinks, setup_address
-from services.api.workers import Workers
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings
+from services.core.stage import StageName
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
     from uvicorn import Server
 
 
-def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens. ``run`` and ``workers`` as in ``create_app``.
+def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> None:
+    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens. ``run`` and ``doors`` as in ``create_app``.
 
     Raises:
         PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
@@ -49,7 +50,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, workers: Workers 
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
-        proxies, app = settings.trusted_proxies, create_app(settings, run, workers)
+        proxies, app = settings.trusted_proxies, create_app(settings, run, doors)
         if settings.access == "tokens":
             _tell_setup_link(settings, port)
         config = uvicorn.Config(

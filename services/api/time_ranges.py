@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import Self
 
 from pydantic import Field
 
+from services.api.admission import turn
 from services.api.events import Begun, EventLog, JobEvent
 from services.api.forecast import LEAST, Observation, foresee
 from services.api.job_size import method_of, size_of
@@ -38,12 +40,28 @@ class TimeRange(Record):
     past_jobs: int = Field(default=0, description="how many past jobs it is learned from")
     reason: str | None = Field(default=None, description="why there is no range")
 
-    def after(self, earlier: Self) -> Self:
-        """The range of what begins when something else has ended. Limits are added, as on a busy machine all jobs are late together."""
-        if self.low_s is None or self.high_s is None or earlier.low_s is None or earlier.high_s is None:
+    def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
+        """The range of what begins when a place is free for it, as jobs end that run and those ahead of it have had theirs.
+
+        Lower limits are put together with lower ones and upper with upper, as on a busy machine all jobs are late together.
+        """
+        if self.low_s is None or self.high_s is None:
             return self
-        fewer = min(self.past_jobs, earlier.past_jobs)
-        return self.model_copy(update={"low_s": self.low_s + earlier.low_s, "high_s": self.high_s + earlier.high_s, "past_jobs": fewer})
+        low_s, high_s = (
+            _start_s([getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places)
+            for limit in ("low_s", "high_s")
+        )
+        fewer = min(one.past_jobs for one in (self, *running, *ahead))
+        return self.model_copy(update={"low_s": self.low_s + low_s, "high_s": self.high_s + high_s, "past_jobs": fewer})
+
+
+def _start_s(running_s: list[float], ahead_s: list[float], places: int) -> float:
+    """When a place is free: each of those ahead takes the one that is free first."""
+    free_s = sorted(running_s)[max(len(running_s) - places, 0) :] + [0.0] * (places - len(running_s))
+    heapq.heapify(free_s)
+    for lasts_s in ahead_s:
+        heapq.heapreplace(free_s, free_s[0] + lasts_s)
+    return free_s[0]
 
 
 @dataclass(frozen=True)
@@ -59,18 +77,20 @@ class Position:
     """How long the run had taken until then; None where past runs do not compare."""
 
 
-def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastRun]) -> TimeRange:
+def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastRun], beside: float = 1.0) -> TimeRange:
     """Range of what remains from a position, from past runs.
 
     Args:
         job_size: the features of its size.
         runs: oldest first.
+        beside: how many jobs are expected to share the workers, this one included.
     """
+    job_size = *job_size, math.log(beside)
     compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
     pairs = [_split(run, position) for run in compared]
     # What was needed so far tells of what is left by as much as it was a part of the whole.
     weight = 0.0 if position.took_s is None or not pairs else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
-    past = [Observation((*run.size.features, weight * math.log(took_s)), left_s) for run, (took_s, left_s) in zip(compared, pairs, strict=True)]
+    past = [Observation((*_features(run), weight * math.log(took_s)), left_s) for run, (took_s, left_s) in zip(compared, pairs, strict=True)]
     pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
     outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
     if outlook is None:
@@ -84,6 +104,10 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     return TimeRange(low_s=left[0], high_s=left[1], past_jobs=len(past))
 
 
+def _features(run: PastRun) -> tuple[float, ...]:
+    return *run.size.features, math.log(run.course.beside)
+
+
 def _split(run: PastRun, position: Position) -> tuple[float, float]:
     """How long a run had taken until a position, and took from there."""
     reached_s = 0.0 if position.stage is None else run.course.reached_s[position.stage][position.tenth]
@@ -91,43 +115,53 @@ def _split(run: PastRun, position: Position) -> tuple[float, float]:
 
 
 class TimeRanges:
-    """Ranges over one server's jobs, which run one after the other.
+    """Ranges over one server's jobs.
 
     Args:
         locate: a job's options with the folder of an uploaded capture.
-        waits_for: why a queued job does not start.
+        waits_for: what a queued job waits for that does not come by other jobs' ends.
         machine: class of the machine that runs jobs; None where that is not known before they do.
+        places: most jobs that run side by side.
+        running: how many share the workers now.
     """
 
-    def __init__(self, repository: Repository, locate: Callable[[JobSpec], JobSpec], waits_for: Callable[[Job], str | None], machine: str | None) -> None:
+    def __init__(
+        self,
+        repository: Repository,
+        locate: Callable[[JobSpec], JobSpec],
+        waits_for: Callable[[Job], str | None],
+        machine: str | None,
+        places: int = 1,
+        running: Callable[[], int] = lambda: 1,
+    ) -> None:
         self._repository, self._locate, self._waits_for, self._machine = repository, locate, waits_for, machine
+        self._places, self._running = places, running
 
-    def learn(self, job: Job) -> None:
-        """Remember how a job went that has succeeded."""
+    def learn(self, job: Job, beside: float = 1.0) -> None:
+        """Remember how a job went that has succeeded, and how many on average ran while it did."""
         if (size := size_of(self._locate(job.spec))) is not None:
-            self._repository.past_runs.record(job.id, method_of(job.spec), size)
+            self._repository.past_runs.record(job.id, method_of(job.spec), size, beside)
 
     def of(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
         if job.state is JobState.RUNNING:
-            return self._own(job, self._repository.events_of(job.id).begun(), _Past(self._repository))
+            return self._own(job, self._repository.events_of(job.id).begun(), _Past(self._repository), max(self._running(), 1))
         if job.state is not JobState.QUEUED:
             return None
         unfinished, stages, past = self._repository.unfinished(), self._repository.begun(), _Past(self._repository)
-        ahead = [one for one in unfinished if one.state is JobState.RUNNING or one.number < job.number]
-        if sum(one.state is JobState.RUNNING for one in ahead) > 1:
-            return TimeRange(reason="Several servers run jobs at once, so the place in the queue does not tell a time.")
-        total = self._own(job, stages.get(job.id, Begun()), past)
-        for one in ahead:
-            if total.low_s is None:
-                break
-            earlier = self._own(one, stages.get(one.id, Begun()), past)
-            if earlier.reason is not None:
-                return TimeRange(reason=f"Job {one.number} comes first: {earlier.reason}")
-            total = total.after(earlier)
-        return total
+        running = [one for one in unfinished if one.state is JobState.RUNNING]
+        ahead = sorted((one for one in unfinished if one.state is JobState.QUEUED and turn(one) < turn(job)), key=turn)
+        beside = min(self._places, len(running) + len(ahead) + 1)
+        own = self._own(job, stages.get(job.id, Begun()), past, beside)
+        if own.low_s is None:
+            return own
+        earlier = [self._own(one, stages.get(one.id, Begun()), past, beside) for one in (*running, *ahead)]
+        for one, range_ in zip((*running, *ahead), earlier, strict=True):
+            if range_.reason is not None:
+                return TimeRange(reason=f"Job {one.number} comes first: {range_.reason}")
+        return own.after(earlier[: len(running)], earlier[len(running) :], self._places)
 
-    def _own(self, job: Job, stages: Begun, past: _Past) -> TimeRange:
+    def _own(self, job: Job, stages: Begun, past: _Past, beside: float) -> TimeRange:
         # Without the jobs before it.
         if (waits_for := self._waits_for(job)) is not None:
             return TimeRange(reason=waits_for)
@@ -138,7 +172,7 @@ class TimeRanges:
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
         machine = (stages.started.data.get("machine") if stages.started is not None else self._machine) or past.newest_machine
-        return time_range(size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine))
+        return time_range(size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine), beside)
 
 
 class _Past:

@@ -14,13 +14,13 @@ from services.api.database import Query
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
 from services.api.repository import Repository
-from services.api.workers import Workers
+from services.api.workers import NOT_STARTED, Workers
 from services.core.geometry import Record
 from services.core.stage import StageName
 
 HOUR_S, DAY_S = 3600.0, 86400.0
-_TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}")
-"""Key of a stage's task; see ``pipeline``."""
+_TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}(-.*)?")
+"""Key of a stage's task, or of one that it has made; see ``pipeline``."""
 _SUCCEEDED = Query(
     sql.select(sql.func.count(), sql.func.coalesce(sql.func.sum(sql.case((job_table.c.changed_s > sql.bindparam("hour_ago_s"), 1), else_=0)), 0)).where(
         job_table.c.state == JobState.SUCCEEDED.value, job_table.c.changed_s > sql.bindparam("day_ago_s")
@@ -41,7 +41,7 @@ class WorkerState(Record):
     name: str = Field(description="as its scheduler calls it")
     host: str = Field(description="where it runs")
     threads: int = Field(description="tasks that it takes on at once; renderers are processes beside it")
-    tasks: tuple[WorkerTask, ...] = Field(description="stages that it runs or will run next")
+    tasks: tuple[WorkerTask, ...] = Field(description="stages that it runs, wholly or in part, or will run next")
     memory_bytes: int = Field(description="resident size of its process, renderers not counted")
     memory_limit_bytes: int | None = Field(description="beyond it its tasks are stopped; null where it has none")
     has_dome: bool = Field(description="whether captures may run there")
@@ -77,7 +77,7 @@ def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, I
             name=str(worker["name"]),
             host=str(worker["host"]),
             threads=worker["nthreads"],
-            tasks=tuple(WorkerTask.model_validate({"stage": key[1], "job": key[2]}) for key in keys if key is not None),
+            tasks=_tasks(key for key in keys if key is not None),
             memory_bytes=worker["metrics"].get("memory", 0),
             memory_limit_bytes=worker["memory_limit"] or None,
             has_dome=bool(worker["resources"].get("DOME")),
@@ -85,9 +85,14 @@ def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, I
         )
 
 
+def _tasks(keys: Iterable[re.Match[str]]) -> tuple[WorkerTask, ...]:
+    """Each stage once, of however many parts of it the worker has."""
+    return tuple(WorkerTask.model_validate({"stage": stage, "job": job}) for stage, job in dict.fromkeys((key[1], key[2]) for key in keys))
+
+
 def _sentence(found: tuple[WorkerState, ...], *, is_started: bool) -> str:
     if not is_started:
-        return "Workers start with the next job."
+        return NOT_STARTED
     if not found:
         return "The scheduler has no workers; start some, jobs wait for them."
     busy = sum(bool(one.tasks) for one in found)

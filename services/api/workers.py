@@ -5,16 +5,18 @@ from __future__ import annotations
 import socket
 import ssl
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from services.api.collector import leave_alone_what_is_loaded
 from services.api.dask_tls import Certificates, scheduler_address
+from services.api.worker_check import OwnCheck
 from services.core.dask_config import DASK_CONFIG
-from services.core.errors import SchedulerLostError
+from services.core.errors import PlatformError, SchedulerLostError
+from services.core.placement import DOME, STAGES, UNLIMITED
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -28,6 +30,20 @@ LOOK_S = 3.0
 """How long the scheduler may take to tell of its workers."""
 
 
+NOT_STARTED = "Workers start with the next job."
+TOLD = "dentine"
+"""Under which name a worker tells its scheduler what is wrong with it."""
+RIG = "rig"
+"""Name of the worker of this process's own that captures."""
+
+
+class Demand(NamedTuple):
+    """What a job that runs wants of the workers."""
+
+    workers: int
+    captures: bool
+
+
 class Census(NamedTuple):
     """What a scheduler tells of its workers, each by its address."""
 
@@ -35,13 +51,31 @@ class Census(NamedTuple):
     processing: Mapping[str, Sequence[Any]]
     """Keys of the tasks that each has been given."""
 
+    def able(self, resource: str) -> int:
+        """How many workers have a resource."""
+        return sum(bool(worker["resources"].get(resource)) for worker in self.workers.values())
+
+    def sentence(self, *, captures: bool = False) -> str:
+        """How many workers can do what, or why none can run stages or capture."""
+        connected, stages = len(self.workers), self.able(STAGES)
+        if captures and not self.able(DOME):
+            return f"None of the {connected} connected workers reaches a dome; start one with dentine worker --captures-only."
+        if stages or captures:
+            rigs = self.able(DOME)
+            return f"{stages} worker{'' if stages == 1 else 's'} can run stages, {rigs} can capture."
+        if not connected:
+            return "The scheduler has no workers; start some with dentine worker."
+        why = sorted({str(told) for worker in self.workers.values() if (told := worker.get(TOLD))})
+        what = f"None of the {connected} connected workers can run stages"
+        return f"{what}: {' '.join(why)}" if why else f"{what}; start some with dentine worker."
+
 
 class Workers:
     """Opened at the first job and again after they broke; a context manager.
 
     Args:
-        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. Any of those may reach the dome, one
-            stage at a time.
+        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. One more than jobs ask for is started
+            where one of them captures, so that no capture waits for a fit or is stopped with it.
         certificates: what to show that scheduler; None for connections without TLS.
     """
 
@@ -50,6 +84,8 @@ class Workers:
         self._lock = threading.Lock()
         self._cluster: Any = None
         self._client: Client | None = None
+        self._demands: list[Demand] = []
+        self._own_check: OwnCheck | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -57,8 +93,26 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
-    def connect(self, count: int) -> Client:
-        """A connection to ``count`` workers, or to all where they run elsewhere; it stays this object's.
+    @contextmanager
+    def serving(self, count: int, *, captures: bool = False) -> Iterator[Client]:
+        """A connection to at least ``count`` workers for one job, or to all where they run elsewhere.
+
+        Jobs at once share the workers of the one that asks for most.
+
+        Raises:
+            SchedulerLostError: the scheduler does not answer.
+        """
+        demand = Demand(count, captures)
+        with self._lock:
+            self._demands.append(demand)
+        try:
+            yield self.connect()
+        finally:
+            with self._lock:
+                self._demands.remove(demand)
+
+    def connect(self) -> Client:
+        """A connection; it stays this object's.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
@@ -67,16 +121,14 @@ class Workers:
             if self._client is not None and self._client.status != "running":
                 self._close()
             if self._client is None:
-                self._client = self._open(count)
-            elif self._cluster is not None:
-                self._cluster.scale(count)
+                self._client = self._open()
+            self._scale()
             return self._client
 
-    def keep(self, count: int) -> None:
-        """Start again what was lost of ``count`` workers: Dask gives up one that does not come back within 15 s, as on a busy machine."""
+    def keep(self) -> None:
+        """Start again what was lost of the workers: Dask gives up one that does not come back within 15 s, as on a busy machine."""
         with self._lock:
-            if self._cluster is not None:
-                self._cluster.scale(count)
+            self._scale()
 
     def look(self) -> Census | None:
         """Who works on what by now; None where workers of this process's own have not been started yet, as the first job does that.
@@ -89,19 +141,64 @@ class Workers:
             if self._scheduler is None:
                 return None
             require_scheduler(self._scheduler, self._certificates)
-            client = self.connect(0)
+            client = self.connect()
         try:
             census: Census = client.sync(_census, client, callback_timeout=LOOK_S)
         except (OSError, TimeoutError) as problem:
             raise SchedulerLostError(f"The scheduler {self._scheduler or 'of this server'} does not answer; jobs wait for it.") from problem
         return census
 
+    def lacking(self, captures: bool) -> str | None:
+        """Why no worker can capture, or run other stages; None if one can, also where this process starts its own."""
+        if self._scheduler is None:
+            return None
+        try:
+            census = self.look()
+        except SchedulerLostError as problem:
+            return problem.message
+        return None if census is None or census.able(DOME if captures else STAGES) else census.sentence(captures=captures)
+
+    def condition(self) -> str:
+        """How many workers can run stages.
+
+        Raises:
+            PlatformError: none can; SchedulerLostError: their scheduler does not answer.
+        """
+        if self._own_check is not None:
+            return self._own_check.condition()
+        census = self.look()
+        if census is None:
+            return NOT_STARTED
+        if not census.able(STAGES):
+            raise PlatformError(census.sentence())
+        return census.sentence()
+
+    def begin_check(self) -> None:
+        """Find out, in the background, whether workers of this process's own can run stages; ``condition`` tells it."""
+        if self._scheduler is None:
+            self._own_check = OwnCheck()
+
     def close(self) -> None:
         """End the processes, or leave those that run elsewhere."""
         with self._lock:
             self._close()
 
-    def _open(self, count: int) -> Client:
+    def _scale(self) -> None:
+        if self._cluster is None or not self._demands:
+            return
+        specs, wanted = self._cluster.worker_spec, max(demand.workers for demand in self._demands)
+        if RIG not in specs and any(demand.captures for demand in self._demands):
+            (fresh,) = self._cluster.new_worker_spec().values()
+            rig = fresh | {"options": fresh["options"] | {"resources": {DOME: 1}}}
+            others = dict(specs)
+            specs.clear()
+            specs.update({RIG: rig} | others)  # first, as scaling down removes the last
+        extra = int(RIG in specs)
+        if len(self._demands) > 1:  # a worker that is one too many for this job may hold tasks of another
+            wanted = max(wanted, len(specs) - extra)
+        self._cluster.scale(wanted + extra)
+
+    def _open(self) -> Client:
         import dask
         from distributed import Client, LocalCluster
 
@@ -115,7 +212,7 @@ class Workers:
             except OSError as problem:
                 raise SchedulerLostError(f"The scheduler {self._scheduler} does not answer; start it, the job waits.") from problem
         self._cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={"DOME": 1}, silence_logs=50
+            n_workers=0, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={STAGES: UNLIMITED}, silence_logs=50
         )
         return Client(self._cluster)
 

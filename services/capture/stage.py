@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 from pathlib import Path
 
 from services.core.errors import SettingsError
+from services.core.installed import require_packages
 from services.core.records import LIMITS_OF_A_RIG, CaptureManifest, JobSpec
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter
+
+PACKAGES = ("pymodbus",)
+"""What the extra ``capture`` brings."""
+
+
+def check() -> None:
+    """Import what a capture needs.
+
+    Raises:
+        PlatformError: something is missing.
+    """
+    require_packages(PACKAGES, "capture")
+    importlib.import_module("services.capture.sequence")
 
 
 def run(spec: JobSpec, context: StageContext) -> CaptureManifest:

@@ -30,6 +30,7 @@ Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
+Priority = Literal["low", "normal", "high"]
 
 
 class MaskBit(IntFlag):
@@ -143,6 +144,10 @@ class JobSpec(Record):
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
     workers: Whole = Field(default=2, ge=1, le=1024, description="processes of a local run")
     device: Device = Field(default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker")
+    priority: Priority = Field(
+        default="normal",
+        description="which waiting jobs start first; of running fits each takes four times the share of a lower one",
+    )
 
     @model_validator(mode="after")
     def _one_source(self) -> JobSpec:

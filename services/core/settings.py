@@ -71,6 +71,7 @@ class ServerSettings(Record):
     database: SecretStr | None = Field(default=None, description="postgresql://USER:PASSWORD@HOST/NAME; default is SQLite in the data folder")
     scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
     tls: Path | None = Field(default=None, description="folder with ca.crt, tls.crt and tls.key: API, scheduler and workers speak TLS; default: without")
+    jobs_at_once: int = Field(default=4, ge=1, le=64, description="most jobs that run side by side; captures of further ones begin nevertheless")
     keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
     private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
     access: Literal["tokens", "open"] = Field(default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only")

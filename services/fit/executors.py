@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from distributed import WorkerPlugin
 
@@ -41,11 +41,15 @@ class LocalExecutor:
 
 
 class DaskExecutor:
-    """Runs tasks on any worker; a worker's tasks share its one child process."""
+    """Runs tasks on any worker that has what they need; a worker's tasks share its one child process.
 
-    def __init__(self, client: Any, factory: str, prefix: str, flag: Path) -> None:
+    Args:
+        needs: Dask resources of a worker that may run the tasks.
+    """
+
+    def __init__(self, client: Any, factory: str, prefix: str, flag: Path, needs: Mapping[str, float] | None = None) -> None:
         self._client, self._prefix, self._plugin, self._submitted = client, prefix, plugin_name(factory), itertools.count()
-        self._flag = flag
+        self._flag, self._needs = flag, dict(needs or {})
         client.register_plugin(_EnginePlugin(factory), name=self._plugin)
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
@@ -54,7 +58,7 @@ class DaskExecutor:
         A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it again.
         """
         own = f"{self._prefix}-{next(self._submitted)}-{key}"
-        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False)
+        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False, resources=self._needs)
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """See Executor."""
@@ -93,24 +97,36 @@ def run_on_worker(plugin: str, flag: Path, task: Task, *args: Any) -> Any:
     return task(CancellableHost(get_worker().plugins[plugin].host, flag), *args)
 
 
-def _inside_task() -> bool:
+class Surroundings(NamedTuple):
+    """The Dask task that this code runs in."""
+
+    key: str
+    needs: Mapping[str, float]
+    """Resources of a worker that may run it."""
+
+
+def _surroundings() -> Surroundings | None:
     from distributed import get_worker
 
     try:
-        get_worker()
+        worker = get_worker()
     except ValueError:
-        return False
-    return True
+        return None
+    key = worker.get_current_task()
+    return Surroundings(str(key), worker.state.tasks[key].resource_restrictions or {})
 
 
 @contextmanager
 def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
     """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process.
 
+    On a cluster tasks run where this one may, and their keys begin with its own, so that whoever looks at the workers knows whose they are.
+
     Args:
         flag: once it exists, what a worker renders is cut off.
     """
-    if not _inside_task():
+    surroundings = _surroundings()
+    if surroundings is None:
         host = InProcessHost(factory)
         try:
             yield LocalExecutor(host)
@@ -120,4 +136,4 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit") -> Iterator
     from distributed import worker_client
 
     with worker_client() as client:
-        yield DaskExecutor(client, factory, prefix, flag)
+        yield DaskExecutor(client, factory, f"{surroundings.key}-{prefix}", flag, surroundings.needs)

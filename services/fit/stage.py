@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import time
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.core.geometry import Mesh
+from services.core.installed import require_packages
 from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
@@ -18,6 +20,24 @@ if TYPE_CHECKING:
     from services.fit.transport.recipe import DentinShape
 
 ENGINE = "services.fit.transport.engine:Engine"
+
+
+PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "PIL", "rtree", "scipy", "xatlas")
+"""What the extra ``fit`` brings, by the names under which it is imported."""
+
+
+def check() -> None:
+    """Import what a fit and its export need, and render one pixel.
+
+    Raises:
+        PlatformError: something is missing, or the renderer does not work.
+    """
+    require_packages(PACKAGES, "fit")
+    for module in ("services.fit.jaw_driver", "services.fit.export.report", "services.fit.transport.engine"):
+        importlib.import_module(module)
+    from services.fit.transport.platform import require_renderer
+
+    require_renderer()
 
 
 def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from services.core.calibration import published_capture, recalibrated
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import teeth_folder
+from services.core.installed import require_packages
 from services.core.records import CaptureManifest, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, create_array, open_stage, write_record
@@ -17,6 +19,21 @@ if TYPE_CHECKING:
     import zarr
 
     from services.preprocess.source import Source
+
+
+PACKAGES = ("cv2", "rtree")
+"""What the extra ``preprocess`` brings, by the names under which it is imported."""
+
+
+def check() -> None:
+    """Import what a preparation needs.
+
+    Raises:
+        PlatformError: something is missing.
+    """
+    require_packages(PACKAGES, "preprocess")
+    for module in ("source", "brightness", "masks", "quality", "subject", "valid"):
+        importlib.import_module(f"services.preprocess.{module}")
 
 
 def run(spec: JobSpec, context: StageContext) -> PreparedManifest:

@@ -46,7 +46,7 @@ def bad_checks(client: httpx.Client) -> dict[str, str]:
     """Name and sentence of each check that fails; status, problem document and metrics must say the same."""
     answer = client.get("/v1/health/ready")
     told = answer.json()
-    assert [check["name"] for check in told["checks"]] == ["database", "scheduler", "store", "disk"]
+    assert [check["name"] for check in told["checks"]] == ["database", "scheduler", "workers", "store", "disk"]
     bad = {check["name"]: check["sentence"] for check in told["checks"] if not check["ok"]}
     if bad:
         assert (answer.status_code, told["status"], told["code"]) == (503, 503, "not-ready")
@@ -133,16 +133,18 @@ def test_a_disk_that_takes_no_byte_is_told(client: httpx.Client, monkeypatch: py
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_runner_that_died_is_told(tmp_path: Path) -> None:
-    def die(*_: object) -> None:
-        raise SystemExit  # ends the thread that runs jobs
+def test_a_runner_that_died_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(*_: object, **__: object) -> None:
+        raise SystemExit  # ends the thread that starts jobs
 
-    with serving(create_app(ServerSettings(data=tmp_path), die)) as client:
+    with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
         assert bad_checks(client) == {}
-        client.post("/v1/jobs", json={"capture": "/"})
+        monkeypatch.setattr("services.api.admission.Admission.holds", die)
+        job = client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
         while client.get("/v1/health/ready").status_code == 200:
             pass
         assert set(bad_checks(client)) == {"scheduler"}
+        assert client.get(f"/v1/jobs/{job}").json()["waits_for"] == "This server does not run jobs; restart it and read its log."
 
 
 def test_a_read_only_data_folder_is_told() -> None:

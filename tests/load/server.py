@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
+from services.api.server import serve
 from services.core.settings import ServerSettings
 from tests.load.stages import DOORS
-from tests.support.toy_server import serve_doors
 
 if __name__ == "__main__":
-    serve_doors(ServerSettings.model_validate_json(sys.argv[1]), DOORS)
+    serve(ServerSettings.model_validate_json(sys.argv[1]), doors=DOORS)

@@ -52,7 +52,7 @@ def held() -> HeldJob:
 
 @pytest.fixture
 def server(tmp_path: Path, held: HeldJob) -> Iterator[httpx.Client]:
-    with serving(create_app(ServerSettings(data=tmp_path / "data"), held)) as client:
+    with serving(create_app(ServerSettings(data=tmp_path / "data", jobs_at_once=1), held)) as client:
         yield client
         held.goes_on.set()
 

@@ -69,7 +69,7 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_co
     workers, frozen = Workers("tcp://127.0.0.1:1"), []
     for _ in range(3):
         with pytest.raises(SchedulerLostError):
-            workers.connect(0)
+            workers.connect()
         frozen.append(gc.get_freeze_count())
     assert frozen[0] > 0
     assert frozen == sorted(frozen, reverse=True)

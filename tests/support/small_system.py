@@ -18,6 +18,7 @@ from pathlib import Path
 import httpx
 import psutil
 
+from services.core.placement import STAGES, UNLIMITED
 from services.core.store import write_atomic
 from tests.support.live_server import connect
 from tests.support.network import Network, network_of
@@ -27,6 +28,8 @@ from tests.support.store_disk import StoreDisk, store_disk
 ROOT = Path(__file__).parents[2]
 DASK_TIMEOUTS = {"COMM__TIMEOUTS__TCP": "11s", "COMM__TIMEOUTS__CONNECT": "5s", "SCHEDULER__WORKER_TTL": "20s"}
 """As tests wait for them; Dask's own are 30 s, 30 s and 5 min, and the first one's least is 11 s."""
+RUNS_STAGES = f"{STAGES}={UNLIMITED}"
+"""What a worker is given that need not show that it can run stages, as the tests' stages need nothing."""
 PATIENCE_S = 300.0
 """A bound for a machine that is busy with something else."""
 
@@ -42,11 +45,20 @@ class SmallSystem:
     """One of each, two workers, of which one may reach the dome.
 
     Args:
+        has_rig_apart: the worker that reaches the dome only captures, and there is one more for the stages.
         network: hosts that the scheduler, the workers and the database are; None for this one.
         disk: where the data folder lies; None for an ordinary folder.
     """
 
-    def __init__(self, folder: Path, postgres: PostgresServer, network: Network | None = None, disk: StoreDisk | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        postgres: PostgresServer,
+        network: Network | None = None,
+        disk: StoreDisk | None = None,
+        *,
+        has_rig_apart: bool = False,
+    ) -> None:
         self.data, self.network, self.disk, self._folder, self._postgres = folder / "data", network, disk, folder, postgres
         self.acknowledged: list[str] = []
 
@@ -63,10 +75,12 @@ class SmallSystem:
         worker = [*dask, "worker", scheduler, "--nworkers", "1", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "dask")]
         self._commands = {
             "scheduler": [*inside("scheduler"), *dask, "scheduler", "--host", host("scheduler"), "--port", scheduler.rpartition(":")[2], "--no-dashboard"],
-            "worker": [*inside("worker"), *worker, "--host", host("worker")],
-            "rig": [*inside("rig"), *worker, "--host", host("rig"), "--resources", "DOME=1"],
+            "worker": [*inside("worker"), *worker, "--host", host("worker"), "--resources", RUNS_STAGES],
+            "rig": [*inside("rig"), *worker, "--host", host("rig"), "--resources", "DOME=1" if has_rig_apart else f"{RUNS_STAGES} DOME=1"],
             "api": [sys.executable, "-m", "tests.support.stepped_clock", str(self._clock_step), "tests.support.toy_server", json.dumps(settings)],
         }
+        if has_rig_apart:
+            self._commands["worker2"] = self._commands["worker"]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, *names: str) -> None:
@@ -86,6 +100,14 @@ class SmallSystem:
             with suppress(psutil.NoSuchProcess):
                 one.kill()
         process.wait(PATIENCE_S)
+
+    @contextmanager
+    def without(self, *names: str) -> Iterator[None]:
+        """Kill parts, and start them again after the block."""
+        for name in names:
+            self.kill(name)
+        yield
+        self.start(*names)
 
     def pids(self, name: str) -> set[int]:
         """Processes of a part."""
@@ -133,11 +155,12 @@ class SmallSystem:
 
 
 @contextmanager
-def small_system(folder: Path, *, on_hosts: bool = False) -> Iterator[SmallSystem]:
+def small_system(folder: Path, *, on_hosts: bool = False, has_rig_apart: bool = False) -> Iterator[SmallSystem]:
     """A running system, ended with the block.
 
     Args:
         on_hosts: its parts are hosts on a network and its store is a disk; skips where this is not permitted.
+        has_rig_apart: see ``SmallSystem``.
     """
     from tests.support.postgres import postgres_server
 
@@ -146,7 +169,7 @@ def small_system(folder: Path, *, on_hosts: bool = False) -> Iterator[SmallSyste
         network, disk = None, None
         if on_hosts:
             network, disk = stack.enter_context(network_of("scheduler", "worker", "rig", "database")), stack.enter_context(store_disk(folder / "data"))
-        system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk)
+        system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk, has_rig_apart=has_rig_apart)
         system.data.mkdir(parents=True, exist_ok=True)
         stack.callback(system.close)
         system.start()

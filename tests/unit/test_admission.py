@@ -100,7 +100,7 @@ def test_nothing_is_remembered_of_jobs_that_wait_no_more(spec: JobSpec) -> None:
     world.free(0)
     assert world.admission.holds("a", spec)
     assert world.admission.holds("b", spec)
-    world.admission.remember_only(["b"])
+    world.admission.begin_round(["b"])
     assert world.admission.reason("a") is None
     assert world.admission.reason("b")
 

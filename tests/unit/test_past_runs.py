@@ -123,7 +123,31 @@ def test_without_enough_or_alike_runs_there_is_a_reason_and_no_range() -> None:
 
 def test_ranges_follow_each_other() -> None:
     first, second = TimeRange(low_s=1, high_s=3, past_jobs=9), TimeRange(low_s=10, high_s=20, past_jobs=7)
-    assert second.after(first) == TimeRange(low_s=11, high_s=23, past_jobs=7)
+    assert second.after([first], [], places=1) == TimeRange(low_s=11, high_s=23, past_jobs=7)
+
+
+def test_a_range_begins_when_a_place_is_free() -> None:
+    def lasting(low_s: float, high_s: float) -> TimeRange:
+        return TimeRange(low_s=low_s, high_s=high_s, past_jobs=5)
+
+    short, long, last = lasting(1, 2), lasting(10, 20), lasting(100, 200)
+    assert last.after([long], [], places=2) == last  # the second place is free
+    assert last.after([short, long], [], places=2) == lasting(101, 202)
+    assert last.after([short, long], [long], places=2) == lasting(110, 220)  # the one ahead takes the first free place, for 11 to 22 s
+    assert last.after([short, short, long], [], places=2) == lasting(101, 202)  # one of them captures beside two in their places
+    assert last.after([], [long, short], places=1) == lasting(111, 222)
+
+
+def test_runs_beside_others_are_compared_by_how_many_there_were() -> None:
+    alone = [past(factor) for factor in (0.9, 1.0, 1.1) for _ in range(3)]
+    shared = [past(2 * factor) for factor in (0.9, 1.0, 1.1) for _ in range(3)]
+    shared = [run.model_copy(update={"course": run.course.model_copy(update={"beside": 2.0})}) for run in shared]
+    for beside, truth_s in ((1.0, 110), (2.0, 220)):
+        told = time_range(SIZE.features, Position(), [*alone, *shared], beside)
+        assert told.low_s is not None
+        assert told.high_s is not None
+        assert told.low_s < truth_s < told.high_s
+        assert told.high_s / told.low_s < 2
 
 
 def test_size_is_read_from_the_description_of_the_capture(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_what_is_not_renewed_is_lost_and_its_holder_has_no_say_any_more(reposito
     clock.now_s += 50
     assert repository.lose_expired() == []
     clock.now_s += 20
-    assert repository.lose_expired(old) == []  # the holder itself knows better than a clock
+    assert repository.lose_expired([old]) == []  # the holder itself knows better than a clock
     assert repository.lose_expired() == [job.id]
     new = repository.lease(job.id, "b", 60)
     assert not repository.renew(old, 60)
@@ -120,7 +120,7 @@ def test_a_server_that_stopped_working_on_a_job_loses_it_like_any_other(reposito
     # What it holds is told by the lease it works under now, not by its name: a runner that broke off must not keep its job for ever.
     broken, current = (repository.lease(repository.create(SPEC, None).job.id, "a", 60) for _ in range(2))
     clock.now_s += 70
-    assert repository.lose_expired(current) == [broken.job.id]
+    assert repository.lose_expired([current]) == [broken.job.id]
 
 
 def test_many_servers_at_once_never_lease_one_job_twice(opened: Callable[[], Repository]) -> None:

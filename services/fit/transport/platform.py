@@ -25,6 +25,27 @@ def require_llvm(version: tuple[int, int, int]) -> None:
         raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {remedy}.")
 
 
+def require_renderer() -> None:
+    """Render one pixel of an empty scene.
+
+    Raises:
+        PlatformError: that does not work; an unusable libLLVM may end the process instead.
+    """
+    prepare_device(threads=1)
+    mitsuba = importlib.import_module("mitsuba")
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance"}
+    sensor = {"type": "perspective", "film": film}
+    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, "light": {"type": "constant"}}
+    try:
+        image = mitsuba.render(mitsuba.load_dict(scene, optimize=False), spp=1)
+        importlib.import_module("drjit").eval(image)
+        value = float(image.array[0])
+    except Exception as problem:
+        raise PlatformError(f"The renderer cannot render a pixel here ({problem}); check libLLVM and the packages drjit and mitsuba.") from problem
+    if value != 1.0:
+        raise PlatformError(f"The renderer sees {value:g} where a light of 1 is; check the packages drjit and mitsuba.")
+
+
 def prepare_device(threads: int | None = None, backend: Device | None = None, colours: Literal["mono", "rgb"] = "mono") -> None:
     """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same back end do nothing.
 

@@ -1,0 +1,66 @@
+"""Signs of life of this machine's workers: each writes a small file every few seconds, and ``dentine worker-health`` reads them.
+
+Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this machine's worker that works.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.core.errors import PlatformError
+from services.core.store import write_atomic
+
+SIGN_S = 5.0
+"""How often a worker gives a sign."""
+SILENT_S = 60.0
+"""Without a sign for so long a worker does not count: a kernel may hold its interpreter for some seconds, and its scheduler waits longer."""
+
+
+def default_folder() -> Path:
+    """Where the workers of this user write."""
+    return Path(tempfile.gettempdir()) / f"dentine-workers-{os.getuid()}"
+
+
+@dataclass(frozen=True)
+class Sign:
+    """The file of one worker."""
+
+    path: Path
+
+    @classmethod
+    def of_this_process(cls) -> Sign:
+        """That of the worker in this process."""
+        return cls(default_folder() / f"{os.getpid()}.json")
+
+    def give(self, fault: str) -> None:
+        """Say that the worker is connected and answers.
+
+        Args:
+            fault: what it cannot do of what it was started for; empty where nothing is missing.
+        """
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_atomic(self.path, json.dumps({"fault": fault}).encode())
+
+    def withdraw(self) -> None:
+        """Say that the worker has ended."""
+        self.path.unlink(missing_ok=True)
+
+
+def require_healthy_workers(folder: Path | None = None) -> int:
+    """How many workers of this machine are connected to their scheduler and can do what they were started for.
+
+    Raises:
+        PlatformError: there is none, or one cannot.
+    """
+    folder, since_s = folder or default_folder(), time.time() - SILENT_S
+    signs = sorted(path for path in folder.glob("*.json") if path.stat().st_mtime > since_s)
+    if not signs:
+        raise PlatformError(f"No worker of this machine has been connected to its scheduler in the last {SILENT_S:g} s; read the worker's log.")
+    if faults := [fault for sign in signs if (fault := json.loads(sign.read_bytes())["fault"])]:
+        raise PlatformError(faults[0])
+    return len(signs)

@@ -1,0 +1,26 @@
+"""Importing what an extra of the package brings, with a sentence where that fails."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+
+from services.core.errors import PlatformError
+
+
+def require_packages(names: Iterable[str], extra: str) -> None:
+    """Import packages.
+
+    Raises:
+        PlatformError: one is not installed, or is there and cannot be loaded, such as for want of a library of the system.
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as problem:
+            what = f"The package {problem.name} is not installed; install dentine[{extra}] on this machine."
+            raise PlatformError(what) from problem
+        except Exception as problem:
+            first = str(problem).splitlines()[0] if str(problem) else ""
+            what = f"The package {name} is installed but cannot be loaded ({type(problem).__name__}: {first})"
+            raise PlatformError(f"{what}; install the system's libraries that it needs.") from problem
