@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
@@ -69,7 +70,7 @@ class Attempt:
         """Where tasks run, under keys of this attempt's own."""
         place = self.context.root / CHECKPOINT
         prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[:12]
-        with executor(self.context.root / CANCEL_FLAG, self.engine, prefix) as run_on:
+        with executor(self.context.root / CANCEL_FLAG, self.engine, prefix, WEIGHTS[self.spec.priority]) as run_on:
             yield run_on
 
     def passes(self, run_on: Executor, files: ChannelFiles, scope: str) -> Passes:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from distributed import WorkerPlugin
 
 from services.fit.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
+from services.fit.shares import Share
 
 Task = Callable[..., Any]
+TASKS_AHEAD = 2
+"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows without a gap."""
 
 
 class Executor(Protocol):
@@ -43,58 +49,126 @@ class LocalExecutor:
 class DaskExecutor:
     """Runs tasks on any worker that has what they need; a worker's tasks share its one child process.
 
+    Few tasks are with the workers at a time, so that those of another fit come in between; see ``shares``.
+
     Args:
         needs: Dask resources of a worker that may run the tasks.
+        share: what this fit has used of the workers.
     """
 
-    def __init__(self, client: Any, factory: str, prefix: str, flag: Path, needs: Mapping[str, float] | None = None) -> None:
-        self._client, self._prefix, self._plugin, self._submitted = client, prefix, plugin_name(factory), itertools.count()
-        self._flag, self._needs = flag, dict(needs or {})
-        client.register_plugin(_EnginePlugin(factory), name=self._plugin)
+    def __init__(
+        self,
+        client: Any,
+        factory: str,
+        prefix: str,
+        flag: Path,
+        needs: Mapping[str, float] | None = None,
+        share: Share | None = None,
+    ) -> None:
+        from distributed import as_completed
 
-    def submit(self, key: str, task: Task, *args: Any) -> Any:
+        self._client, self._factory, self._prefix, self._submitted = client, factory, prefix, itertools.count()
+        self._flag, self._needs, self._share = flag, dict(needs or {}), share or Share()
+        self._waiting: deque[_Planned] = deque()
+        self._flying: dict[Any, _Planned] = {}
+        self._ended = as_completed(loop=client.loop)
+
+    def submit(self, key: str, task: Task, *args: Any) -> _Planned:
         """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own.
 
         A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it again.
         """
-        own = f"{self._prefix}-{next(self._submitted)}-{key}"
-        return self._client.submit(run_on_worker, self._plugin, self._flag, task, *args, key=own, pure=False, resources=self._needs)
+        planned = _Planned(f"{self._prefix}-{next(self._submitted)}-{key}", task, args)
+        self._waiting.append(planned)
+        return planned
 
-    def gather(self, pending: Sequence[Any]) -> list[Any]:
+    def gather(self, pending: Sequence[_Planned]) -> list[Any]:
         """See Executor."""
-        return list(self._client.gather(list(pending)))
+        most, missing = self._most_at_once(), set(pending)
+        while missing:
+            while self._waiting and len(self._flying) < most:
+                self._send(self._waiting.popleft())
+            for future in self._ended.next_batch():
+                planned = self._flying.pop(future)
+                if future.status != "finished":
+                    future.result()  # raises
+                if planned in missing:  # else its result goes to another task, which counts its time
+                    missing.remove(planned)
+                    planned.timed = future.result()
+                    self._share.end(planned.timed.seconds, planned.timed.tasks)
+        return [planned.timed.value for planned in pending]
+
+    def _send(self, planned: _Planned) -> None:
+        # What an earlier task returns goes from worker to worker.
+        args = [arg.future if isinstance(arg, _Planned) else arg for arg in planned.args]
+        options = {"resources": self._needs, "priority": self._share.begin(), "key": planned.key, "pure": False}
+        planned.future = self._client.submit(run_on_worker, self._factory, self._flag, planned.task, *args, **options)
+        planned.args = ()
+        self._flying[planned.future] = planned
+        self._ended.add(planned.future)
+
+    def _most_at_once(self) -> int:
+        able = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        threads = sum(worker["nthreads"] for worker in able if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items()))
+        return TASKS_AHEAD * max(threads, 1)
+
+
+@dataclass(eq=False)
+class _Planned:
+    """A task of a fit, before and after it has been given to the workers."""
+
+    key: str
+    task: Task
+    args: tuple[Any, ...]
+    future: Any = None
+    timed: Any = None
+
+
+class Timed(NamedTuple):
+    """What a task returned, and the worker time that went into it."""
+
+    value: Any
+    seconds: float
+    """Of this task and of those whose results it took that were not counted themselves."""
+    tasks: int
 
 
 class _EnginePlugin(WorkerPlugin):
     """A worker's child process, made at its first task and ended with the worker."""
 
-    name = "dentine-engine"
-    idempotent = True
-
     def __init__(self, factory: str) -> None:
         self._factory = factory
-        self.host: ChildHost | None = None
 
     def setup(self, worker: Any) -> None:
-        """Called by Dask on every worker, late-comers included."""
+        """Called by Dask when it is added to a worker."""
         self.host = ChildHost(self._factory, worker.state.nthreads, worker.memory_manager.memory_limit)
 
     def teardown(self, worker: Any) -> None:  # noqa: ARG002 - Dask's signature
         """Called by Dask when the worker closes."""
-        if self.host is not None:
-            self.host.close()
+        self.host.close()
 
 
-def plugin_name(factory: str) -> str:
-    """Name under which a worker keeps the child for an engine."""
-    return f"dentine-{factory}"
+async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
+    """The plugin of an engine, made where the worker has none: on the worker's loop, so that tasks in several threads make one."""
+    name = f"dentine-{factory}"
+    if name not in worker.plugins:
+        await worker.plugin_add(_EnginePlugin(factory), name=name, catch_errors=False)
+    plugin: _EnginePlugin = worker.plugins[name]
+    return plugin
 
 
-def run_on_worker(plugin: str, flag: Path, task: Task, *args: Any) -> Any:
+def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
     """Run a task with its worker's child, until ``flag`` exists."""
     from distributed import get_worker
+    from distributed.utils import sync
 
-    return task(CancellableHost(get_worker().plugins[plugin].host, flag), *args)
+    worker = get_worker()
+    plugin: _EnginePlugin = sync(worker.loop, _prepare_worker, worker, factory)
+    began_s, earlier = time.monotonic(), [arg for arg in args if isinstance(arg, Timed)]
+    given = [arg.value if isinstance(arg, Timed) else arg for arg in args]
+    value = task(CancellableHost(plugin.host, flag), *given)
+    seconds = time.monotonic() - began_s
+    return Timed(value, seconds + sum(one.seconds for one in earlier), 1 + sum(one.tasks for one in earlier))
 
 
 class Surroundings(NamedTuple):
@@ -117,13 +191,14 @@ def _surroundings() -> Surroundings | None:
 
 
 @contextmanager
-def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit") -> Iterator[Executor]:
+def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: float = 1.0) -> Iterator[Executor]:
     """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process.
 
     On a cluster tasks run where this one may, and their keys begin with its own, so that whoever looks at the workers knows whose they are.
 
     Args:
         flag: once it exists, what a worker renders is cut off.
+        weight: share of the workers' time relative to other fits'.
     """
     surroundings = _surroundings()
     if surroundings is None:
@@ -136,4 +211,4 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit") -> Iterator
     from distributed import worker_client
 
     with worker_client() as client:
-        yield DaskExecutor(client, factory, f"{surroundings.key}-{prefix}", flag, surroundings.needs)
+        yield DaskExecutor(client, factory, f"{surroundings.key}-{prefix}", flag, surroundings.needs, Share(weight))

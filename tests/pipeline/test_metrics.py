@@ -43,7 +43,7 @@ def test_jobs_steps_and_requests_are_counted(tmp_path: Path) -> None:
         entered.set()
         assert go_on.wait(60)
 
-    with serving(create_app(ServerSettings(data=tmp_path), run)) as client:
+    with serving(create_app(ServerSettings(data=tmp_path, jobs_at_once=1), run)) as client:
         assert value(scrape(client), "dentine_steps_total") == 0
         first, second = (client.post("/v1/jobs", json={"capture": "/"}).json()["id"] for _ in range(2))
         assert entered.wait(60)

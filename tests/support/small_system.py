@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import psutil
@@ -46,6 +47,7 @@ class SmallSystem:
 
     Args:
         has_rig_apart: the worker that reaches the dome only captures, and there is one more for the stages.
+        stages: module of what jobs run.
         network: hosts that the scheduler, the workers and the database are; None for this one.
         disk: where the data folder lies; None for an ordinary folder.
     """
@@ -58,6 +60,7 @@ class SmallSystem:
         disk: StoreDisk | None = None,
         *,
         has_rig_apart: bool = False,
+        stages: str = "tests.support.toy_stages",
     ) -> None:
         self.data, self.network, self.disk, self._folder, self._postgres = folder / "data", network, disk, folder, postgres
         self.acknowledged: list[str] = []
@@ -77,7 +80,7 @@ class SmallSystem:
             "scheduler": [*inside("scheduler"), *dask, "scheduler", "--host", host("scheduler"), "--port", scheduler.rpartition(":")[2], "--no-dashboard"],
             "worker": [*inside("worker"), *worker, "--host", host("worker"), "--resources", RUNS_STAGES],
             "rig": [*inside("rig"), *worker, "--host", host("rig"), "--resources", "DOME=1" if has_rig_apart else f"{RUNS_STAGES} DOME=1"],
-            "api": [sys.executable, "-m", "tests.support.stepped_clock", str(self._clock_step), "tests.support.toy_server", json.dumps(settings)],
+            "api": [sys.executable, "-m", "tests.support.stepped_clock", str(self._clock_step), "tests.support.toy_server", json.dumps(settings), stages],
         }
         if has_rig_apart:
             self._commands["worker2"] = self._commands["worker"]
@@ -155,12 +158,12 @@ class SmallSystem:
 
 
 @contextmanager
-def small_system(folder: Path, *, on_hosts: bool = False, has_rig_apart: bool = False) -> Iterator[SmallSystem]:
+def small_system(folder: Path, *, on_hosts: bool = False, **options: Any) -> Iterator[SmallSystem]:
     """A running system, ended with the block.
 
     Args:
         on_hosts: its parts are hosts on a network and its store is a disk; skips where this is not permitted.
-        has_rig_apart: see ``SmallSystem``.
+        options: see ``SmallSystem``.
     """
     from tests.support.postgres import postgres_server
 
@@ -169,7 +172,7 @@ def small_system(folder: Path, *, on_hosts: bool = False, has_rig_apart: bool = 
         network, disk = None, None
         if on_hosts:
             network, disk = stack.enter_context(network_of("scheduler", "worker", "rig", "database")), stack.enter_context(store_disk(folder / "data"))
-        system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk, has_rig_apart=has_rig_apart)
+        system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk, **options)
         system.data.mkdir(parents=True, exist_ok=True)
         stack.callback(system.close)
         system.start()

@@ -1,0 +1,83 @@
+"""Fits that share workers get equal worker time, whoever has the longer blocks, or what their weights say."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+
+import pytest
+
+from services.fit.shares import FADING_S, Share
+
+WORKERS, AHEAD, BLOCKS, PAUSE_S = 2, 4, 12, 0.5
+
+
+class Replay:
+    """Fits of steps of blocks on workers that take the ready task of the highest priority, in simulated time."""
+
+    def __init__(self, block_s: Sequence[float], weights: Sequence[float]) -> None:
+        self.now_s, self._free, self._ready, self._events = 0.0, WORKERS, list[tuple[float, int, int]](), list[tuple[float, int, int]]()
+        self._block_s, self._order = block_s, 0
+        self._shares = [Share(weight, lambda: self.now_s) for weight in weights]
+        self._left, self._flying = [BLOCKS for _ in block_s], [0 for _ in block_s]
+        self.used_s = [0.0 for _ in block_s]
+
+    def run(self, until_s: float) -> list[float]:
+        """Shares of the workers' time."""
+        for fit in range(len(self._block_s)):
+            self._fill(fit)
+        while self.now_s < until_s:
+            while self._free and self._ready:
+                _, _, fit = heapq.heappop(self._ready)
+                self._free -= 1
+                self._at(self._block_s[fit], fit)
+            self.now_s, _, fit = heapq.heappop(self._events)
+            self._end(fit)
+        return [used_s / sum(self.used_s) for used_s in self.used_s]
+
+    def _end(self, fit: int) -> None:
+        if not self._flying[fit] and not self._left[fit]:  # the pause between two steps is over
+            self._left[fit] = BLOCKS
+        else:
+            self._free, self._flying[fit] = self._free + 1, self._flying[fit] - 1
+            self._shares[fit].end(self._block_s[fit])
+            self.used_s[fit] += self._block_s[fit]
+        if self._flying[fit] or self._left[fit]:
+            self._fill(fit)
+        else:
+            self._at(PAUSE_S, fit)
+
+    def _fill(self, fit: int) -> None:
+        while self._left[fit] and self._flying[fit] < AHEAD:
+            self._left[fit], self._flying[fit] = self._left[fit] - 1, self._flying[fit] + 1
+            heapq.heappush(self._ready, (-self._shares[fit].begin(), self._next(), fit))
+
+    def _at(self, after_s: float, fit: int) -> None:
+        heapq.heappush(self._events, (self.now_s + after_s, self._next(), fit))
+
+    def _next(self) -> int:
+        self._order += 1
+        return self._order
+
+
+@pytest.mark.parametrize("block_s", [(1.0, 1.0), (1.0, 3.0), (0.2, 0.6), (3.0, 9.0)])
+def test_equal_fits_get_equal_shares_whoever_has_the_longer_blocks(block_s: tuple[float, float]) -> None:
+    first, second = Replay(block_s, (1.0, 1.0)).run(1200.0)
+    assert abs(first - second) < 0.1 * (first + second)  # half of the 20 % that are promised
+
+
+def test_three_fits_share_by_their_weights() -> None:
+    shares = Replay((1.0, 0.5, 1.0), (0.25, 1.0, 0.25)).run(1200.0)
+    assert shares == pytest.approx([1 / 6, 4 / 6, 1 / 6], abs=0.06)
+
+
+def test_use_fades_and_what_is_under_way_counts() -> None:
+    now_s = 0.0
+    share = Share(clock=lambda: now_s)
+    assert [share.begin(), share.begin()] == [0, 0]  # nothing is known of how long its tasks take
+    share.end(10.0)
+    assert share.begin() == pytest.approx(-20.0)  # what was used, and as much for the one that has not ended
+    share.end(10.0, tasks=2)
+    assert share.begin() == pytest.approx(-20.0)
+    now_s = FADING_S
+    assert share.begin() == pytest.approx(-20.0 / 2.718281828 - 20.0 / 3)
