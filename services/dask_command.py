@@ -27,9 +27,7 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
     @app.command(context_settings=_ALL_TO_DASK)
     def worker(
         context: typer.Context,
-        captures_only: Annotated[
-            bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")
-        ] = False,
+        captures_only: Annotated[bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")] = False,
     ) -> None:
         """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address.
 

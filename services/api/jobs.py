@@ -68,9 +68,7 @@ class Jobs:
         self.calibrations = Calibrations(self._data)
         self._light_limits = LightLimits(settings.dome)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
-        self._admission = Admission(
-            lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks
-        )
+        self._admission = Admission(lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks)
         places, running = settings.jobs_at_once, lambda: self._admission.sharing
         self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running)
 

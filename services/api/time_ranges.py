@@ -48,8 +48,7 @@ class TimeRange(Record):
         if self.low_s is None or self.high_s is None:
             return self
         low_s, high_s = (
-            _start_s([getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places)
-            for limit in ("low_s", "high_s")
+            _start_s([getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places) for limit in ("low_s", "high_s")
         )
         fewer = min(one.past_jobs for one in (self, *running, *ahead))
         return self.model_copy(update={"low_s": self.low_s + low_s, "high_s": self.high_s + high_s, "past_jobs": fewer})
