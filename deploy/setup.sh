@@ -1,6 +1,6 @@
 #!/bin/sh
 # Prepares a fresh Debian 12+ or Ubuntu 24.04+ machine; what is there already is left alone.
-#   deploy/setup.sh              .venv with the package and its tools, libLLVM for the renderer
+#   deploy/setup.sh              .venv with the package and its tools, libLLVM and libatomic for the renderer
 #   deploy/setup.sh dashboard    also the dashboard's bundle
 #   deploy/setup.sh browser      also Chromium for the browser tests; goes on without it
 set -eu
@@ -9,7 +9,7 @@ cd "$(dirname "$0")/.."
 say() { printf 'setup: %s\n' "$1" >&2; }
 die() { say "$1"; exit 4; }
 
-# Install with apt where this user may; false elsewhere.
+# Install the first of these packages that apt knows, where this user may; false elsewhere.
 apt_install() {
     command -v apt-get >/dev/null || return 1
     as_root=
@@ -17,10 +17,15 @@ apt_install() {
         sudo -n true 2>/dev/null || return 1
         as_root="sudo -n"
     fi
-    say "installing $* with apt"
     [ -n "${apt_updated:-}" ] || $as_root apt-get update -qq </dev/null >&2 || true
     apt_updated=yes
-    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$@" </dev/null >&2
+    for package in "$@"; do
+        [ -n "$(apt-cache search --names-only "^$package\$")" ] || continue
+        say "installing $package with apt"
+        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$package" </dev/null >&2
+        return
+    done
+    return 1
 }
 
 prepare_packages() {
@@ -37,15 +42,22 @@ prepare_packages() {
     touch "$stamp"
 }
 
-llvm_is_usable() { .venv/bin/python -c 'import drjit, sys; sys.exit(drjit.detail.llvm_version()[0] < 17)'; }
+# What the renderer lacks on this machine, as one sentence, into $lack; false if it lacks something.
+check_renderer() {
+    lack=$(.venv/bin/python -m services.fit.transport.platform 2>&1) && return
+    lack=$(printf '%s\n' "$lack" | tail -n 1)
+    return 1
+}
 
-prepare_llvm() {
-    llvm_is_usable && return
+prepare_renderer() {
+    check_renderer && return
+    case "$lack" in *libatomic*)
+        apt_install libatomic1 || die "$lack"
+        check_renderer && return ;;
+    esac
     [ -z "${DRJIT_LIBLLVM_PATH:-}" ] || die "DRJIT_LIBLLVM_PATH=$DRJIT_LIBLLVM_PATH is no libLLVM of version 17 or later; correct or unset it."
-    for name in libllvm19 libllvm18 libllvm17t64 libllvm17; do
-        apt_install "$name" && break
-    done
-    llvm_is_usable || die "The renderer needs libLLVM 17 or later; install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so."
+    apt_install libllvm19 libllvm18 libllvm17t64 libllvm17 || true
+    check_renderer || die "$lack"
 }
 
 prepare_dashboard() {
@@ -66,7 +78,7 @@ prepare_browser() {
 }
 
 prepare_packages
-prepare_llvm
+prepare_renderer
 for extra in "$@"; do
     case "$extra" in
         dashboard) prepare_dashboard ;;

@@ -44,6 +44,9 @@ def main() -> NoReturn:
     except DentineError as problem:
         print(f"dentine: {problem.message}", file=sys.stderr)
         sys.exit(problem.exit_status)
+    except ModuleNotFoundError as problem:
+        print(f"dentine: {_remedy(problem)}", file=sys.stderr)
+        sys.exit(4)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
@@ -72,6 +75,22 @@ def build_app() -> typer.Typer:
     app.add_typer(simulate, name="simulate")
     app.add_typer(build_token_app(lambda: read_settings(os.environ).server.database_url), name="token")
     return app
+
+
+_EXTRAS = MappingProxyType({"serve": "api", "token": "api", "capture": "capture", "dome-sim": "capture", "bench": "worker,bench"})
+"""What a command needs beside the base installation; of those that are not named here all that a worker has."""
+
+
+def _remedy(missing: ModuleNotFoundError) -> str:
+    """What to install for the command that was called; a module of our own that is missing is a fault.
+
+    Raises:
+        ModuleNotFoundError: it is one of our own.
+    """
+    if (missing.name or "services").partition(".")[0] == "services":
+        raise missing
+    extra = _EXTRAS.get(next(iter(sys.argv[1:]), ""), "worker")
+    return f"This command needs {missing.name}, which is not installed; pip install 'dentine[{extra}]' brings it."
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,6 +1,6 @@
 # Workers, their scheduler and the simulated dome: all stages, with the libLLVM that the renderer compiles with.
 FROM python:3.12-slim-bookworm
-RUN apt-get update && apt-get install -y --no-install-recommends libllvm19 && rm -rf /var/lib/apt/lists/* \
+RUN apt-get update && apt-get install -y --no-install-recommends libatomic1 libllvm19 && rm -rf /var/lib/apt/lists/* \
  && useradd --uid 10001 --create-home dentine && install -d -o dentine -g dentine /data
 WORKDIR /app
 COPY pyproject.toml README.md ./

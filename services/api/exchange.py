@@ -60,15 +60,9 @@ class Exchange:
         self.server, self._token = server, token
 
     def connection(self) -> dict[str, Any]:
-        """Arguments of ``httpx.Client`` and of ``httpx.AsyncClient``.
+        """Arguments of ``httpx.Client`` and of ``httpx.AsyncClient``."""
+        import httpx
 
-        Raises:
-            PlatformError: httpx is not installed, as in a broken environment.
-        """
-        try:
-            import httpx
-        except ModuleNotFoundError as problem:
-            raise PlatformError("The client's package httpx is not installed; install dentine again, which brings it.") from problem
         headers = {} if self._token is None else {"Authorization": f"Bearer {self._token.get_secret_value()}"}
         return {"base_url": f"{self.server.rstrip('/')}/v1", "headers": headers, "timeout": httpx.Timeout(10.0, read=60.0), "trust_env": False}
 

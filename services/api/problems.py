@@ -57,6 +57,19 @@ _PATH_CHARACTERS = "/:@!$&'()*+,;=~"
 """That a URI's path may hold as they are, besides letters and digits (RFC 3986, 3.3)."""
 CHECKSUM_MISMATCH = 460
 """Of the tus protocol, no registered status."""
+_PHRASES = {
+    413: "Request Entity Too Large",
+    414: "Request-URI Too Long",
+    416: "Requested Range Not Satisfiable",
+    422: "Unprocessable Entity",
+    CHECKSUM_MISMATCH: "Checksum Mismatch",
+}
+"""Those that Python 3.13 names anew, after RFC 9110, as they were: a problem's title and code stay the same whatever the server runs on."""
+
+
+def phrase_of(status: int) -> str:
+    """The name of an HTTP status, the same on every Python."""
+    return _PHRASES.get(status) or HTTPStatus(status).phrase
 
 
 class Problem(Record):
@@ -72,7 +85,7 @@ class Problem(Record):
     @classmethod
     def of(cls, status: int, code: str, detail: str, path: str, **more: object) -> Self:
         """The document for a status, one of our codes and a decoded path; ``more`` are the members of a subclass."""
-        title = "Checksum Mismatch" if status == CHECKSUM_MISMATCH else HTTPStatus(status).phrase
+        title = phrase_of(status)
         fields = {"detail": redacted(detail).encode(errors="backslashreplace").decode(), "instance": quote(redacted(path), safe=_PATH_CHARACTERS), "code": code}
         return cls.model_validate({"type": f"urn:dentine:problem:{code}", "title": title, "status": status} | fields | more)
 
@@ -138,7 +151,8 @@ def database_lost(path: str) -> Response:
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """What the description says of routes that may answer so, besides what the shield, the gate and a lost database answer everywhere."""
-    return {status: {"model": Problem, "content": {MEDIA_TYPE: {}}} for status in sorted({400, 401, 403, 429, 503, *statuses})}
+    chosen = sorted({400, 401, 403, 429, 503, *statuses})
+    return {status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen}
 
 
 def install(app: FastAPI) -> None:
@@ -188,7 +202,7 @@ def install(app: FastAPI) -> None:
         status = HTTPStatus(problem.status_code)
         if status is HTTPStatus.BAD_REQUEST and problem.__cause__ is not None:  # FastAPI's on a body that is no text; of other malformed bodies it says 422
             return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", "The body cannot be read; send JSON in UTF-8.")
-        return answer(request, status, status.phrase.lower().replace(" ", "-"), f"{problem.detail}.", problem.headers)
+        return answer(request, status, phrase_of(status).lower().replace(" ", "-"), f"{problem.detail}.", problem.headers)
 
     @app.exception_handler(Exception)
     def _unexpected(request: Request, _problem: Exception) -> Response:

@@ -214,9 +214,9 @@ def accumulate(
     Returns:
         Names of the derivatives, and the sums.
     """
+    prepare_device()
     ior = _checked(layers, ior, boundary, source)
     _check_directions(source, mu_incident, exit_cosines, ring_edges_mm)
-    prepare_device()
     from services.fit.transport.geometry import SlabGeometry
     from services.fit.transport.media import Media, Score
     from services.fit.transport.scores import Plan

@@ -1,8 +1,16 @@
-"""Choose the Dr.Jit back end once per process, after checking that it cannot abort the process."""
+"""Choose the Dr.Jit back end once per process, after checking that it cannot abort the process.
+
+Whoever renders calls ``prepare_device`` before it imports a kernel, so that whatever the machine lacks is told here, as one sentence.
+``python -m services.fit.transport.platform`` tells it too, and exits with status 4.
+"""
 
 from __future__ import annotations
 
 import importlib
+import re
+import sys
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Literal
 
 from services.core.errors import PlatformError
@@ -10,6 +18,28 @@ from services.core.records import Device
 
 OLDEST_LLVM = 17
 """libLLVM 13 and 14 are refused by Dr.Jit with a misleading sentence; 15 and 16 abort the process in the first kernel."""
+LLVM_REMEDY = "install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so"
+PACKAGES = {"libatomic.so.1": "libatomic1", "libstdc++.so.6": "libstdc++6"}
+"""Debian's and Ubuntu's package of each library that Dr.Jit's wheel takes from the system; a bare system lacks the first."""
+_MISSING_LIBRARY = re.compile(r"(lib\S+?\.so[.\d]*): cannot open shared object file")
+
+
+def import_renderer() -> tuple[ModuleType, ModuleType]:
+    """The modules ``drjit`` and ``mitsuba``.
+
+    Raises:
+        PlatformError: names the system library that their wheels need and the machine lacks.
+    """
+    try:
+        return importlib.import_module("drjit"), importlib.import_module("mitsuba")
+    except ModuleNotFoundError:
+        raise  # the package itself: whoever installed this process's extras knows which one brings it
+    except (ImportError, NameError) as problem:  # drjit's own handler of a failed import ends in a NameError
+        for cause in _causes(problem):
+            if missing := _MISSING_LIBRARY.search(str(cause)):
+                package = PACKAGES.get(missing[1], f"the package of {missing[1]}")
+                raise PlatformError(f"The renderer needs {missing[1]}, which this machine lacks; install {package}.") from problem
+        raise PlatformError(f"The renderer cannot be loaded ({problem}); install drjit and mitsuba again.") from problem
 
 
 def require_llvm(version: tuple[int, int, int]) -> None:
@@ -18,11 +48,10 @@ def require_llvm(version: tuple[int, int, int]) -> None:
     Raises:
         PlatformError: names what was found and what to install.
     """
-    remedy = "install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so"
     if version[0] < 0:
-        raise PlatformError(f"No libLLVM was found, which the CPU renderer needs; {remedy}.")
+        raise PlatformError(f"No libLLVM was found, which the CPU renderer needs; {LLVM_REMEDY}.")
     if version[0] < OLDEST_LLVM:
-        raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {remedy}.")
+        raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {LLVM_REMEDY}.")
 
 
 def require_renderer() -> None:
@@ -55,10 +84,9 @@ def prepare_device(threads: int | None = None, backend: Device | None = None, co
         colours: ``mono`` for everything that fits; ``rgb`` for pictures of other people's scenes.
 
     Raises:
-        PlatformError: the back end is not usable here, or another one is already in use.
+        PlatformError: a library is missing, the back end is not usable here, or another one is already in use.
     """
-    drjit = importlib.import_module("drjit")
-    mitsuba = importlib.import_module("mitsuba")
+    drjit, mitsuba = import_renderer()
     if backend is None:
         backend = "cuda" if (mitsuba.variant() or "").startswith("cuda") else "llvm"
     variant = f"{backend}_ad_{colours}"
@@ -73,3 +101,17 @@ def prepare_device(threads: int | None = None, backend: Device | None = None, co
     mitsuba.set_variant(variant)
     if threads is not None:
         drjit.set_thread_count(threads)
+
+
+def _causes(problem: BaseException | None) -> Iterator[BaseException]:
+    while problem is not None:
+        yield problem
+        problem = problem.__cause__ or problem.__context__
+
+
+if __name__ == "__main__":
+    try:
+        require_llvm(tuple(import_renderer()[0].detail.llvm_version()))
+    except PlatformError as problem:
+        print(problem.message, file=sys.stderr)
+        sys.exit(problem.exit_status)

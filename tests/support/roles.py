@@ -1,0 +1,89 @@
+"""What each part of the service is installed with, and where it enters the code."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+DOME_AT_THE_SERVER = "services.capture.console"
+_NAME_AND_EXTRAS = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^\]]*)\])?")
+_EXTRA_MARKER = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+
+
+@dataclass(frozen=True)
+class Role:
+    """One part of the service.
+
+    Attributes:
+        extras: of the package; what its machine or its image installs.
+        entries: ``module`` or ``module:function`` where it enters the code, also through a name in a string.
+    """
+
+    extras: tuple[str, ...]
+    entries: tuple[str, ...]
+
+
+_COMMANDS = ("services.__main__:build_app",)
+_WORKER = (*_COMMANDS, "services.dask_command", "services.api.pipeline", "services.preprocess.stage", "services.fit.stage", "services.fit.engine_host")
+_WORKER += ("services.fit.transport.engine",)
+_CLIENT_COMMANDS = tuple(f"services.__main__:{name}" for name in ("upload", "submit", "watch", "cancel", "retry"))
+
+ROLES: Mapping[str, Role] = {
+    "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.token_command", DOME_AT_THE_SERVER)),
+    "scheduler": Role((), (*_COMMANDS, "services.dask_command")),
+    "worker": Role(("worker",), _WORKER),
+    "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
+    "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.simulator")),
+    "client": Role((), (*_COMMANDS, *_CLIENT_COMMANDS)),
+}
+
+
+def distributions(extras: Iterable[str]) -> set[str]:
+    """Normal names of all that ``pip install dentine[extras]`` brings: this tree's own requirements, and theirs as they are installed here."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    optional: dict[str, list[str]] = project["optional-dependencies"]
+    found: set[tuple[str, str]] = set()
+    todo = [*project["dependencies"], *(f"dentine[{extra}]" for extra in extras)]
+    while todo:
+        name, wanted = _parse(todo.pop())
+        if name == "dentine":
+            todo += [one for extra in wanted for one in optional[extra]]
+            continue
+        for extra in ("", *wanted):
+            if (name, extra) not in found:
+                found.add((name, extra))
+                todo += _requirements(name, extra)
+    return {name for name, _ in found}
+
+
+def normal(name: str) -> str:
+    """A distribution's name as the package index compares it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _parse(requirement: str) -> tuple[str, tuple[str, ...]]:
+    match = _NAME_AND_EXTRAS.match(requirement)
+    assert match is not None, requirement
+    return normal(match[1]), tuple(one.strip() for one in (match[2] or "").split(",") if one.strip())
+
+
+@cache
+def _requirements(name: str, extra: str) -> tuple[str, ...]:
+    return tuple(_required_by(name, extra))
+
+
+def _required_by(name: str, extra: str) -> Iterator[str]:
+    try:
+        requirements = importlib.metadata.requires(name) or ()
+    except importlib.metadata.PackageNotFoundError:
+        return  # for another Python or another system
+    for requirement in requirements:
+        marker = _EXTRA_MARKER.search(requirement)
+        if (marker[1] if marker else "") == extra:
+            yield requirement.partition(";")[0]
