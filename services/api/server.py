@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.api.access import refuse_open_network
-from services.api.app import STATIC, create_app
+from services.api.app import create_app, is_dashboard_built
 from services.api.collector import leave_alone_what_is_loaded
 from services.api.database import open_database
 from services.api.logs import configure_logs
@@ -45,8 +45,8 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
         raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
 
     with _sole_server(settings.data), closing(_listen(settings)) as listener:
-        if not (STATIC / "app.js").exists():
-            print("The dashboard is not built; run make dashboard. The API works without it.", file=sys.stderr)
+        if not is_dashboard_built():
+            print("The dashboard is not built; run make dashboard and start again. The API works without it.", file=sys.stderr)
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)

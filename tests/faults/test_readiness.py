@@ -161,6 +161,7 @@ def test_a_read_only_data_folder_is_told() -> None:
             path.chmod(0o555 if path.is_dir() else 0o444)
         with unprivileged():
             bad = {check.name: check.sentence for check in readiness.checks() if not check.ok}
+        jobs.repository.close()
         assert set(bad) == {"database", "store"}
         assert "readonly database" in bad["database"] or "unable to open" in bad["database"]
         assert "Permission denied" in bad["store"]

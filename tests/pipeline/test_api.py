@@ -239,8 +239,10 @@ def test_a_deleted_job_is_gone_and_its_receipt_stays(serve: Any, capture_folder:
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert list((tmp_path / "data" / "jobs").iterdir()) == []
     # Nor do its options lie in the database's files any more.
-    with open_database(sqlite_url(tmp_path / "data" / DATABASE_FILE)).connect() as connection:
+    engine = open_database(sqlite_url(tmp_path / "data" / DATABASE_FILE))
+    with engine.connect() as connection:
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+    engine.dispose()
     assert not [path for path in (tmp_path / "data").glob("dentine.sqlite*") if capture_folder.encode() in path.read_bytes()]
 
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,35 +12,28 @@ from pathlib import Path
 import httpx
 import pytest
 
-from services.api.app import STATIC
+from services.api.app import is_dashboard_built
+from tests.support.installed import build_wheel, environment_without_this_tree, install
 from tests.support.live_server import running_server
 from tests.support.small_system import free_port
 from tests.support.uploading import write_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
-ROOT = Path(__file__).parents[2]
 ABSENT = ("mitsuba", "drjit", "cv2", "pymodbus", "scipy", "rtree", "manifold3d", "xatlas", "PIL", "matplotlib", "psycopg")
 
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A virtual environment with ``.[api]``, installed from a copy of the tree as the dashboard's image does."""
+    """A virtual environment with ``dentine[api]`` alone."""
     folder = tmp_path_factory.mktemp("installed")
-    tree = folder / "tree"
-    shutil.copytree(ROOT / "services", tree / "services", ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, tree)
-    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
-    subprocess.run([str(folder / "venv/bin/pip"), "install", "--quiet", f"{tree}[api]"], check=True, cwd=folder)
-    return folder / "venv"
+    return install(build_wheel(folder / "build"), ["api"], folder / "venv").parent
 
 
 @contextmanager
 def served(environment: Path, data: Path, **settings: str) -> Iterator[httpx.Client]:
     """The installed server, which sees nothing of this tree."""
-    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     command = [str(environment / "bin/dentine"), "serve", "--port", "0", "--data", str(data)]
-    with running_server(command, cwd=data.parent, environment=inherited | settings) as (client, _):
+    with running_server(command, cwd=data.parent, environment=environment_without_this_tree(**settings)) as (client, _):
         yield client
 
 
@@ -58,7 +48,7 @@ def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path
         assert client.get("/v1/health/live").json() == {"status": "live"}
         assert client.get("/v1/health/ready").status_code == 200
         assert "<title>dentine</title>" in client.get("/").text
-        assert client.get("/app.js").status_code == (200 if (STATIC / "app.js").exists() else 404)
+        assert client.get("/app.js").status_code == (200 if is_dashboard_built() else 404)
         assert "/v1/jobs" in client.get("/v1/openapi.json").json()["paths"]
 
 

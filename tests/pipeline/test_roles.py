@@ -129,7 +129,7 @@ def parts(programs: dict[str, Path], tmp_path: Path) -> Iterator[Parts]:
 def test_a_small_job_runs_through_parts_that_have_only_their_own_packages(parts: Parts, tmp_path: Path) -> None:
     parts.run("worker", *PHANTOM)
     uploaded = json.loads(parts.run("client", "upload", "mouth", "--server", parts.address, "--json"))
-    assert Path(uploaded["path"]).is_dir()
+    assert (tmp_path / "data" / uploaded["path"]).is_dir()
 
     (tmp_path / "job.toml").write_text(JOB.format(port=parts.dome.rpartition(":")[2], mouth=tmp_path / "mouth"))
     job = parts.run("client", "submit", "job.toml", "--watch", "--server", parts.address).splitlines()[0]

@@ -6,8 +6,9 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from tests.support.roles import ROOT
 
@@ -15,8 +16,8 @@ TREE = ("services", "pyproject.toml", "README.md", "LICENSE")
 NOT_COPIED = shutil.ignore_patterns("__pycache__", "node_modules")
 
 
-def build_wheel(folder: Path) -> Path:
-    """Build the wheel from a copy of this tree, with the dashboard's bundle where it has been built."""
+def build_wheel(folder: Path, added: Mapping[str, str] = MappingProxyType({})) -> Path:
+    """Build the wheel from a copy of this tree, with the dashboard's bundle where it has been built; ``added`` gives the text of further files."""
     tree = folder / "tree"
     tree.mkdir(parents=True)
     for name in TREE:
@@ -25,6 +26,8 @@ def build_wheel(folder: Path) -> Path:
             shutil.copytree(source, tree / name, ignore=NOT_COPIED)
         else:
             shutil.copy(source, tree)
+    for path, text in added.items():
+        (tree / path).write_text(text)
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder / "wheel"), str(tree)]
     subprocess.run(command, check=True, cwd=folder)
     (wheel,) = (folder / "wheel").glob("*.whl")

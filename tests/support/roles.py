@@ -32,7 +32,6 @@ class Role:
 _COMMANDS = ("services.__main__:build_app",)
 _WORKER = (*_COMMANDS, "services.dask_command", "services.api.pipeline", "services.preprocess.stage", "services.fit.stage", "services.fit.engine_host")
 _WORKER += ("services.fit.transport.engine",)
-_CLIENT_COMMANDS = tuple(f"services.__main__:{name}" for name in ("upload", "submit", "watch", "cancel", "retry"))
 
 ROLES: Mapping[str, Role] = {
     "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.token_command", DOME_AT_THE_SERVER)),
@@ -40,7 +39,7 @@ ROLES: Mapping[str, Role] = {
     "worker": Role(("worker",), _WORKER),
     "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
     "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.simulator")),
-    "client": Role((), (*_COMMANDS, *_CLIENT_COMMANDS)),
+    "client": Role((), (*_COMMANDS, "services.client_commands")),
 }
 
 

@@ -13,7 +13,7 @@ FIRST = "0001"
 
 
 def upgrade(engine: sql.Engine, to: str = "head") -> None:
-    """Take all steps that are missing, up to one. Servers that start together wait for each other."""
+    """Take all steps that are missing, up to one, and close what was opened for that. Servers that start together wait for each other."""
     from alembic import command
     from alembic.config import Config
 
@@ -26,3 +26,4 @@ def upgrade(engine: sql.Engine, to: str = "head") -> None:
         if "job" in tables and "alembic_version" not in tables:
             command.stamp(config, FIRST)
         command.upgrade(config, to)
+    engine.dispose()
