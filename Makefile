@@ -4,8 +4,7 @@
 BIN := .venv/bin
 
 demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and report, below demo/
-	@test -e demo/mouth/capture.json || $(BIN)/dentine phantom --out demo/mouth --pixel-mm 0.5 --cameras 3 --lights 8 --samples 8192
-	@$(BIN)/dentine run deploy/examples/demo.toml --out demo
+	@$(BIN)/dentine demo --out demo
 
 gallery: setup ## pictures of a tooth in an ordinary scene, in gallery/, some minutes
 	@$(BIN)/python -m services.fit.gallery --out gallery

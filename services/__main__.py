@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from types import FrameType, MappingProxyType
+from types import MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -114,29 +111,10 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Run a job to its asset, without a server."""
-    from services.api.pipeline import run_job
-    from services.api.progress import ProgressView
     from services.core.settings import read_job
+    from services.run_command import run_and_tell
 
-    spec = read_job(job)
-    with cancelling_on_signals(out), ProgressView() as view:
-        asset = run_job(spec, out, view, workers)
-    if not view.events:
-        print("Every stage was published already; nothing ran.", file=sys.stderr)
-    report = out / "report.html"
-    if not asset.converged:
-        print(f"The fit did not converge. {asset.advice}", file=sys.stderr)
-    if as_json:
-        result = {
-            "converged": asset.converged,
-            "held_out_error": asset.held_out_error,
-            "report": str(report),
-            "parameters": str(out / "parameters.json"),
-            "files": list(asset.files),
-        }
-        print(json.dumps(result))
-    else:
-        print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")
+    run_and_tell(read_job(job), out, workers, as_json=as_json)
 
 
 def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the job.")]) -> None:
@@ -146,7 +124,7 @@ def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the 
     spec = read_job(job)
     if spec.rig is None:
         raise InputError(f"Job file {job} names no rig to capture with; give it a [rig] table.")
-    _run_one("capture", spec, out, again=False)
+    _run_some(("phantom", "capture") if spec.is_demo else ("capture",), spec, out, again=False)
     print(f"capture: {out / 'capture'}")
 
 
@@ -156,41 +134,17 @@ def export(out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a 
     from services.core.records import JobSpec
     from services.core.store import read_record
 
-    _run_one("export", read_record(out / JOB_FILE, JobSpec), out, again=True)
+    _run_some(("export",), read_record(out / JOB_FILE, JobSpec), out, again=True)
     print(f"report: {out / 'report.html'}")
 
 
-def _run_one(stage: Any, spec: Any, out: Path, *, again: bool) -> None:
+def _run_some(stages: Any, spec: Any, out: Path, *, again: bool) -> None:
     from services.api.pipeline import run_stages
     from services.api.progress import ProgressView
+    from services.run_command import cancelling_on_signals
 
     with cancelling_on_signals(out), ProgressView() as view:
-        run_stages(spec, out, (stage,), view, workers=1, again=again)
-
-
-@contextmanager
-def cancelling_on_signals(out: Path) -> Iterator[None]:
-    """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
-    from services.api.pipeline import request_cancel, withdraw_cancel
-
-    asked = False
-    withdraw_cancel(out)
-
-    def ask(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        out.mkdir(parents=True, exist_ok=True)
-        request_cancel(out)
-        print("Stopping after the current frame or step; press Ctrl-C again to stop at once.", file=sys.stderr)
-
-    earlier = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in earlier.items():
-            signal.signal(number, handler)
+        run_stages(spec, out, stages, view, workers=1, again=again)
 
 
 def serve(

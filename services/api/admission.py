@@ -29,6 +29,8 @@ LEAST_DISK_BYTES = 64 * 2**20
 """What a job stores of a small capture: pictures, checkpoint and asset."""
 RIG_CAPTURE_BYTES = 2 * 2**30
 """A capture that a rig is about to take."""
+DEMO_CAPTURE_BYTES = 2**20
+"""What the demonstration's rig takes: 0.3 MB were measured."""
 WORKER_BYTES = 3 * 2**29
 """Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
 MOST_FILES = 5_000
@@ -59,7 +61,8 @@ class Needs:
 
 def predict(spec: JobSpec) -> Needs:
     """Prediction from the size of the capture and the number of workers."""
-    size = RIG_CAPTURE_BYTES if spec.capture is None else _stored_bytes(spec.capture)
+    rigs = DEMO_CAPTURE_BYTES if spec.is_demo else RIG_CAPTURE_BYTES
+    size = rigs if spec.capture is None else _stored_bytes(spec.capture)
     return Needs(LEAST_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
 
 

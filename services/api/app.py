@@ -23,6 +23,8 @@ from services.core.stage import StageName
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
+PHANTOMS = "phantoms"
+"""In the data folder: mouths of demonstrations, each rendered once. Whatever is removed there is made again."""
 STATIC = Path(__file__).parent / "dashboard" / "static"
 UNBUILT = STATIC.with_name("unbuilt")
 """The page that says how the dashboard is built."""
@@ -63,7 +65,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     workers = Workers(settings.scheduler, certificates)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True, before=lambda: jobs.take_turn(events.job))
+        kept = settings.data.resolve() / PHANTOMS
+        run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True, before=lambda: jobs.take_turn(events.job), phantoms=kept)
 
     def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         if spec.rig is not None:

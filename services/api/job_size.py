@@ -15,6 +15,8 @@ from services.core.records import CaptureManifest, FolderCapture, JobSpec
 from services.core.store import MANIFEST, open_stage
 
 LARGEST_DESCRIPTION_BYTES = 64 * 2**20
+DEMO_VALUES = 16_896
+"""Of the demonstration: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
 _METHOD = ("kind", "boundary", "dentin", "loss", "solver", "prior", "stains", "lobes", "advise", "workers", "device")
 """Options that change what is done; the others change how much of it, or nothing that lasts."""
 
@@ -34,6 +36,8 @@ class JobSize(Record):
 
 def size_of(spec: JobSpec) -> JobSize | None:
     """Size of a job from the description of its capture; None where that cannot be read."""
+    if spec.is_demo:
+        return _sized(spec, DEMO_VALUES)
     try:
         path = _description(spec)
         if path is None:
@@ -41,7 +45,10 @@ def size_of(spec: JobSpec) -> JobSize | None:
         images_px, channels = _images(path, path.stat().st_mtime_ns)
     except (OSError, ValueError, KeyError, StoreError):
         return None
-    values = images_px * (channels if spec.channels is None else len(spec.channels))
+    return _sized(spec, images_px * (channels if spec.channels is None else len(spec.channels)))
+
+
+def _sized(spec: JobSpec, values: int) -> JobSize:
     steps = spec.adam_steps if spec.solver == "adam" else spec.max_steps
     return JobSize(pixels=max(values // spec.pixel_step**2, 1), samples=spec.samples_per_pixel, steps=steps)
 

@@ -117,7 +117,7 @@ class Jobs:
             require_server_path("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
         if spec.rig is not None:
             self._light_limits.require(spec.rig)
-        if spec.rig is not None and not is_uploaded(spec.rig.mouth):
+        if spec.rig is not None and not spec.is_demo and not is_uploaded(spec.rig.mouth):
             require_server_path("rig.mouth", spec.rig.mouth, "upload it with dentine submit --upload, or try the demonstration with dentine demo")
         if spec.calibration is not None and is_stored(spec.calibration):
             self.calibrations.require(spec.calibration)

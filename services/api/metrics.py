@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, get_args
 
 import sqlalchemy as sql
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector
@@ -21,7 +21,7 @@ from services.api.webhook_tables import DeliveryState, delivery_table
 from services.core.stage import StageName
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-STAGES: tuple[StageName, ...] = ("capture", "prepare", "fit", "export")
+STAGES: tuple[StageName, ...] = get_args(StageName)
 _LATENCIES_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 

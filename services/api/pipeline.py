@@ -2,7 +2,9 @@
 
 ::
 
-    capture {DOME: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}        capture only where the job names a rig
+    phantom {STAGES: 1} -> capture {DOME: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}
+
+A capture only where the job names a rig, a phantom only where that is the demonstration's.
 
 Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its part: a rig may go away
 after its capture. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task whose worker dies is run again by
@@ -59,6 +61,7 @@ GRACE_S = 5.0
 
 DOORS: Mapping[StageName, str] = MappingProxyType(
     {
+        "phantom": "services.fit.stage:phantom",
         "capture": "services.capture.stage:run",
         "prepare": "services.preprocess.stage:run",
         "fit": "services.fit.stage:run",
@@ -66,14 +69,14 @@ DOORS: Mapping[StageName, str] = MappingProxyType(
     }
 )
 """``module:function`` of each stage; imported by the worker, never here."""
-_PUBLISHED_AS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
-_EXTRAS = {"capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
+_PUBLISHED_AS = {"phantom": "phantom", "capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
+_EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
 """What to install where a stage runs."""
 
 
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
     """The stages a job goes through, in order."""
-    return (*(("capture",) if spec.rig is not None else ()), "prepare", "fit", "export")
+    return (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()), "prepare", "fit", "export")
 
 
 def first_stage(spec: JobSpec, root: Path) -> StageName | None:
@@ -92,6 +95,7 @@ def run_job(
     *,
     is_logged: bool = False,
     before: Callable[[], None] | None = None,
+    phantoms: Path | None = None,
 ) -> AssetManifest:
     """Run a job to its asset; needs no server.
 
@@ -104,11 +108,12 @@ def run_job(
         cluster: where it runs, default workers of its own.
         is_logged: workers write log lines on standard error.
         before: called before each stage but a capture; what it raises ends the run.
+        phantoms: folder in which the demonstration's mouth is kept from job to job, seen by the workers; None to make it anew for each.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged, before=before)
+    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged, before=before, phantoms=phantoms)
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -125,6 +130,7 @@ def run_stages(
     again: bool = False,
     is_logged: bool = False,
     before: Callable[[], None] | None = None,
+    phantoms: Path | None = None,
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
     root = root.resolve()
@@ -139,10 +145,18 @@ def run_stages(
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
-                tasks = [StageTask(stage, doors[stage], spec, root, address, again, is_logged) for stage in todo]
+                tasks = [StageTask(stage, doors[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged) for stage in todo]
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
             watch.tell()
+
+
+def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
+    """The options as a stage sees them: the demonstration's mouth is where such mouths are kept, and then the one made for this job."""
+    if spec.rig is None or not spec.is_demo:
+        return spec
+    mouth = (phantoms or spec.rig.mouth) if stage == "phantom" else root / _PUBLISHED_AS["phantom"]
+    return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": mouth})})
 
 
 def request_cancel(root: Path) -> None:

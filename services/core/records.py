@@ -81,6 +81,8 @@ SIMULATED_DOME = "simulated"
 """In place of a dome's address: one that is started for the capture, on loopback, and lights nobody."""
 MAX_ON_TIME_S = 60.0
 """Longest time that a light may be on at once: the controller's strobe counts 65.5 s in its 16 bits, and 2 s of them are its margin."""
+DEMO_MOUTH = Path("demo")
+"""Stands for a rig's mouth that a job makes itself: a virtual incisor, rendered by its first stage, so that a demonstration needs no file anywhere."""
 
 
 class RigSpec(Record):
@@ -88,7 +90,10 @@ class RigSpec(Record):
 
     dome: str = Field(default=SIMULATED_DOME, description="host:port of the Modbus controller, or 'simulated' to start one on loopback")
     cameras: Literal["simulated", "playback"] = "simulated"
-    mouth: Path = Field(description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see")
+    mouth: Path = Field(
+        description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see. "
+        "'demo' has a virtual incisor rendered first"
+    )
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
     exposure_s: Positive = Field(default=0.05, description="exposure time")
     settle_s: Number = Field(default=0.002, ge=0, description="wait between light on and exposure")
@@ -148,6 +153,11 @@ class JobSpec(Record):
         default="normal",
         description="which waiting jobs start first; of running fits each takes four times the share of a lower one",
     )
+
+    @property
+    def is_demo(self) -> bool:
+        """Whether the job begins by making the mouth that it captures."""
+        return self.rig is not None and self.rig.mouth == DEMO_MOUTH
 
     @model_validator(mode="after")
     def _one_source(self) -> JobSpec:

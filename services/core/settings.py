@@ -169,6 +169,6 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
         spec = spec.model_copy(update={"capture": (base / spec.capture).resolve()})
     if spec.calibration is not None:
         spec = spec.model_copy(update={"calibration": (base / spec.calibration).resolve()})
-    if spec.rig is not None:
+    if spec.rig is not None and not spec.is_demo:
         spec = spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": (base / spec.rig.mouth).resolve()})})
     return spec

@@ -3,6 +3,7 @@
 ::
 
     JOB/
+      phantom/     published by the phantom stage, of a demonstration alone
       capture/     published by the capture stage
       prepared/    published by the prepare stage
       fit/         published by the fit stage

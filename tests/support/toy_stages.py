@@ -16,7 +16,7 @@ from services.core.records import AssetManifest, JobSpec
 from services.core.stage import StageContext, StageEvent, StageName
 from services.core.store import StageWriter, require_intact
 
-DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("capture", "prepare", "fit", "export")}
+DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("phantom", "capture", "prepare", "fit", "export")}
 
 
 def _steering(spec: JobSpec, context: StageContext) -> Path:
@@ -44,6 +44,12 @@ def _reach(spec: JobSpec, context: StageContext, stage: StageName, point: str) -
     while (steering / f"hold-{stage}-{point}").exists():
         context.raise_if_cancelled()
         time.sleep(0.02)
+
+
+def phantom(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Publishes a mouth."""
+    _reach(spec, context, "phantom", "start")
+    return _publish("phantom", "phantom", spec, context)
 
 
 def capture(spec: JobSpec, context: StageContext) -> AssetManifest:

@@ -1,0 +1,65 @@
+"""``dentine run``, and ``dentine demo`` without a server: one job in this process's own workers, told on the terminal."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from services.core.records import JobSpec
+
+
+def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool) -> None:
+    """Run a job and print where its results are and how well it fits; the first Ctrl-C cancels it in order."""
+    from services.api.pipeline import run_job
+    from services.api.progress import ProgressView
+
+    with cancelling_on_signals(out), ProgressView() as view:
+        asset = run_job(spec, out, view, workers)
+    if not view.events:
+        print("Every stage was published already; nothing ran.", file=sys.stderr)
+    report = out / "report.html"
+    if not asset.converged:
+        print(f"The fit did not converge. {asset.advice}", file=sys.stderr)
+    if as_json:
+        result = {
+            "converged": asset.converged,
+            "held_out_error": asset.held_out_error,
+            "report": str(report),
+            "parameters": str(out / "parameters.json"),
+            "files": list(asset.files),
+        }
+        print(json.dumps(result))
+    else:
+        print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")
+
+
+@contextmanager
+def cancelling_on_signals(out: Path) -> Iterator[None]:
+    """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
+    from services.api.pipeline import request_cancel, withdraw_cancel
+
+    asked = False
+    withdraw_cancel(out)
+
+    def ask(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        out.mkdir(parents=True, exist_ok=True)
+        request_cancel(out)
+        print("Stopping after the current frame or step; press Ctrl-C again to stop at once.", file=sys.stderr)
+
+    earlier = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, handler)
