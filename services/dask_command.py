@@ -1,4 +1,4 @@
-"""``dentine scheduler``, ``dentine worker`` and ``dentine worker-health``: Dask's own commands, with TLS as the settings say, and checked workers."""
+"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS as the settings say and workers that are checked."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
     ) -> None:
         """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address.
 
-        A worker runs every stage but captures, after it has shown that it can; with `--resources DOME=1`, as it reaches the dome, captures too.
+        A worker runs every stage but captures, once it has shown that it can; with `--resources DOME=1` captures too.
         """
         claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
         _become("worker", [*_claiming(context.args, claims), "--preload", "services.api.worker_setup"], tls_folder())

@@ -1,4 +1,4 @@
-"""Which jobs may start: those for which there is a place beside the ones that run, disk, memory, a dome and workers; and what the others wait for.
+"""Which jobs may start, and what the others wait for: a place beside the ones that run, disk, memory, a dome, workers.
 
 What disk or memory the machine does not have in all is refused when a job is submitted.
 """
@@ -40,8 +40,9 @@ _DESCRIPTIONS = ("capture.json", MANIFEST, f"capture/{MANIFEST}")
 KEPT_FREE_BYTES = 256 * 2**20
 """Disk that no job may count on."""
 AT_ONCE = 4
-"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they share the same workers, and holds
-memory; but two long jaws should not keep a short tooth waiting, and while one job is prepared or solves, another one keeps the workers busy."""
+"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they share the
+same workers, and holds memory; but two long jaws should not keep a short tooth waiting, and while one job is prepared or solves,
+another one keeps the workers busy."""
 RETRY_S = 10.0
 """How long a job waits after it was paused."""
 
@@ -120,7 +121,7 @@ class Admission:
 
     Args:
         look: what the machine has now.
-        at_once: most jobs that run side by side. A capture needs no place, as it is done on a worker of its own and a person waits for it.
+        at_once: most jobs that run side by side. A capture needs no place: it has a worker of its own, and a person waits.
         lacks: why no worker can capture (True) or run other stages (False); None if one can.
     """
 
@@ -174,7 +175,7 @@ class Admission:
             )
 
     def begin_round(self, job_ids: Iterable[str]) -> None:
-        """Forget what the last look at the waiting jobs found, and jobs that wait no more: cancelled, deleted or another server's.
+        """Forget what the last look found, and jobs that wait no more: cancelled, deleted or another server's.
 
         Args:
             job_ids: those that wait, in the order in which ``holds`` will be asked of them.
@@ -187,7 +188,7 @@ class Admission:
                     del known[job_id]
 
     def holds(self, job_id: str, spec: JobSpec, *, is_to_capture: bool = False) -> bool:
-        """Whether a queued job must wait; ``reason`` then says why, and does not wait for this, as the disk of a capture may hang."""
+        """Whether a queued job must wait; ``reason`` then says why, without waiting, as the disk of a capture may hang."""
         reason = self._obstacle(job_id, spec, is_to_capture=is_to_capture)
         with self._lock:
             self._reasons.pop(job_id, None)
@@ -227,7 +228,7 @@ class Admission:
             self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
 
     def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
-        """Why a queued job does not start, None if nothing keeps it; or nothing but its turn, where ``besides_turn`` is asked for."""
+        """Why a queued job does not start; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
         with self._lock:
             reason = self._reasons.get(job_id)
             return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
@@ -251,7 +252,8 @@ class Admission:
     def _no_turn(self, needs: Needs, machine: Machine) -> str:
         if self._first_in_line:
             return self._first_in_line
-        if short := self._no_memory(needs, machine.memory_bytes):  # whoever asks for much would never get it if all that ask for less went before
+        if short := self._no_memory(needs, machine.memory_bytes):
+            # Whoever asks for much would never get it if all that ask for less went before.
             self._first_in_line = "Waits behind a job that is before it and waits for memory."
         return short
 

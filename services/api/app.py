@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from services.api.dask_tls import Certificates
 from services.api.events import EventAddress
 from services.api.jobs import Jobs
-from services.api.pipeline import DOORS, run_job
+from services.api.pipeline import DOORS, first_stage, run_job
 from services.api.runner import RunJob
 from services.api.workers import Workers
 from services.core.records import JobSpec
@@ -69,7 +69,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True, before=lambda: jobs.take_turn(events.job), phantoms=kept)
 
     def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        if spec.rig is not None:
+        if first_stage(spec, folder) == "capture":
             dome.make_way()
         (run or run_on_workers)(spec, folder, events)
 

@@ -127,20 +127,18 @@ class Runner:
         for job in queued:
             if self._closing.is_set():
                 return
-            if job.id in self._running or self._admission.holds(job.id, spec := self._locate(job.spec), is_to_capture=self._is_to_capture(job)):
+            spec, is_to_capture = self._locate(job.spec), first_stage(job.spec, self._folder(job.id)) == "capture"
+            if self._admission.holds(job.id, spec, is_to_capture=is_to_capture):
                 continue
             try:
                 lease = self._repository.lease(job.id, self._holder, LEASE_S)
             except JobStateError:
                 continue  # cancelled, or another server's by now
-            self._admission.start(job.id, job.number, spec, is_to_capture=self._is_to_capture(job))
+            self._admission.start(job.id, job.number, spec, is_to_capture=is_to_capture)
             thread = threading.Thread(target=self._run_in_thread, args=(lease,), name=f"job-{job.id}")
             with self._lock:
                 self._running[job.id] = lease, thread
             thread.start()
-
-    def _is_to_capture(self, job: Job) -> bool:
-        return first_stage(job.spec, self._folder(job.id)) == "capture"
 
     def _run_in_thread(self, lease: Lease) -> None:
         job = lease.job

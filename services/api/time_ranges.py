@@ -41,9 +41,9 @@ class TimeRange(Record):
     reason: str | None = Field(default=None, description="why there is no range")
 
     def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
-        """The range of what begins when a place is free for it, as jobs end that run and those ahead of it have had theirs.
+        """The range of what begins when a place is free for it: jobs end that run, and those ahead of it have had theirs.
 
-        Lower limits are put together with lower ones and upper with upper, as on a busy machine all jobs are late together.
+        Lower limits go with lower ones and upper with upper, as on a busy machine all jobs are late together.
         """
         if self.low_s is None or self.high_s is None:
             return self

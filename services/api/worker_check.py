@@ -1,7 +1,7 @@
-"""Whether a machine can do what a worker claims to: imports what the stages need and renders one pixel, in a process of its own.
+"""Whether a machine can do what a worker claims: imports what the stages need and renders a pixel, in a process of its own.
 
-``python -m services.api.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one sentence. What breaks an interpreter, such
-as a library that aborts it, so breaks no worker.
+``python -m services.api.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one sentence.
+What breaks an interpreter, such as a library that aborts it, so breaks no worker.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from services.core.installed import require_packages
 from services.core.placement import DOME, STAGES
 
 CHECK_S = 120.0
-"""How long it may take; 1.5 s were measured, and a machine that compiles its first kernel while others start takes many times as long."""
+"""How long it may take; 1.5 s were measured, and a machine on which much else starts takes many times as long."""
 
 CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {DOME: ("services.capture.stage:check",), STAGES: ("services.preprocess.stage:check", "services.fit.stage:check")}
@@ -44,7 +44,7 @@ def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
 
 
 class OwnCheck:
-    """The check of the machine that this process runs on, begun when this is made: workers of its own need no other one each."""
+    """The check of the machine that this process runs on, begun when this is made; it holds for all workers of its own."""
 
     def __init__(self) -> None:
         self._fault: str | None = None

@@ -1,6 +1,7 @@
-"""Signs of life of this machine's workers: each writes a small file every few seconds, and ``dentine worker-health`` reads them.
+"""Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads them.
 
-Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this machine's worker that works.
+Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this
+machine's worker that works.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from services.core.store import write_atomic
 SIGN_S = 5.0
 """How often a worker gives a sign."""
 SILENT_S = 60.0
-"""Without a sign for so long a worker does not count: a kernel may hold its interpreter for some seconds, and its scheduler waits longer."""
+"""Without a sign for so long a worker does not count: a busy machine may hold one up for some seconds."""
 
 
 def default_folder() -> Path:

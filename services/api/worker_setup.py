@@ -1,7 +1,8 @@
-"""What ``dentine worker`` loads into each of its Dask workers (``--preload services.api.worker_setup``), before the worker takes tasks.
+"""What ``dentine worker`` loads into each of its Dask workers (``--preload services.api.worker_setup``).
 
-A worker claims what it can do by Dask resources (``services.core.placement``). Each claim is checked by a process of its own; what the machine does not
-bear out is withdrawn and told, in the log and to the scheduler, and no task that needs it is given to this worker.
+A worker claims what it can do by Dask resources (``services.core.placement``). Before it takes tasks each claim is checked by
+a process of its own; what the machine does not bear out is withdrawn and told, in the log and to the scheduler, and no task
+that needs it is given to this worker.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ async def dask_setup(worker: Any) -> None:
 class WorkerSetup(WorkerPlugin):
     """Prepares one worker.
 
-    What a worker has to know and no task may carry, such as the address of the database with its password, is given to this class and kept by the process.
+    What a worker has to know and no task may carry, such as the database's address with its password, is given to this class
+    and kept by its process.
     """
 
     name = "dentine-setup"

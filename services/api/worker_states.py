@@ -14,8 +14,9 @@ from services.api.database import Query
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
 from services.api.repository import Repository
-from services.api.workers import NOT_STARTED, Workers
+from services.api.workers import NOT_STARTED, TOLD, Workers
 from services.core.geometry import Record
+from services.core.placement import DOME, STAGES
 from services.core.stage import StageName
 
 HOUR_S, DAY_S = 3600.0, 86400.0
@@ -45,6 +46,8 @@ class WorkerState(Record):
     memory_bytes: int = Field(description="resident size of its process, renderers not counted")
     memory_limit_bytes: int | None = Field(description="beyond it its tasks are stopped; null where it has none")
     has_dome: bool = Field(description="whether captures may run there")
+    runs_stages: bool = Field(description="whether all other stages may run there, as it has shown that it can")
+    fault: str = Field(description="what it cannot do of what it was started for, and the remedy; empty where nothing is wrong")
     heard_s: float = Field(description="Unix time of its last sign of life")
 
 
@@ -80,7 +83,9 @@ def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, I
             tasks=_tasks(key for key in keys if key is not None),
             memory_bytes=worker["metrics"].get("memory", 0),
             memory_limit_bytes=worker["memory_limit"] or None,
-            has_dome=bool(worker["resources"].get("DOME")),
+            has_dome=bool(worker["resources"].get(DOME)),
+            runs_stages=bool(worker["resources"].get(STAGES)),
+            fault=str(worker.get(TOLD) or ""),
             heard_s=worker["last_seen"],
         )
 

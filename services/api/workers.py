@@ -74,8 +74,8 @@ class Workers:
     """Opened at the first job and again after they broke; a context manager.
 
     Args:
-        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. One more than jobs ask for is started
-            where one of them captures, so that no capture waits for a fit or is stopped with it.
+        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. One more
+            than jobs ask for is started where one of them captures, so that no capture waits for a fit or is stopped with it.
         certificates: what to show that scheduler; None for connections without TLS.
     """
 
@@ -126,7 +126,7 @@ class Workers:
             return self._client
 
     def keep(self) -> None:
-        """Start again what was lost of the workers: Dask gives up one that does not come back within 15 s, as on a busy machine."""
+        """Start again what was lost of the workers: Dask gives up one that does not come back within 15 s."""
         with self._lock:
             self._scale()
 

@@ -12,7 +12,7 @@ def require_packages(names: Iterable[str], extra: str) -> None:
     """Import packages.
 
     Raises:
-        PlatformError: one is not installed, or is there and cannot be loaded, such as for want of a library of the system.
+        PlatformError: one is not installed, or cannot be loaded, such as for want of a library of the system.
     """
     for name in names:
         try:

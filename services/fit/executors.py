@@ -18,7 +18,7 @@ from services.fit.shares import Share
 
 Task = Callable[..., Any]
 TASKS_AHEAD = 2
-"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows without a gap."""
+"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows at once."""
 
 
 class Executor(Protocol):
@@ -149,7 +149,7 @@ class _EnginePlugin(WorkerPlugin):
 
 
 async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
-    """The plugin of an engine, made where the worker has none: on the worker's loop, so that tasks in several threads make one."""
+    """The plugin of an engine, made on the worker's loop where it has none, so that tasks in several threads make one."""
     name = f"dentine-{factory}"
     if name not in worker.plugins:
         await worker.plugin_add(_EnginePlugin(factory), name=name, catch_errors=False)
@@ -194,7 +194,7 @@ def _surroundings() -> Surroundings | None:
 def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: float = 1.0) -> Iterator[Executor]:
     """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process.
 
-    On a cluster tasks run where this one may, and their keys begin with its own, so that whoever looks at the workers knows whose they are.
+    On a cluster tasks run where this one may, and their keys begin with its own, which tells whose they are.
 
     Args:
         flag: once it exists, what a worker renders is cut off.

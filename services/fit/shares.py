@@ -1,8 +1,9 @@
 """How running fits share the workers: whoever has used less of them lately goes first.
 
-Decay-usage scheduling, as in the Unix time-sharing of Kay and Lauder (1988): each fit counts the worker time that its tasks took, old use fading away, and
-gives its next task a priority that is the lower the more it used. Fits know nothing of each other, and no server has to tell them: priorities meet in the
-queues of the workers. A fit that is alone gets everything; one that comes late goes first until it has had its share of the last two minutes.
+Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each fit counts the
+worker time that its tasks took, old use fading away, and gives its next task a priority that is the lower the more it used.
+Fits know nothing of each other, and no server has to tell them: priorities meet in the queues of the workers. A fit that is
+alone gets everything; one that comes late goes first until it has had its share of the last two minutes.
 """
 
 from __future__ import annotations

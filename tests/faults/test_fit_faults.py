@@ -108,6 +108,35 @@ def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
     assert run_on.gather([run_on.submit("same", echo, number) for number in range(5)]) == list(range(5))
 
 
+def test_fits_side_by_side_give_the_answer_that_each_gives_alone(client: Client, undisturbed: Path, tmp_path: Path) -> None:
+    roots = [tmp_path / "first", tmp_path / "second"]
+    for root in roots:
+        write_prepared(root)
+    futures = [client.submit(_fit_with, root, {"priority": priority}, pure=False) for root, priority in zip(roots, ("low", "high"), strict=True)]
+    for future in futures:
+        future.result(timeout=PATIENCE_S)
+    assert [answer(root) for root in roots] == [answer(undisturbed)] * 2
+    first, second = (trace(root) for root in roots)
+    assert any(a["worker"] != b["worker"] and min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"]) for a in first for b in second)
+
+
+def test_blocks_run_only_where_their_stage_may(client: Client, tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    able = next(iter(client.scheduler_info()["workers"]))
+    client.run(_claim, workers=[able])
+    client.submit(fit_once, tmp_path, FAKE, pure=False, resources={"STAGES": 1}).result(timeout=PATIENCE_S)
+    (pid,) = client.run(os.getpid, workers=[able]).values()
+    assert {row["worker"].rpartition(":")[2] for row in trace(tmp_path)} == {str(pid)}
+
+
+def _fit_with(root: Path, options: dict[str, Any]) -> None:
+    fit_once(root, SLOW, **options)
+
+
+async def _claim(dask_worker: Any) -> None:
+    await dask_worker.set_resources(STAGES=1000)
+
+
 def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
     # The driver's own worker dies: Dask runs the stage again elsewhere, a new attempt that continues from the journal.
     write_prepared(tmp_path)

@@ -109,6 +109,8 @@ def test_ready_counts_only_workers_that_can_work(system: tuple[httpx.Client, str
         assert until(client, 200, "can run") == "1 worker can run stages, 1 can capture."
         listed = {one["has_dome"]: one for one in client.get("/v1/workers").json()["workers"]}
         assert set(listed) == {True, False}
+        faults = {one["fault"]: (one["runs_stages"], one["has_dome"]) for one in client.get("/v1/workers").json()["workers"]}
+        assert faults[sentence] == (False, False)
         client.get(f"/v1/jobs/{job}/events", timeout=PATIENCE_S)
         assert client.get(f"/v1/jobs/{job}").json()["state"] == "SUCCEEDED"
         while (health := worker_health(able)).returncode:

@@ -46,7 +46,11 @@ def test_what_renders_captures_and_speaks_to_domes_is_absent(environment: Path) 
 def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path) -> None:
     with served(environment, tmp_path / "data") as client:
         assert client.get("/v1/health/live").json() == {"status": "live"}
-        assert client.get("/v1/health/ready").status_code == 200
+        while "being found out" in (ready := client.get("/v1/health/ready")).text:
+            time.sleep(0.2)
+        bad = [check for check in ready.json()["checks"] if not check["ok"]]
+        sentence = "This machine cannot run stages: The package cv2 is not installed; install dentine[preprocess] on this machine."
+        assert (ready.status_code, bad) == (503, [{"name": "workers", "ok": False, "sentence": sentence}])
         assert "<title>dentine</title>" in client.get("/").text
         assert client.get("/app.js").status_code == (200 if is_dashboard_built() else 404)
         assert "/v1/jobs" in client.get("/v1/openapi.json").json()["paths"]

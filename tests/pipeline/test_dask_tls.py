@@ -69,7 +69,7 @@ def test_a_job_runs_by_tls_and_strangers_are_refused(tmp_path: Path, monkeypatch
         await_scheduler(address, ours)
         for stranger in (None, Certificates.of(theirs)):
             with pytest.raises(SchedulerLostError), Workers(address, stranger) as workers:
-                workers.connect(1)
+                workers.connect()
             with pytest.raises(SchedulerLostError):
                 require_scheduler(address, stranger)
         with pytest.raises(SchedulerLostError, match="do not trust each other"):

@@ -82,8 +82,13 @@ export interface JobPage {
 export interface Worker {
   name: string;
   host: string;
-  /** Stages that it runs or will run next. */
+  /** Stages that it runs, wholly or in part, or will run next. */
   tasks: { stage: string; job: string }[];
+  /** Whether captures, and whether all other stages, may run there. */
+  has_dome: boolean;
+  runs_stages: boolean;
+  /** What it cannot do of what it was started for; empty where nothing is wrong. */
+  fault: string;
   memory_bytes: number;
   memory_limit_bytes: number | null;
 }

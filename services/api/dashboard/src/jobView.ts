@@ -150,7 +150,8 @@ export class JobView {
   private showWaiting(job: JobDetail): void {
     this.waits.hidden = job.waits_for === null;
     this.waits.textContent = job.waits_for ?? "";
-    this.remaining.hidden = job.remaining === null || job.waits_for !== null;
+    // Whoever waits for other jobs may know how long; whoever waits for a person does not.
+    this.remaining.hidden = job.remaining === null || (job.waits_for !== null && job.remaining.low_s === null);
     this.remaining.textContent = job.remaining ? remaining(job.remaining) : "";
     window.clearTimeout(this.timer);
     if (job.state === "QUEUED" || job.state === "RUNNING") this.askLater();

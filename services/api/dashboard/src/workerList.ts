@@ -28,9 +28,14 @@ export class WorkerList {
 }
 
 function item(worker: Worker): HTMLElement {
-  const task = worker.tasks[0];
-  const doing = task ? element("a", { href: `#/${task.job}` }, task.stage) : "idle";
+  const tasks = worker.tasks.flatMap((task) => [element("a", { href: `#/${task.job}` }, task.stage), " "]);
+  const doing = tasks.length > 0 ? tasks : [`${worker.fault || idle(worker)} `];
   const limit = worker.memory_limit_bytes === null ? "" : ` of ${bytes(worker.memory_limit_bytes)}`;
   const memory = element("span", { class: "soft" }, `${worker.host}, ${bytes(worker.memory_bytes)}${limit}`);
-  return element("li", {}, element("strong", {}, `Worker ${worker.name}`), " ", doing, memory);
+  return element("li", {}, element("strong", {}, `Worker ${worker.name}`), " ", ...doing, memory);
+}
+
+function idle(worker: Worker): string {
+  if (worker.runs_stages) return "idle";
+  return worker.has_dome ? "waits for captures" : "takes no tasks";
 }
