@@ -39,10 +39,9 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
     @app.command("worker-health")
     def worker_health() -> None:
         """Say whether this machine's workers are connected and can work; for the health check of a container."""
-        from services.api.worker_health import require_healthy_workers
+        from services.api.worker_health import main
 
-        count = require_healthy_workers()
-        print(f"{count} worker{'s' if count > 1 else ''} of this machine can work.")
+        raise typer.Exit(main())
 
 
 def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:

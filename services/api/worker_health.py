@@ -1,20 +1,20 @@
 """Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads them.
 
 Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this
-machine's worker that works.
+machine's worker that works. ``python -m services.api.worker_health`` says the same and imports nothing large.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from services.core.errors import PlatformError
-from services.core.store import write_atomic
 
 SIGN_S = 5.0
 """How often a worker gives a sign."""
@@ -44,6 +44,8 @@ class Sign:
         Args:
             fault: what it cannot do of what it was started for; empty where nothing is missing.
         """
+        from services.core.store import write_atomic
+
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomic(self.path, json.dumps({"fault": fault}).encode())
 
@@ -65,3 +67,18 @@ def require_healthy_workers(folder: Path | None = None) -> int:
     if faults := [fault for sign in signs if (fault := json.loads(sign.read_bytes())["fault"])]:
         raise PlatformError(faults[0])
     return len(signs)
+
+
+def main() -> int:
+    """One sentence, and the exit status."""
+    try:
+        count = require_healthy_workers()
+    except PlatformError as problem:
+        print(f"dentine: {problem.message}", file=sys.stderr)
+        return problem.exit_status
+    print(f"{count} worker{'s' if count > 1 else ''} of this machine can work.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

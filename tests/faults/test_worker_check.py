@@ -53,7 +53,7 @@ def process(log: Path, env: dict[str, str], *arguments: str) -> Iterator[None]:
 
 
 def worker_health(env: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "services", "worker-health"]
+    command = [sys.executable, "-m", "services.api.worker_health"]
     return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
 
 
@@ -116,6 +116,8 @@ def test_ready_counts_only_workers_that_can_work(system: tuple[httpx.Client, str
         while (health := worker_health(able)).returncode:
             time.sleep(0.2)
         assert health.stdout == "1 worker of this machine can work.\n"
+        command = [sys.executable, "-m", "services", "worker-health"]
+        assert subprocess.run(command, env=able, capture_output=True, text=True, check=True).stdout == health.stdout
 
 
 def test_a_worker_without_signs_of_life_is_not_healthy(tmp_path: Path) -> None:
