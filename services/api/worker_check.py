@@ -72,7 +72,7 @@ def require(claims: Iterable[str]) -> None:
     Raises:
         PlatformError: something is missing or does not work.
     """
-    require_packages(("structlog",), "api")  # every stage of a server's job writes log lines
+    require_packages(("structlog",), "worker")  # every stage of a server's job writes log lines
     for door in (door for claim in claims for door in CHECKS[claim]):
         module, function = door.split(":")
         getattr(importlib.import_module(module), function)()

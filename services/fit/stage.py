@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,11 +33,13 @@ def check() -> None:
     Raises:
         PlatformError: something is missing, or the renderer does not work.
     """
+    from services.fit.transport.platform import import_renderer, require_renderer
+
+    with suppress(ModuleNotFoundError):  # told as a package below
+        import_renderer()
     require_packages(PACKAGES, "fit")
     for module in ("services.fit.jaw_driver", "services.fit.export.report", "services.fit.transport.engine"):
         importlib.import_module(module)
-    from services.fit.transport.platform import require_renderer
-
     require_renderer()
 
 

@@ -31,7 +31,7 @@ class Role:
 
 _COMMANDS = ("services.__main__:build_app",)
 _WORKER = (*_COMMANDS, "services.dask_command", "services.api.pipeline", "services.preprocess.stage", "services.fit.stage", "services.fit.engine_host")
-_WORKER += ("services.fit.transport.engine",)
+_WORKER += ("services.fit.transport.engine", "services.api.worker_setup", "services.api.worker_check")
 
 ROLES: Mapping[str, Role] = {
     "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.token_command", DOME_AT_THE_SERVER)),

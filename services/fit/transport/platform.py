@@ -61,13 +61,13 @@ def require_renderer() -> None:
         PlatformError: that does not work; an unusable libLLVM may end the process instead.
     """
     prepare_device(threads=1)
-    mitsuba = importlib.import_module("mitsuba")
+    drjit, mitsuba = import_renderer()
     film = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance"}
     sensor = {"type": "perspective", "film": film}
     scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, "light": {"type": "constant"}}
     try:
         image = mitsuba.render(mitsuba.load_dict(scene, optimize=False), spp=1)
-        importlib.import_module("drjit").eval(image)
+        drjit.eval(image)
         value = float(image.array[0])
     except Exception as problem:
         raise PlatformError(f"The renderer cannot render a pixel here ({problem}); check libLLVM and the packages drjit and mitsuba.") from problem
