@@ -128,8 +128,8 @@ _STATUS: dict[type[DentineError], int] = {
 
 
 def status_of(problem: DentineError) -> int:
-    """The HTTP status that an error means."""
-    return next(status for kind, status in _STATUS.items() if isinstance(problem, kind))
+    """The HTTP status that an error means: that of its kind, else of the nearest kind above it, in whatever order they are listed."""
+    return next(_STATUS[kind] for kind in type(problem).__mro__ if kind in _STATUS)
 
 
 def response_of(problem: DentineError, path: str, headers: dict[str, str] | None = None) -> Response:

@@ -59,7 +59,8 @@ class Runner:
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
         self._running: dict[str, tuple[Lease, threading.Thread]] = {}
-        self._threads = [threading.Thread(target=self._start_jobs, name="jobs"), threading.Thread(target=self._look_after, name="leases")]
+        parts = {"jobs": self._start_jobs, "leases": self._look_after, "rounds": self._make_rounds}
+        self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
 
     def start(self, *, alone: bool) -> None:
         """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left by one that died."""
@@ -74,7 +75,10 @@ class Runner:
         self._closing.set()
         self._wake.set()
         for lease in self._leases():
-            request_cancel(self._folder(lease.job.id))
+            try:
+                request_cancel(self._folder(lease.job.id))
+            except OSError as problem:  # of one job's folder, which keeps no other from going dark
+                logging.getLogger(__name__).warning("job %s cannot be told to stop: %s", lease.job.id, problem)
 
     def close(self) -> None:
         """Stop the running jobs cooperatively, and wait for that."""
@@ -158,7 +162,6 @@ class Runner:
         while not self._closing.wait(ROUND_S):
             try:
                 self._renew_leases()
-                self._on_round()
             except Exception:
                 log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
             self._wake.set()
@@ -174,6 +177,14 @@ class Runner:
         for lease in leases:
             if self._is_cancelled(lease):
                 request_cancel(self._folder(lease.job.id))
+
+    def _make_rounds(self) -> None:
+        # A thread of its own, as a deletion of many files takes longer than a lease lasts.
+        while not self._closing.wait(ROUND_S):
+            try:
+                self._on_round()
+            except Exception:
+                logging.getLogger(__name__).exception("the round failed; trying again in %g s", ROUND_S)
 
     def _run_one(self, lease: Lease) -> None:
         job, folder = lease.job, self._folder(lease.job.id)

@@ -45,7 +45,7 @@ class Console:
         self._held = ExitStack()
         self._dome: ModbusDome | None = None
         self._budget, self._until_s = ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s), 0.0
-        self._newest_off = 0
+        self._newest_off, self._ordering = 0, threading.Lock()
         self._keeper = threading.Thread(target=self._keep, name="light keeper")
         self._keeper.start()
 
@@ -73,7 +73,8 @@ class Console:
     def _carry_out(self, command: DomeCommand) -> DomeAnswer:
         findings: tuple[str, ...] = ()
         if command.do == "off":
-            self._newest_off = max(self._newest_off, command.number)
+            with self._ordering:
+                self._newest_off = max(self._newest_off, command.number)
             try:
                 status = self._all_off()
             finally:
@@ -146,7 +147,9 @@ class Console:
 
     def _require_wanted(self, command: DomeCommand) -> None:
         # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the controller.
-        if command.number < self._newest_off:
+        with self._ordering:
+            is_overtaken = command.number < self._newest_off
+        if is_overtaken:
             raise RigStoppedError("ALL OFF was pressed after this was asked for; ask again when the subject is ready.")
 
     def _status(self) -> DomeStatus:

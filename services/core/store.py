@@ -9,6 +9,7 @@
       fit/         published by the fit stage
       asset/       published by the export stage
       <stage>.lease          highest attempt that has started the stage
+      .<stage>.lock          held while the lease is compared and written, and while the stage is published
       .<stage>.<attempt>/    being written; never read by others
 
 A stage is written into its own hidden folder and published by one rename, with ``manifest.json`` inside that lists every
@@ -19,12 +20,14 @@ would read as zeros, is an error here.
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,12 +47,18 @@ MANIFEST = "manifest.json"
 
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old or the new content, also after a power cut."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    partial.replace(path)
+    # Random, as threads share a process id and hosts or containers that share a disk may too.
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
+    try:
+        with partial.open("xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
     _fsync_folder(path.parent)
 
 
@@ -85,14 +94,22 @@ class StageWriter:
         """
         self.root, self.stage, self.attempt = Path(root), stage, attempt
         self.root.mkdir(parents=True, exist_ok=True)
-        self.require_lease(starting=True)
-        write_atomic(self._lease, str(attempt).encode())
+        with self._alone():
+            self.require_lease(starting=True)
+            write_atomic(self._lease, str(attempt).encode())
         self.folder = self.root / f".{stage}.{attempt}"
         self.folder.mkdir(exist_ok=True)
 
     @property
     def _lease(self) -> Path:
         return self.root / f"{self.stage}.lease"
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Hold the stage's lock, so that no other attempt starts or publishes it in between; the system drops it however this process ends."""
+        with (self.root / f".{self.stage}.lock").open("w") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            yield
 
     def require_lease(self, *, starting: bool = False) -> None:
         """Raise FencedError if a newer attempt has started the stage. Call before every durable write."""
@@ -107,13 +124,14 @@ class StageWriter:
             files[path.relative_to(self.folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": _sha256(path)}
         manifest = {"format": FORMAT_VERSION, "stage": self.stage, "attempt": self.attempt, "files": files, "record": json.loads(record.model_dump_json())}
         write_atomic(self.folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
-        self.require_lease()
         final, retired = self.root / self.stage, self.root / f".{self.stage}.retired"
-        if final.exists():
-            shutil.rmtree(retired, ignore_errors=True)
-            final.rename(retired)
-        self.folder.rename(final)
-        _fsync_folder(self.root)
+        with self._alone():
+            self.require_lease()
+            if final.exists():
+                shutil.rmtree(retired, ignore_errors=True)
+                final.rename(retired)
+            self.folder.rename(final)
+            _fsync_folder(self.root)
         shutil.rmtree(retired, ignore_errors=True)
         return final
 
@@ -227,14 +245,17 @@ class StoredArray:
             self._array = zarr.open_array(path, mode="r")
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
-        with self._telling_damage():
+        with self._telling_damage(asked=(selection,)):
             return np.asarray(self._array[selection])
 
     @contextmanager
-    def _telling_damage(self) -> Iterator[None]:
+    def _telling_damage(self, asked: tuple[Any, ...] = ()) -> Iterator[None]:
         try:
             yield
         except (FileNotFoundError, ValueError, RuntimeError) as problem:
+            for selection in asked:
+                # What no array of this shape could be asked for is the caller's mistake, and raised as such.
+                np.broadcast_to(np.empty((), dtype=bool), self._array.shape)[selection]
             raise CorruptStoreError(f"{self._path} cannot be read ({problem}); restore it or run its stage again.") from problem
 
 

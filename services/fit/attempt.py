@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from services.core.store import StageWriter, write_atomic
 from services.fit.evaluate import Evaluation
 from services.fit.executors import Executor, executor
 from services.fit.journal import Journal
+from services.fit.numerics import numerics_name
 from services.fit.observations import ChannelFiles, Observations, ViewStack
 from services.fit.passes import Passes, TraceRow
 from services.fit.pictures import write_pictures, write_preview
@@ -58,9 +58,9 @@ class Attempt:
         """The journal of a fit of these inputs, continued where an earlier attempt stopped."""
         folder = self.context.root / CHECKPOINT
         folder.mkdir(parents=True, exist_ok=True)
-        journal = Journal(folder / "journal.json", fingerprint(self.spec, self.engine, files), self.writer.require_lease)
+        journal = Journal(folder / "journal.jsonl", fingerprint(self.spec, self.engine, files), self.writer.require_lease)
         if journal.set_aside is not None:
-            self.log(f"The checkpoint is damaged or of another job, data or version: it is kept as {journal.set_aside.name} and this fit starts anew.")
+            self.log(f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name} and this fit starts anew.")
         if journal.resumed:
             self.log(f"Attempt {self.context.attempt} continues after {journal.resumed} recorded results.")
         return journal
@@ -123,7 +123,7 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
     """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
-    parts = [version("dentine"), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority"})]
+    parts = [numerics_name(), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority"})]
     for channel in files:
         parts += [channel.channel, *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

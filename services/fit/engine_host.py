@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, Protocol
 
-from services.core.errors import JobCancelledError, ResourceError
+from services.core.errors import JobCancelledError, ResourceError, WorkerLostError
 from services.fit.blocks import StoredFile, read_recipe
 from services.fit.engine_process import EngineProcess
 
@@ -77,7 +77,7 @@ class ChildHost:
     def __init__(self, factory: str = ENGINE, threads: int | None = None, memory_bytes: int | None = None) -> None:
         self._command = [sys.executable, "-m", "services.fit.engine_host"], [factory, str(threads or 0)]
         self._memory_bytes = memory_bytes
-        self._lock = threading.Lock()
+        self._lock, self._is_closed = threading.Lock(), threading.Event()
         self._process: EngineProcess | None = None
 
     @property
@@ -90,6 +90,7 @@ class ChildHost:
 
         Raises:
             MemoryKillError: the child grew beyond its share, or the system killed it for memory. CrashError: it died twice in this call.
+            WorkerLostError: the host was closed meanwhile.
         """
         return self.call_until(lambda: False, method, recipe, *args, **options)
 
@@ -100,6 +101,7 @@ class ChildHost:
             for is_last in (False, True):
                 if is_cancelled():
                     raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+                self._require_open()
                 self._process = process = self._process or self._start()
                 try:
                     process.pipe.send_bytes(request)
@@ -107,10 +109,12 @@ class ChildHost:
                         if is_cancelled():
                             self._end()
                             raise JobCancelledError("The job was cancelled on request while it rendered; what it had published is kept.")
+                        self._require_open()
                         process.check_memory()
                     succeeded, value = pickle.loads(process.pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe
                 except (EOFError, ConnectionError):
                     self._end()
+                    self._require_open()
                     if is_last or process.was_out_of_memory:
                         raise process.death() from None
                     continue
@@ -123,9 +127,14 @@ class ChildHost:
         raise AssertionError
 
     def close(self) -> None:
-        """End the child."""
+        """End the child, also in mid-kernel: whoever waits for its answer meets WorkerLostError. There is no call after this."""
+        self._is_closed.set()
         with self._lock:
             self._end()
+
+    def _require_open(self) -> None:
+        if self._is_closed.is_set():
+            raise WorkerLostError("The worker was closed while it rendered; its task runs again on another one.")
 
     def _start(self) -> EngineProcess:
         ours, theirs = Pipe()
@@ -178,8 +187,18 @@ def serve(descriptor: int, factory: str, threads: int | None) -> None:
         try:
             answer = pickle.dumps((True, host.call(method, recipe, *args, **options)))
         except Exception as problem:
-            answer = pickle.dumps((False, problem))
+            answer = pickle.dumps((False, _portable(problem)))
         pipe.send_bytes(answer)
+
+
+def _portable(problem: Exception) -> Exception:
+    """An exception as it comes out at the other end of a pipe; one that would not, as it needs more than its arguments, say, in words."""
+    try:
+        if type(pickle.loads(pickle.dumps(problem))) is type(problem):  # noqa: S301 - made on the line itself
+            return problem
+    except Exception as refusal:
+        problem.add_note(f"It cannot be sent between processes: {refusal}")
+    return RuntimeError(f"{type(problem).__name__}: {problem}")
 
 
 if __name__ == "__main__":

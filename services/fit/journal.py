@@ -3,23 +3,33 @@
 The driver is a deterministic function. Each costly part runs as ``journal.once(key, compute)``; its JSON result is on disk before the next part starts.
 A later attempt runs the same function, gets the recorded results back in the same order, and goes on where the record ends. Every part depends only on
 recorded results and on seeds, so the answer of an interrupted fit is that of an undisturbed one.
+
+::
+
+    {"format": 2, "fingerprint": "..."}     first line
+    {"key": "...", "value": ...}            one line a result, appended; a last line that was cut short is no result
+
+An attempt that adds to a journal first writes it anew under the same name, once, so that an older attempt which still runs cannot write
+into it. Format 1, one JSON object that was replaced with every result, is read and continued as format 2.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from services.core.errors import FencedError
 from services.core.store import write_atomic
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 class Journal:
-    """Results by key, in one file that is replaced atomically.
+    """Results by key, in one file that grows by a line with every result.
 
     Attributes:
         resumed: how many results an earlier attempt left.
@@ -30,20 +40,23 @@ class Journal:
         """Open or begin a journal.
 
         Args:
-            fingerprint: identifies job, data and version; a journal of another one is set aside, neither continued nor lost.
+            path: of the file; one of format 1 beside it, with the suffix ``.json``, is continued.
+            fingerprint: identifies job, data and numerics; a journal of another one is set aside, neither continued nor lost.
             guard: called before every write; raises when this attempt has lost the right to write.
         """
         self.path, self._fingerprint, self._guard = path, fingerprint, guard
+        self._earlier = path if path.is_file() else path.with_suffix(".json")
+        self._inode: int | None = None
         self.entries: dict[str, Any] = {}
         self.set_aside: Path | None = None
-        if path.is_file():
-            stored = _read(path)
-            if stored.get("format") == FORMAT_VERSION and stored.get("fingerprint") == fingerprint:
-                self.entries = stored["entries"]
+        if self._earlier.is_file():
+            owner, entries = _read(self._earlier)
+            if owner == fingerprint:
+                self.entries = entries
             else:
                 guard()
-                self.set_aside = _free_name(path)
-                path.rename(self.set_aside)
+                self.set_aside = _free_name(self._earlier)
+                self._earlier.rename(self.set_aside)
         self.resumed = len(self.entries)
 
     def once(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
@@ -52,19 +65,57 @@ class Journal:
             return self.entries[key], False
         value = json.loads(json.dumps(compute(), allow_nan=False))
         self._guard()
+        if self._inode is None:
+            self._begin()
+        try:
+            self._append(_line({"key": key, "value": value}))
+        except BaseException:
+            self._inode = None  # what was written of the line, if anything, goes with the file: the next result begins it anew
+            raise
         self.entries[key] = value
-        content = {"format": FORMAT_VERSION, "fingerprint": self._fingerprint, "entries": self.entries}
-        write_atomic(self.path, json.dumps(content).encode())
         return value, True
 
+    def _begin(self) -> None:
+        """Write what is recorded so far into a file of this attempt's own."""
+        lines = [{"format": FORMAT_VERSION, "fingerprint": self._fingerprint}, *({"key": key, "value": value} for key, value in self.entries.items())]
+        write_atomic(self.path, b"".join(map(_line, lines)))
+        self._inode = self.path.stat().st_ino
+        if self._earlier != self.path:
+            self._earlier.unlink(missing_ok=True)
 
-def _read(path: Path) -> dict[str, Any]:
-    # A file that is no journal belongs to no fit.
+    def _append(self, line: bytes) -> None:
+        with self.path.open("ab", buffering=0) as stream:
+            if os.fstat(stream.fileno()).st_ino != self._inode:
+                raise FencedError(f"{self.path} was taken over by another attempt; the writes of this one are refused.")
+            if stream.write(line) != len(line):
+                raise OSError(f"{self.path} took only a part of a line")
+            os.fsync(stream.fileno())
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """The results that a journal holds, whosever it is; none where it is damaged."""
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[str | None, dict[str, Any]]:
+    """Fingerprint and results. A file that is no journal belongs to no fit."""
+    head, *lines = path.read_bytes().split(b"\n")
     try:
-        stored = json.loads(path.read_bytes())
-    except ValueError:
-        return {}
-    return stored if isinstance(stored, dict) and isinstance(stored.get("entries"), dict) else {}
+        first = json.loads(head)
+        match first:
+            case {"format": 1, "fingerprint": str(owner), "entries": dict(entries)} if not any(lines):
+                return owner, entries
+            case {"format": 2, "fingerprint": str(owner)} if lines:
+                # What follows the last line break was cut short.
+                results = [json.loads(line) for line in lines[:-1]]
+                return owner, {result["key"]: result["value"] for result in results}
+    except (ValueError, KeyError, TypeError):
+        pass
+    return None, {}
+
+
+def _line(value: dict[str, Any]) -> bytes:
+    return json.dumps(value).encode() + b"\n"
 
 
 def _free_name(path: Path) -> Path:

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from distributed import Client, Future, LocalCluster, get_worker
 
-from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError
+from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.blocks import StoredFile, write_recipe
 from services.fit.engine_host import CancellableHost, ChildHost, EngineHost
@@ -49,6 +49,39 @@ def test_a_process_that_outgrows_its_share_is_ended_with_evidence(recipe: Stored
     assert host.pid is None
     assert host.call("answer", recipe, 3) == 3
     host.close()
+
+
+def test_an_exception_that_cannot_be_sent_is_told_in_words_and_the_process_stays(host: ChildHost, recipe: StoredFile) -> None:
+    assert host.call("answer", recipe, 1) == 1
+    child = host.pid
+    with pytest.raises(RuntimeError, match="PickyError: refused with code 7"):
+        host.call("refuse", recipe)
+    assert host.call("answer", recipe, 2) == 2
+    assert host.pid == child
+
+
+def test_closing_does_not_wait_for_a_kernel(recipe: StoredFile, tmp_path: Path) -> None:
+    host, raised, started = ChildHost(BROKEN), list[Exception](), tmp_path / "started"
+
+    def render() -> None:
+        try:
+            host.call("hang", recipe, str(started))
+        except Exception as problem:
+            raised.append(problem)
+
+    rendering = threading.Thread(target=render, daemon=True)
+    rendering.start()
+    deadline_s = time.monotonic() + 60
+    while not (started.exists() and started.read_text()):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    closing = threading.Thread(target=host.close, daemon=True)
+    closing.start()
+    closing.join(60)
+    assert not closing.is_alive(), "it waits for the kernel, which takes an hour"
+    rendering.join(60)
+    assert [type(problem) for problem in raised] == [WorkerLostError]
+    assert not psutil.pid_exists(int(started.read_text()))
 
 
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT, signal.SIGKILL])

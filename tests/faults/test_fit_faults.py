@@ -18,6 +18,7 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.executors import DaskExecutor
+from services.fit.journal import read_entries as read_entries_of
 from services.fit.stage import run
 from tests.support.prepared import FAKE, write_prepared
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
@@ -204,8 +205,8 @@ def test_renderers_end_with_their_worker(tmp_path: Path) -> None:
 
 
 def read_entries(root: Path) -> dict[str, Any]:
-    journal = root / "fit-checkpoint" / "journal.json"
-    return dict(json.loads(journal.read_text())["entries"]) if journal.is_file() else {}
+    journal = root / "fit-checkpoint" / "journal.jsonl"
+    return read_entries_of(journal) if journal.is_file() else {}
 
 
 def await_entries(root: Path, count: int) -> int:

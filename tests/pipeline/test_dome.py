@@ -373,3 +373,23 @@ def test_all_off_ends_a_process_that_hangs(client: httpx.Client, observer: DomeO
     assert client.post("/v1/dome/off").json()["status"]["lit"] == []
     assert lit(observer) == ()
     assert not hanging.is_running()
+
+
+def test_of_two_all_offs_at_once_the_later_one_holds(shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
+    later: list[threading.Thread] = []
+    with console(shared_dome) as answer:
+
+        def compare_slowly(*numbers: int) -> int:
+            if not later:
+                later.append(threading.Thread(target=lambda: answer(number=7, do="off")))
+                later[0].start()
+                # Whoever waits for the order to be written takes all of this time.
+                later[0].join(1)
+            return max(numbers)
+
+        monkeypatch.setattr("services.capture.console.max", compare_slowly, raising=False)
+        assert answer(number=5, do="off").code is None
+        later[0].join()
+        assert answer(number=6, do="light", light=0, level=0.1, on_s=1).code == "rig-stopped"
+        assert lit(observer) == ()
+        assert answer(number=8, do="light", light=0, level=0.1, on_s=1).code is None

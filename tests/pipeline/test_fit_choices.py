@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import pytest
 
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
+from services.fit.journal import read_entries
 from services.fit.stage import run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
@@ -115,7 +115,7 @@ def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
 def test_weights_follow_residuals_once_a_round_and_are_kept(tmp_path: Path) -> None:
     write_prepared(tmp_path, shadowed=0.08)
     fit(tmp_path, loss="robust")
-    entries = json.loads((tmp_path / "fit-checkpoint" / "journal.json").read_text())["entries"]
+    entries = read_entries(tmp_path / "fit-checkpoint" / "journal.jsonl")
     rounds = [key for key in entries if key.endswith("/weights")]
     assert rounds == ["green/exact/weights", "green/exact.1/weights", "green/exact.2/weights"]
     assert all((tmp_path / "fit-checkpoint" / "inputs" / name).is_file() for key in rounds for name, _ in entries[key])

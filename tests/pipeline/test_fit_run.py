@@ -14,6 +14,7 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.identifiability import NOTHING
+from services.fit.numerics import NUMERICS, numerics_name
 from services.fit.stage import export, run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
@@ -158,10 +159,11 @@ def test_a_step_cut_off_before_its_report_is_told_by_the_next_attempt(finished: 
     _, report, _ = finished
     write_prepared(tmp_path)
     fit(tmp_path)
-    journal = tmp_path / "fit-checkpoint" / "journal.json"
-    stored = json.loads(journal.read_text())
-    del stored["entries"]["green/history/2"]
-    journal.write_text(json.dumps(stored))
+    journal = tmp_path / "fit-checkpoint" / "journal.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if json.loads(line).get("key") != "green/history/2"]
+    assert len(kept) == len(lines) - 1
+    journal.write_text("".join(kept))
     events: list[StageEvent] = []
     assert without_time(fit(tmp_path, attempt=2, events=events)) == without_time(report)
     assert [event.data["step"] for event in events if event.kind == "step"] == [2]
@@ -172,18 +174,18 @@ def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(finished: tu
     _, report, _ = finished
     write_prepared(tmp_path)
     fit(tmp_path, seed=2, max_steps=1)
-    journal = tmp_path / "fit-checkpoint" / "journal.json"
+    journal = tmp_path / "fit-checkpoint" / "journal.jsonl"
     earlier, events = journal.read_bytes(), list[StageEvent]()
     assert without_time(fit(tmp_path, attempt=2, events=events)) == without_time(report)
-    assert journal.with_name("journal-set-aside-1.json").read_bytes() == earlier
+    assert journal.with_name("journal-set-aside-1.jsonl").read_bytes() == earlier
     (said,) = [event.message for event in events if "checkpoint" in event.message]
-    assert "kept as journal-set-aside-1.json and this fit starts anew" in said
+    assert "kept as journal-set-aside-1.jsonl and this fit starts anew" in said
 
 
-def test_a_checkpoint_of_another_version_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_of_other_numerics_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_prepared(tmp_path)
     fit(tmp_path, max_steps=1)
-    monkeypatch.setattr("services.fit.attempt.version", lambda _: "0.0.1")
+    monkeypatch.setattr("services.fit.attempt.numerics_name", lambda: numerics_name(NUMERICS + 1))
     events: list[StageEvent] = []
     fit(tmp_path, attempt=2, events=events, max_steps=1)
     assert [event for event in events if "starts anew" in event.message]
@@ -222,7 +224,7 @@ def test_cancel_ends_between_steps_and_keeps_the_record(tmp_path: Path) -> None:
 
     with pytest.raises(JobCancelledError):
         run(spec_for(tmp_path), LocalContext(tmp_path, 1, cancel), engine=FAKE)
-    assert (tmp_path / "fit-checkpoint" / "journal.json").is_file()
+    assert (tmp_path / "fit-checkpoint" / "journal.jsonl").is_file()
     assert not (tmp_path / "fit").exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.fit.anatomy.stain_uv import StainLayout, stain_layout, texel_edge_mm
 from services.fit.export.stains import kept_stains
+from services.fit.journal import read_entries
 from services.fit.optics.parameters import Tissue
 from services.fit.stage import export, run
 from services.fit.transport.recipe import ToothSurfaces, View, single_tooth
@@ -118,7 +118,7 @@ def test_a_clean_tooth_gets_no_texture(tmp_path: Path) -> None:
     write_prepared(tmp_path)
     plain = run(spec_for(tmp_path), LocalContext(tmp_path, 1), engine=FAKE)
     assert kept_stains(tmp_path / "fit") is None
-    compared = json.loads((tmp_path / "fit-checkpoint" / "journal.json").read_text())["entries"]["green/stain.compare"]
+    compared = read_entries(tmp_path / "fit-checkpoint" / "journal.jsonl")["green/stain.compare"]
     assert compared["se"] > 0
     # Then the answer is that of a fit that never looked.
     write_prepared(tmp_path / "without")

@@ -7,6 +7,13 @@ import time
 from typing import Any
 
 
+class PickyError(Exception):
+    """An exception as libraries have them: made from more than its arguments."""
+
+    def __init__(self, *, code: int) -> None:
+        super().__init__(f"refused with code {code}")
+
+
 class BrokenEngine:
     """Takes the place of the real one; builds nothing."""
 
@@ -28,6 +35,10 @@ class BrokenEngine:
         with open(started, "w") as stream:  # noqa: PTH123 - plain, in a process that is about to be killed
             stream.write(str(os.getpid()))
         time.sleep(3600)
+
+    def refuse(self) -> None:
+        """Raise what does not come out whole at the other end of a pipe."""
+        raise PickyError(code=7)
 
     def die(self, number: int) -> None:
         """End by a signal."""

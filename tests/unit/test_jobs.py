@@ -11,6 +11,7 @@ import pytest
 from services.api import admission
 from services.api.admission import Needs
 from services.api.jobs import Jobs
+from services.api.repository import Lease
 from services.core.errors import DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -52,3 +53,40 @@ def test_a_capture_that_takes_long_to_measure_holds_up_no_other_submission(servi
     go_on.set()
     first.join()
     assert len(service.repository.queued()) == 2
+
+
+def test_a_long_round_keeps_no_lease_from_being_renewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.api.runner.ROUND_S", 0.05)
+    running, deleting, go_on, renewed = (threading.Event() for _ in range(4))
+    begun_under: list[int] = []
+
+    def hold(*_: object) -> None:
+        running.set()
+        assert go_on.wait(60)
+
+    def delete_for_long(*_: object) -> None:
+        deleting.set()
+        assert go_on.wait(60)
+
+    service = Jobs(ServerSettings(data=tmp_path / "data"), hold)
+    monkeypatch.setattr(service._runner, "_on_round", delete_for_long)
+    renew = service.repository.renew
+
+    def note_renewal(lease: Lease, seconds: float) -> bool:
+        if deleting.is_set():
+            begun_under.append(lease.number)
+            renewed.set()
+        return renew(lease, seconds)
+
+    monkeypatch.setattr(service.repository, "renew", note_renewal)
+    service.start()
+    try:
+        service.submit(JobSpec(capture=tmp_path))
+        assert running.wait(60)
+        assert deleting.wait(60)
+        renewed.clear()
+        assert renewed.wait(60), "whoever deletes renews no lease"
+    finally:
+        go_on.set()
+        service.close()
+    assert set(begun_under) == {1}

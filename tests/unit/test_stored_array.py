@@ -39,3 +39,9 @@ def test_a_damaged_shard_is_told_when_it_is_read_and_the_rest_stays_readable(pat
 def test_an_index_beyond_the_end_is_not_called_damage(path: Path) -> None:
     with pytest.raises(IndexError):
         StoredArray(path)[7]
+
+
+@pytest.mark.parametrize(("selection", "kind"), [(np.s_[::0], ValueError), (np.s_[0, 0, 0], IndexError), ("row", IndexError)])
+def test_a_selection_that_cannot_be_is_the_readers_own_error(path: Path, selection: object, kind: type[Exception]) -> None:
+    with pytest.raises(kind):
+        StoredArray(path)[selection]

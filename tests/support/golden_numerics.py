@@ -1,0 +1,82 @@
+"""The numbers that the fit's parts gave for fixed seeds when their numerics were last raised; ``python -m tests.support.golden_numerics`` stores them anew.
+
+Images and derivatives of the real engine on a small tooth with stains, and every result that a short fit records on the fake engine, which
+shows solvers and schedules.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.records import Boundary, JobSpec
+from services.core.stage import LocalContext
+from services.fit.journal import read_entries
+from services.fit.numerics import NUMERICS
+from services.fit.stage import run
+from tests.support.prepared import FAKE, write_prepared
+
+STORED = Path(__file__).parents[1] / "data" / "numerics.npz"
+FIT_OPTIONS = {"boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 128, "max_steps": 4, "search_candidates": 500}
+PASSING = frozenset({"begun", "seconds"})
+"""Recorded, but no numerics."""
+
+
+def renders() -> dict[str, NDArray[np.float32]]:
+    """Images and derivatives of the real engine, by boundary and kind."""
+    from services.fit.transport.engine import Engine
+    from tests.support.render_once import Picture, picture
+    from tests.support.stained_tooth import stained_recipe
+
+    found = {}
+    for boundary in get_args(Boundary):
+        result = picture(Engine(stained_recipe(boundary), 2))
+        found |= {f"render/{boundary}/{field.name}": getattr(result, field.name).astype(np.float32) for field in fields(Picture)}
+    return found
+
+
+def fit_results() -> dict[str, NDArray[np.float64]]:
+    """Every number that a short fit records, by the key of its result."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        write_prepared(root)
+        run(JobSpec.model_validate({"capture": root, **FIT_OPTIONS}), LocalContext(root), engine=FAKE)
+        entries = read_entries(root / "fit-checkpoint" / "journal.jsonl")
+    return {f"fit/{key}": np.array(list(_numbers(value))) for key, value in entries.items() if key not in PASSING}
+
+
+def measure() -> dict[str, NDArray[Any]]:
+    """All of them."""
+    return {**renders(), **fit_results()}
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    match value:
+        case bool() | int() | float():
+            yield float(value)
+        case list():
+            for one in value:
+                yield from _numbers(one)
+        case dict():
+            for name, one in sorted(value.items()):
+                if name not in PASSING:
+                    yield from _numbers(one)
+
+
+def main() -> None:
+    """Store what this tree gives, unless its number stands for other numbers already."""
+    if STORED.exists() and int(np.load(STORED)["numerics"]) >= NUMERICS:
+        sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.numerics.NUMERICS first.")
+    np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]
+    print(f"{STORED}: {STORED.stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()
