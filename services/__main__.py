@@ -13,7 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from services.core.errors import DentineError, InputError
+from services.core.errors import DentineError, InputError, StoreError
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the job's.")]
@@ -44,11 +44,18 @@ def main() -> NoReturn:
     except ModuleNotFoundError as problem:
         print(f"dentine: {_remedy(problem)}", file=sys.stderr)
         sys.exit(4)
+    except RecursionError:
+        print("dentine: What was given nests too deeply to be read; simplify it.", file=sys.stderr)
+        sys.exit(InputError.exit_status)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
+    except OSError as problem:
+        what = f"{problem.filename or 'A file'} cannot be used ({problem.strerror or problem})"
+        print(f"dentine: {what}; check its path, its permissions and the disk.", file=sys.stderr)
+        sys.exit(StoreError.exit_status)
     sys.exit(0)
 
 
@@ -120,10 +127,12 @@ def run(
 def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the job.")]) -> None:
     """Run only the capture of a job that names a rig."""
     from services.core.settings import read_job
+    from services.run_command import require_apart
 
     spec = read_job(job)
     if spec.rig is None:
         raise InputError(f"Job file {job} names no rig to capture with; give it a [rig] table.")
+    require_apart(spec, out)
     _run_some(("phantom", "capture") if spec.is_demo else ("capture",), spec, out, again=False)
     print(f"capture: {out / 'capture'}")
 
@@ -194,6 +203,9 @@ def phantom(
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
+    from services.core.folders import require_folder
+
+    require_folder(out, "--out")
     of_jaw = {"--scan": scan is not None}
     of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--fdi": fdi is not None}
     of_tooth |= {"--highlights": highlights, "--gums": gums, "--stains": stains}

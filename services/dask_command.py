@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,8 +12,10 @@ from typing import Annotated, Literal, NoReturn
 import typer
 
 from services.core.dask_config import as_environment
+from services.core.errors import SettingsError
 from services.core.placement import DOME, STAGES, UNLIMITED
 
+_ADDRESS = re.compile(r"([a-z]+://)?[^-\s][^\s]*:\d+")
 _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
@@ -33,6 +36,7 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
 
         A worker runs every stage but captures, once it has shown that it can; with `--resources DOME=1` captures too.
         """
+        require_scheduler_named(context.args, os.environ)
         claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
         _become("worker", [*_claiming(context.args, claims), "--preload", "services.api.worker_setup"], tls_folder())
 
@@ -56,6 +60,19 @@ def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:
             others.append(argument)
     named = {name: str(amount) for name, amount in claims.items()} | named
     return [*others, "--resources", " ".join(f"{name}={amount}" for name, amount in named.items())]
+
+
+def require_scheduler_named(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Refuse to start workers that know no scheduler, which Dask itself answers with a traceback.
+
+    Raises:
+        SettingsError: neither an address nor a file is given.
+    """
+    known = "--scheduler-file", "--help", "--version", "--preload"
+    if "DASK_SCHEDULER_ADDRESS" in environment or any(one.partition("=")[0] in known for one in arguments):
+        return
+    if not any(_ADDRESS.fullmatch(one) for one in arguments):
+        raise SettingsError("No scheduler is named; give its address first, as in: dentine worker tcp://HOST:8786.")
 
 
 def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], folder: Path | None) -> NoReturn:

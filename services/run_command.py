@@ -20,6 +20,7 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     from services.api.pipeline import run_job
     from services.api.progress import ProgressView
 
+    require_apart(spec, out)
     with cancelling_on_signals(out), ProgressView() as view:
         asset = run_job(spec, out, view, workers)
     if not view.events:
@@ -40,11 +41,26 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
         print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")
 
 
+def require_apart(spec: JobSpec, out: Path) -> None:
+    """Refuse results in the folder that they are made from.
+
+    Raises:
+        InputError: names both folders.
+    """
+    from services.core.folders import require_outside
+
+    require_outside(out, spec.capture, "--out")
+    if spec.rig is not None and not spec.is_demo:
+        require_outside(out, spec.rig.mouth, "--out")
+
+
 @contextmanager
 def cancelling_on_signals(out: Path) -> Iterator[None]:
     """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
     from services.api.pipeline import request_cancel, withdraw_cancel
+    from services.core.folders import require_folder
 
+    require_folder(out, "Folder")
     asked = False
     withdraw_cancel(out)
 

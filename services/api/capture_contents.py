@@ -41,7 +41,7 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
         first = problem.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the file"
         return f"{name}: {place}: {first['msg']}; correct it."
-    except (ValueError, KeyError, TypeError) as problem:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError, AttributeError) as problem:
         return f"{name} cannot be read: {str(problem) or type(problem).__name__}; export it again."
 
 

@@ -113,6 +113,8 @@ class Jobs:
         """
         if key is not None and (earlier := self.repository.submitted(spec, key)) is not None:
             return Creation(earlier, is_new=False)
+        if spec.channels == ():
+            raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
         if spec.capture is not None and not is_uploaded(spec.capture):
             require_server_path("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
         if spec.rig is not None:

@@ -22,6 +22,7 @@ from services.api.pipeline import DOORS
 from services.api.runner import RunJob
 from services.api.setup_links import SetupLinks, setup_address
 from services.core.errors import PlatformError
+from services.core.redaction import redacted
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
 
@@ -35,7 +36,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
     """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens. ``run`` and ``doors`` as in ``create_app``.
 
     Raises:
-        PlatformError: the port is taken, another server uses the data folder, or the api extra is not installed.
+        PlatformError: the port is taken, another server uses the data folder, it cannot be written, or the api extra is not installed.
         SettingsError: other machines reach the server and access is open, or the database belongs to another data folder.
     """
     refuse_open_network(settings)
@@ -50,9 +51,10 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
-        proxies, app = settings.trusted_proxies, create_app(settings, run, doors)
-        if settings.access == "tokens":
-            _tell_setup_link(settings, port)
+        with _telling_what_cannot_be_written(settings.data):
+            proxies, app = settings.trusted_proxies, create_app(settings, run, doors)
+            if settings.access == "tokens":
+                _tell_setup_link(settings, port)
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -79,6 +81,18 @@ def _tell_setup_link(settings: ServerSettings, port: int) -> None:
     if secret is not None:
         link = f"{setup_address(settings, port)}/#/setup/{secret.get_secret_value()}"
         logging.getLogger(__name__).info("Nobody has a token yet. Open this link within an hour to make the administrator's: %s", link)
+
+
+@contextmanager
+def _telling_what_cannot_be_written(data: Path) -> Iterator[None]:
+    from sqlalchemy.exc import DBAPIError
+
+    try:
+        yield
+    except (OSError, DBAPIError) as problem:
+        reason = problem.orig if isinstance(problem, DBAPIError) else problem.strerror or problem
+        what = f"The server cannot use its data folder {data} or its database ({redacted(str(reason).splitlines()[0])})"
+        raise PlatformError(f"{what}; free some disk, correct path and permissions, and see that the database answers.") from problem
 
 
 def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
@@ -110,8 +124,10 @@ def _listen(settings: ServerSettings) -> socket.socket:
 @contextmanager
 def _sole_server(data: Path) -> Iterator[None]:
     """Hold the data folder's lock; the system drops it however this process ends."""
-    data.mkdir(parents=True, exist_ok=True)
-    with (data / ".lock").open("w") as stream:
+    with _telling_what_cannot_be_written(data):
+        data.mkdir(parents=True, exist_ok=True)
+        stream = (data / ".lock").open("w")
+    with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -15,6 +15,7 @@ from services.capture.motion import SubjectMotion
 from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
 from services.capture.simulated_cameras import PlaybackCameras, SimulatedCameras
 from services.capture.stills import Stills
+from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError, RigError
 from services.core.records import FolderCapture, RigSpec
 from services.core.store import read_record
@@ -86,4 +87,5 @@ def _read_description(path: Path) -> FolderCapture:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise CaptureInputError(f"{path} lists {part} '{twice}' twice; give each its own name.")
+    require_consistent(description, str(path))
     return description

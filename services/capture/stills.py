@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.arrays import as_float32, map_radiance
 from services.core.errors import CaptureInputError
 from services.core.records import FolderCapture
 
@@ -29,13 +30,8 @@ class Stills:
 
     def still(self, camera: int, light: int) -> NDArray[np.float32]:
         """Radiance (height, width, channel) that the camera sees with this light alone, at ``Light.intensity``."""
-        path, (height, width, channels) = self._files[camera, light], self.shape(camera)
-        image = _map(path)
-        if image.shape != (height, width, channels) and not (channels == 1 and image.shape == (height, width)):
-            raise CaptureInputError(
-                f"Image {path} has shape {image.shape} instead of {(height, width, channels)}; its camera's size and the channels in capture.json must match."
-            )
-        radiance = np.asarray(image, dtype=np.float32).reshape(height, width, channels)
+        path, what = self._files[camera, light], f"Image {self._files[camera, light]}"
+        radiance = as_float32(map_radiance(path, self.shape(camera), what), what)
         if not (np.isfinite(radiance).all() and (radiance >= 0).all()):
             raise CaptureInputError(f"Image {path} holds negative or non-finite values; render or export it again.")
         return radiance
@@ -67,13 +63,3 @@ def _find(folder: Path, description: FolderCapture) -> dict[tuple[int, int], Pat
             if (i, j) not in files:
                 raise CaptureInputError(f"{folder / 'capture.json'} has no image of camera {camera} and light {light}; add it or remove the light.")
     return files
-
-
-def _map(path: Path) -> NDArray[np.generic]:
-    try:
-        image = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as problem:
-        raise CaptureInputError(f"Image {path} cannot be read as npy ({problem}); restore or export the file again.") from problem
-    if not (isinstance(image, np.ndarray) and np.issubdtype(image.dtype, np.floating)):
-        raise CaptureInputError(f"Image {path} does not hold floating-point numbers; export linear radiance as float32.")
-    return image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +10,17 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Record
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
+
+MAX_LIGHTS = 1000
+"""Six times the lights of the largest dome that is known here."""
+MAX_PIXELS = 2**28
+"""Of one camera: above the largest sensors of one chip (151 million), and an image of one channel still fits a GiB."""
+MAX_FOCAL_PX = 1e7
+"""Beyond it a pixel is smaller than light resolves."""
+MAX_DISTANCE_MM = 1e6
+"""A kilometre; a unit other than millimetres does not come out much nearer."""
+MIN_INTENSITY, MAX_INTENSITY = 1e-12, 1e24
+"""Of a light: between them products with distances and albedos stay within single precision."""
 
 
 class Calibration(Record):
@@ -53,19 +65,50 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
     Raises:
         CaptureInputError: names the first contradiction.
     """
-    for what, names in (("camera", [c.name for c in description.cameras]), ("light", [light.name for light in description.lights])):
+    named = {
+        "camera": [camera.name for camera in description.cameras],
+        "light": [light.name for light in description.lights],
+        "channel": list(description.channels),
+    }
+    for what, names in named.items():
         if not names:
             raise CaptureInputError(f"{origin} lists no {what}; add at least one.")
-        repeated = {name for name in names if names.count(name) > 1}
-        if repeated:
+        if repeated := {name for name, count in Counter(names).items() if count > 1}:
             raise CaptureInputError(f"{origin} lists {what} {min(repeated)} twice; give each its own name.")
-    if not description.channels:
-        raise CaptureInputError(f"{origin} lists no channel; name each colour channel of the images.")
+    if len(description.lights) > MAX_LIGHTS:
+        raise CaptureInputError(f"{origin} lists {len(description.lights)} lights, more than any rig has ({MAX_LIGHTS}); remove those without images.")
+    for camera in description.cameras:
+        _require_possible(camera, origin)
     for light in description.lights:
         if len(light.intensity) != len(description.channels):
             raise CaptureInputError(
                 f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)} channels; give one per channel."
             )
+        dark = [channel for channel, value in zip(description.channels, light.intensity, strict=True) if not MIN_INTENSITY <= value <= MAX_INTENSITY]
+        if dark:
+            value = light.intensity[description.channels.index(dark[0])]
+            what = f"{origin}: light {light.name} has intensity {value:g} in channel {dark[0]}, outside {MIN_INTENSITY:g} to {MAX_INTENSITY:g}"
+            raise CaptureInputError(f"{what}; give what was measured, or remove the light.")
+        if max(map(abs, light.position_mm)) > MAX_DISTANCE_MM:
+            raise CaptureInputError(f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm.")
+
+
+def _require_possible(camera: Camera, origin: str) -> None:
+    """Refuse a camera that cannot be one, whatever it looks at."""
+    where = f"{origin}: camera {camera.name}"
+    width, height = camera.size
+    if width * height > MAX_PIXELS:
+        raise CaptureInputError(f"{where} has {width} x {height} pixels, more than any camera here ({MAX_PIXELS / 2**20:.0f} million); correct its size.")
+    (fx, skew, cx), (zero, fy, cy), last = camera.K
+    if not (0 < fx <= MAX_FOCAL_PX and 0 < fy <= MAX_FOCAL_PX):
+        what = f"{where} has focal lengths K[0][0] = {fx:g} and K[1][1] = {fy:g} pixels, which must lie between 0 and {MAX_FOCAL_PX:g}"
+        raise CaptureInputError(f"{what}; correct K.")
+    if zero != 0 or last != (0, 0, 1) or abs(skew) > fx or max(abs(cx), abs(cy)) > MAX_FOCAL_PX:
+        raise CaptureInputError(f"{where} has a K that is not [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels; correct K.")
+    if max(abs(row[3]) for row in camera.camera_from_world) > MAX_DISTANCE_MM:
+        raise CaptureInputError(f"{where} is more than {MAX_DISTANCE_MM:g} mm away; its pose must be in millimetres.")
+    if camera.camera_from_world[3] != (0, 0, 0, 1):
+        raise CaptureInputError(f"{where}: the last row of camera_from_world must be [0, 0, 0, 1]; export the pose again.")
 
 
 def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:

@@ -117,6 +117,26 @@ class Mesh:
                 f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices must be in millimetres, so rescale it."
             )
 
+    def shell_count(self) -> int:
+        """Into how many parts the surface falls that share no vertex."""
+        # Every vertex takes the least number of its faces' vertices, then of that vertex, until none changes.
+        labels = np.arange(len(self.vertices_mm))
+        while True:
+            before = labels.copy()
+            np.minimum.at(labels, self.faces, labels[self.faces].min(axis=1, keepdims=True))
+            labels = labels[labels]
+            if (labels == before).all():
+                return len(np.unique(labels[self.faces[:, 0]]))
+
+    def require_one_shell(self, name: str) -> None:
+        """Refuse a mesh of several bodies, which may lie in each other.
+
+        Raises:
+            MeshError: says how many there are.
+        """
+        if (shells := self.shell_count()) > 1:
+            raise MeshError(f"Mesh {name} holds {shells} separate shells; join them into one surface, or remove all but the tooth's.")
+
     def require_solid(self, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:
         """Refuse a mesh that cannot bound a medium.
 

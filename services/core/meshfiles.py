@@ -8,9 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import CaptureInputError
+from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh, Tooth, teeth_folder
 from services.core.vtk_polydata import read_polydata
+
+FDI_NUMBERS = frozenset(10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6))
+"""Permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""
+TOOTH_EXTENT_MM = (2.0, 45.0)
+"""The longest tooth that was ever measured has 37 mm."""
+MIN_SPACING_MM = 2.0
+"""Between the centres of two teeth; the narrowest, lower incisors, stand 5 mm apart."""
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -86,17 +93,31 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, .
     Raises:
         CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
     """
-    numbers = fdi if fdi is not None else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isdigit()))
+    numbers = fdi if fdi is not None else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
+    if unknown := next((number for number in numbers if number not in FDI_NUMBERS), None):
+        what = f"{root / 'teeth' / str(unknown)} is of tooth {unknown}, which is no FDI number"
+        raise CaptureInputError(f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on to 85.")
     if not numbers:
         raise CaptureInputError(f"No tooth mesh below {root / 'teeth'}; put teeth/<FDI>/outer.ply there.")
     teeth = []
     for number in numbers:
         folder = teeth_folder(root, number)
         outer = read_mesh(folder / "outer.ply")
-        outer.require_solid(f"teeth/{number}/outer.ply")
+        outer.require_solid(f"teeth/{number}/outer.ply", TOOTH_EXTENT_MM)
+        outer.require_one_shell(f"teeth/{number}/outer.ply")
         dentin = None
         if (folder / "dentin.ply").exists():
             dentin = read_mesh(folder / "dentin.ply")
-            dentin.require_solid(f"teeth/{number}/dentin.ply")
+            dentin.require_solid(f"teeth/{number}/dentin.ply", TOOTH_EXTENT_MM)
         teeth.append(Tooth(number, outer, dentin))
+    _require_apart(teeth)
     return tuple(teeth)
+
+
+def _require_apart(teeth: list[Tooth]) -> None:
+    centres = [tooth.outer.vertices_mm.mean(axis=0) for tooth in teeth]
+    for k, tooth in enumerate(teeth):
+        for n in range(k):
+            if np.linalg.norm(centres[k] - centres[n]) < MIN_SPACING_MM:
+                what = f"Teeth {teeth[n].fdi} and {tooth.fdi} lie in each other: their centres are less than {MIN_SPACING_MM:g} mm apart"
+                raise MeshError(f"{what}; export each in its own place.")

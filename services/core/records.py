@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, Strict, StringConstraints, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints, model_validator
 from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Name, Record, Vector3
@@ -46,13 +46,23 @@ class MaskBit(IntFlag):
     UNLIT = 128
 
 
+def _no_nul(value: str) -> str:
+    if "\0" in value:
+        raise PydanticCustomError("path", "no path holds the character NUL")
+    return value
+
+
+FileName = Annotated[str, AfterValidator(_no_nul)]
+"""Path of a file below a capture's folder."""
+
+
 class ImageEntry(Record):
     """One image of a folder capture."""
 
     camera: str
     light: str
-    file: str
-    variance_file: str | None = None
+    file: FileName
+    variance_file: FileName | None = None
     held_out: bool = False
 
 

@@ -126,6 +126,10 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
             node = tree
             for part in path:
                 node = node.setdefault(part, {})
+                if not isinstance(node, dict):
+                    raise SettingsError(f"Setting {variable} needs a group of which another variable sets the whole; remove one of the two.")
+            if isinstance(node.get(leaf), dict):
+                raise SettingsError(f"Setting {variable} is a group, of which other variables set single values; remove it.")
             node[leaf] = value
     try:
         return Settings.model_validate(tree)
@@ -145,7 +149,9 @@ def read_job(path: Path) -> JobSpec:
         raise SettingsError(f"Job file {path} does not exist; check the path.")
     try:
         tree = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+    except RecursionError as problem:
+        raise SettingsError(f"Job file {path} nests brackets too deeply; a job's options need three levels at most.") from problem
+    except (ValueError, OSError) as problem:  # numbers beyond all limits, too, and what is no UTF-8
         raise SettingsError(f"Job file {path} is not valid TOML: {problem}; correct that line.") from problem
     return job_from_tree(tree, path.parent, str(path))
 
@@ -165,6 +171,11 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
             known = ", ".join(sorted(JobSpec.model_fields))
             raise SettingsError(f"{origin}: unknown option '{option}'; known options are {known}.") from problem
         raise SettingsError(f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it.") from problem
+    for option, path in {"capture": spec.capture, "calibration": spec.calibration, "rig.mouth": spec.rig and spec.rig.mouth}.items():
+        if path is not None and "\0" in str(path):
+            raise SettingsError(f"{origin}: option '{option}' holds the character NUL, which no path has; correct it.")
+    if spec.channels == ():
+        raise SettingsError(f"{origin}: option 'channels' is empty; name a channel, or leave it out to fit all.")
     if spec.capture is not None:
         spec = spec.model_copy(update={"capture": (base / spec.capture).resolve()})
     if spec.calibration is not None:

@@ -195,7 +195,7 @@ def _manifest(root: Path, stage: str) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_bytes())
         return {"files": dict(manifest["files"]), "record": manifest["record"]}
-    except (ValueError, KeyError, TypeError) as problem:
+    except (ValueError, KeyError, TypeError, RecursionError) as problem:
         raise CorruptStoreError(f"{path}, the list of what stage {stage} published, cannot be read; {_remedy(stage)}.") from problem
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.arrays import as_float32, map_radiance
 from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import FolderCapture, ImageEntry, MaskBit
@@ -17,13 +19,14 @@ from services.preprocess.source import LightImage
 
 # Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
 NOT_FINITE_LIMIT = 0.5
+NAMES_SHOWN = 3
+"""Lights that a note names, of those without an image."""
 
 
 class FolderSource:
     """Reads a folder capture; everything but the pixels is checked before the first image is opened."""
 
     measures_motion = False
-    notes: tuple[str, ...] = ()
 
     def __init__(self, root: Path, noise_relative: float, noise_floor: float) -> None:
         """Open ``root/capture.json``.
@@ -36,6 +39,7 @@ class FolderSource:
             CaptureInputError: names what is missing or contradictory.
         """
         self.root = root
+        self.notes: tuple[str, ...] = ()
         self.description = read_record(root / "capture.json", FolderCapture)
         self._noise = noise_relative, noise_floor
         origin = str(root / "capture.json")
@@ -44,6 +48,7 @@ class FolderSource:
             raise CaptureInputError(f"{origin} lists no image; add one entry per camera and light.")
         cameras = {camera.name for camera in self.description.cameras}
         lights = {light.name for light in self.description.lights}
+        numbers = {camera.name: number for number, camera in enumerate(self.description.cameras)}
         self._entries: dict[tuple[str, str], ImageEntry] = {}
         for entry in self.description.images:
             if entry.camera not in cameras:
@@ -58,6 +63,12 @@ class FolderSource:
                     raise CaptureInputError(
                         f"Image file {root / file} (camera {entry.camera}, light {entry.light}) does not exist; put it there or remove its entry."
                     )
+                if file is not None:
+                    self._map(entry, file, numbers[entry.camera])
+        used = {light for _, light in self._entries}
+        if unused := [light.name for light in self.description.lights if light.name not in used]:
+            shown = ", ".join(unused[:NAMES_SHOWN]) + (f" and {len(unused) - NAMES_SHOWN} more" if len(unused) > NAMES_SHOWN else "")
+            self.notes = (f"No image names light {shown}; remove what the rig does not have, or add its images.",)
         self.held_out = tuple(pair for pair, entry in self._entries.items() if entry.held_out)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:
@@ -95,19 +106,11 @@ class FolderSource:
         return path
 
     def _read(self, entry: ImageEntry, file: str, camera: int) -> NDArray[np.float32]:
+        return as_float32(*self._map(entry, file, camera))
+
+    def _map(self, entry: ImageEntry, file: str, camera: int) -> tuple[NDArray[np.floating[Any]], str]:
         place = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"
         if Path(file).suffix.lower() != ".npy":
             raise CaptureInputError(f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float32.")
-        try:
-            image = np.load(self._path(file), allow_pickle=False)
-        except (ValueError, EOFError, OSError) as problem:
-            raise CaptureInputError(f"{place} cannot be read ({problem}); it may be truncated, so copy or export it again.") from problem
-        if not isinstance(image, np.ndarray) or not np.issubdtype(image.dtype, np.floating):
-            raise CaptureInputError(f"{place} does not hold floating-point radiance; export linear values as float32.")
         width, height = self.description.cameras[camera].size
-        expected = (height, width, len(self.description.channels))
-        if image.ndim == 2 and expected[2] == 1:
-            image = image[..., None]
-        if image.shape != expected:
-            raise CaptureInputError(f"{place} has shape {image.shape} instead of {expected} (height, width, channels); export it at the camera's size.")
-        return image.astype(np.float32)
+        return map_radiance(self._path(file), (height, width, len(self.description.channels)), place), place

@@ -57,6 +57,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     source = _open_source(spec, context.root)
     cameras, lights, channels = source.description.cameras, source.description.lights, source.description.channels
     held_out = _held_out(spec, source)
+    if spec.channels == ():
+        raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
     if unknown := set(spec.channels or ()) - set(channels):
         raise SettingsError(f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it.")
     masks = HandMasks(context.root, source.description)

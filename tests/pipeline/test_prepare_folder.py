@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -203,6 +204,24 @@ def rename_camera(tree: Tree, name: str) -> None:
     tree["cameras"][0]["name"] = name
 
 
+def npy(header: bytes) -> bytes:
+    """A .npy file with this header and no content."""
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+
+def declare(shape: tuple[int, ...]) -> Callable[[Path, Tree], object]:
+    header = repr({"descr": "<f4", "fortran_order": False, "shape": shape}).encode() + b"\n"
+    return lambda root, _: (root / "side_left.npy").write_bytes(npy(header))
+
+
+def double_mesh(root: Path, _: Tree) -> None:
+    path = root / "teeth" / "11" / "outer.ply"
+    ball = trimesh.load_mesh(path)
+    moved = ball.copy()
+    moved.apply_translation((1.0, 0.0, 0.0))
+    (ball + moved).export(path)
+
+
 BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] = {
     "missing file": (
         lambda root, _: (root / "front_right.npy").unlink(),
@@ -248,6 +267,43 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
         r"times as bright as a white surface .* intensities per steradian with mm",
     ),
     "all images dark": (darken_all, CaptureInputError, r"Every image of .* is dark.*check exposure, lights"),
+    "header beyond all memory": (declare((10**9, 10**9, 2)), CaptureInputError, r"side_left\.npy \(camera side, light left\) cannot be read as npy"),
+    "header beyond all integers": (declare((10**40, 3)), CaptureInputError, r"side_left\.npy .*cannot be read as npy"),
+    "header of brackets": (
+        lambda root, _: (root / "side_left.npy").write_bytes(npy(b"(" * 5000)),
+        CaptureInputError,
+        r"side_left\.npy .*cannot be read as npy",
+    ),
+    "camera beyond all memory": (
+        edit(lambda tree: tree["cameras"][1].update(size=[2 * 10**9, 1])),
+        CaptureInputError,
+        r"camera side has 2000000000 x 1 pixels",
+    ),
+    "dark light": (edit(lambda tree: tree["lights"][1].update(intensity=[1e6, 0.0])), CaptureInputError, r"light right has intensity 0 in channel blue"),
+    "NUL in a path": (edit(lambda tree: tree["images"][0].update(file="a\0.npy")), CaptureInputError, r"images\.0\.file: .*character NUL"),
+    "a tooth that nobody has": (lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "99"), CaptureInputError, r"tooth 99, which is no FDI number"),
+    "a tooth that no integer names": (lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "\u00b2"), CaptureInputError, r"No tooth mesh"),
+    "mesh in fifths of a mm": (rescale_mesh(6.0), MeshError, r"teeth/11/outer\.ply is 48 units across, outside 2 to 45 mm"),
+    "two shells in each other": (double_mesh, MeshError, r"teeth/11/outer\.ply holds 2 separate shells"),
+    "two teeth in each other": (lambda root, _: shutil.copytree(root / "teeth" / "11", root / "teeth" / "12"), MeshError, r"Teeth 11 and 12 lie in each other"),
+    "lights beyond any rig": (
+        edit(lambda tree: tree["lights"].extend({**tree["lights"][0], "name": f"l{k}"} for k in range(10_000))),
+        CaptureInputError,
+        r"lists 10002 lights, more than any rig has \(1000\)",
+    ),
+    "beyond single precision": (replace_image(lambda image: image.astype(np.float64) * 1e200), CaptureInputError, r"side_left\.npy .* beyond single precision"),
+    "negative focal length": (
+        edit(lambda tree: tree["cameras"][1]["K"][0].__setitem__(0, -1500)),
+        CaptureInputError,
+        r"camera side has focal lengths K\[0\]\[0\] = -1500",
+    ),
+    "matrix of another kind": (edit(lambda tree: tree["cameras"][1]["K"][2].__setitem__(2, 2)), CaptureInputError, r"camera side has a K that is not"),
+    "pose without its last row": (
+        edit(lambda tree: tree["cameras"][1]["camera_from_world"][3].__setitem__(3, 0)),
+        CaptureInputError,
+        r"last row of camera_from_world",
+    ),
+    "channel twice": (edit(lambda tree: tree.update(channels=["green", "green"])), CaptureInputError, r"lists channel green twice"),
     "tooth out of view": (edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)), CaptureInputError, r"No tooth .* camera front"),
 }
 
@@ -280,6 +336,7 @@ def test_a_camera_may_be_named_in_any_script(tmp_path: Path) -> None:
     [
         ({"held_out_lights": ("sun",)}, r"'held_out_lights' names sun, but the capture has left, right"),
         ({"held_out_lights": ("left", "right")}, r"keeps every light from the fit"),
+        ({"channels": ()}, r"'channels' is empty"),
         ({"channels": ("red",)}, r"'channels' names red, but the capture has green, blue"),
     ],
 )
@@ -296,6 +353,14 @@ def test_a_failed_import_leaves_the_published_one(tmp_path: Path) -> None:
     with pytest.raises(CaptureInputError):
         prepare(tmp_path, tmp_path / "job")
     assert open_stage(tmp_path / "job", "prepared", PreparedManifest)[1] == first
+
+
+def test_lights_without_an_image_are_told(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    tree["lights"].extend({**tree["lights"][0], "name": f"spare{k}"} for k in range(5))
+    write_tree(tmp_path, tree)
+    notes = prepare(tmp_path, tmp_path / "job").notes
+    assert [note for note in notes if "spare0, spare1, spare2 and 2 more" in note]
 
 
 def test_neither_folder_nor_store(tmp_path: Path) -> None:
