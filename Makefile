@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
+.PHONY: demo deploy-test deploy-check manifests gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -36,6 +36,16 @@ roles: ## every part of the service in a virtual environment of its own, and a s
 SUITE ?= bookworm
 bare-test: ## demo and test on a machine with apt, make and python3 alone, in a folder; SUITE names it; needs root and mmdebstrap, see deploy/README.md
 	@deploy/bare_machine.sh $(SUITE)
+
+deploy-test: setup ## build the images, run the composed system in real containers and disturb it, half an hour; needs an engine, see deploy/README.md
+	@tests/containers/build.sh
+	@$(BIN)/python -m pytest tests/containers
+
+deploy-check: setup ## the files of deploy/ against their formats' own validators
+	@$(BIN)/python -m pytest tests/pipeline/test_deploy_files.py
+
+manifests: setup ## write deploy/kubernetes/dentine.yaml from deploy/compose.yaml
+	@$(BIN)/python deploy/kubernetes/render.py
 
 lint: setup
 	@$(BIN)/ruff check .

@@ -64,6 +64,7 @@ def build_app() -> typer.Typer:
     from services.client_commands import add_client_commands
     from services.core.settings import read_settings
     from services.dask_command import add_dask_commands
+    from services.secrets_command import build_secrets_app
     from services.slab_command import simulate_slab_command
     from services.token_command import build_token_app
 
@@ -77,6 +78,7 @@ def build_app() -> typer.Typer:
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)
     app.add_typer(simulate, name="simulate")
+    app.add_typer(build_secrets_app(lambda: read_settings(os.environ).server), name="secrets")
     app.add_typer(build_token_app(lambda: read_settings(os.environ).server.database_url), name="token")
     return app
 

@@ -7,12 +7,16 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from services.api.database import metadata, writing
+from services.api.database import metadata, parse_database_url, with_password_file, writing
 from services.core.errors import SettingsError
+from services.core.private_files import write_private
 from services.core.store import write_atomic
 
 FILE = "folder.id"
 """In the data folder, with a number drawn when it was first used; a copy of the folder is the folder."""
+
+PASSWORD_FILE = "database.password"  # noqa: S105 - a name
+"""In the data folder, which workers see too: the password of a database whose URL brought one along."""
 
 data_folder_table = sql.Table("data_folder", metadata, sql.Column("id", sql.Text, primary_key=True))
 
@@ -35,3 +39,12 @@ def require_own_folder(engine: sql.Engine, data: Path) -> None:
         engine.dispose()
         what = f"The database belongs to another data folder than {data}, which has none of its jobs' files"
         raise SettingsError(f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder is lost for good.")
+
+
+def keep_password_apart(url: str, data: Path) -> str:
+    """The URL without its password, which is put into a private file of the data folder: the URL travels inside tasks, no secret does."""
+    password = parse_database_url(url).password
+    if password is None:
+        return url
+    write_private(data / PASSWORD_FILE, f"{password}\n".encode())
+    return with_password_file(url, data / PASSWORD_FILE)

@@ -34,6 +34,8 @@ MOST_ID = 2**31 - 1
 POSTGRES_SILENCE_S = 15
 """After so long without a sign of life, each side of a connection takes the other for gone, also in the middle of a transaction."""
 
+PASSWORD_FILE = "password_file"  # noqa: S105 - a name
+"""Part of a database's URL here, not of Postgres': the file that holds the password, so that none travels with the URL."""
 PATIENCE_S = 600.0
 """How long whoever works on a job waits for a database that went away."""
 
@@ -49,23 +51,71 @@ def sqlite_url(path: Path) -> str:
 def open_database(url: str) -> sql.Engine:
     """Open a database; nothing is created in it.
 
+    Args:
+        url: may name the file of its password, ``?password_file=PATH``, which is read for every connection, so that a password
+            that was changed needs no restart.
+
     Raises:
         SettingsError: not a URL of SQLite or Postgres. PlatformError: Postgres' driver is not installed.
     """
-    try:
-        parsed = sql.make_url(url)
-    except sql.exc.ArgumentError:
-        raise SettingsError("The database's URL is malformed; give sqlite:///FILE or postgresql://USER:PASSWORD@HOST/NAME.") from None
+    parsed = parse_database_url(url)
     if parsed.get_backend_name() == "sqlite":
         if parsed.database:
             Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
         return _sqlite(parsed)
     if parsed.get_backend_name() != "postgresql":
         raise SettingsError(f"The database {parsed.get_backend_name()!r} is not supported; use sqlite or postgresql.")
+    password_file = parsed.query.get(PASSWORD_FILE)
+    parsed = parsed.difference_update_query([PASSWORD_FILE])
     try:
-        return sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True, connect_args=_watchful(parsed))
+        engine = sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True, connect_args=_watchful(parsed))
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
+    if isinstance(password_file, str):
+        _read_password_at_each_connection(engine, Path(password_file))
+    return engine
+
+
+def parse_database_url(url: str) -> sql.URL:
+    """The parts of a database's URL.
+
+    Raises:
+        SettingsError: it is malformed; no part of it is repeated, as one of them is a password.
+    """
+    try:
+        return sql.make_url(url)
+    except (sql.exc.ArgumentError, ValueError):
+        what = "The database's URL is malformed; give sqlite:///FILE or postgresql://USER@HOST/NAME"
+        advice = "with the password in the file that DENTINE__SERVER__DATABASE_PASSWORD_FILE names"
+        raise SettingsError(f"{what}, {advice}: in a URL, characters such as / @ # must be written as %2F %40 %23.") from None
+
+
+def with_password_file(url: str, path: Path) -> str:
+    """The URL of a database whose password stands in a file."""
+    parsed = parse_database_url(url).set(password=None).update_query_dict({PASSWORD_FILE: str(path)})
+    return parsed.render_as_string(hide_password=False)
+
+
+def read_password(path: Path) -> str:
+    """The password in a file, without the end of its line.
+
+    Raises:
+        SettingsError: the file is absent, unreadable, or empty.
+    """
+    try:
+        password = path.read_text().rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = getattr(problem, "strerror", None) or "it is no text"
+        raise SettingsError(f"The file of the database's password, {path}, cannot be read ({reason}); correct it or the setting.") from problem
+    if not password:
+        raise SettingsError(f"The file of the database's password, {path}, is empty; write the password into it.")
+    return password
+
+
+def _read_password_at_each_connection(engine: sql.Engine, path: Path) -> None:
+    @sql.event.listens_for(engine, "do_connect")
+    def _connect(_dialect: Any, _record: Any, _arguments: Any, options: dict[str, Any]) -> None:
+        options["password"] = read_password(path)
 
 
 def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:

@@ -14,7 +14,7 @@ from pydantic import Field
 from services.api.admission import Admission, Machine
 from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
-from services.api.data_folder import require_own_folder
+from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.erasure import erase, forget_listing
 from services.api.events import EventAddress, JobEvent
 from services.api.job_table import JobFilter
@@ -61,7 +61,7 @@ class Jobs:
     def __init__(self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None) -> None:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
-        self.repository = Repository(settings.database_url)
+        self.repository = Repository(keep_password_apart(settings.database_url, self._data))
         if settings.database is not None:
             require_own_folder(self.repository.engine, self._data)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 import re
 import secrets
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 
 from services.api.tokens import Token
 from services.core.errors import UnauthenticatedError
+from services.core.private_files import write_private
 
 COOKIE = "dentine-session"
 KEY_FILE = "session.key"
@@ -60,8 +60,5 @@ def read_key(data: Path) -> bytes:
     """The signing key of a data folder; made on first use, readable by its owner alone."""
     path = data / KEY_FILE
     if not path.exists():
-        fresh = data / f".{KEY_FILE}-{secrets.token_hex(4)}"
-        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
-            stream.write(secrets.token_bytes(_KEY_BYTES))
-        fresh.replace(path)
+        write_private(path, secrets.token_bytes(_KEY_BYTES))
     return path.read_bytes()

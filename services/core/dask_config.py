@@ -16,6 +16,11 @@ DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
         "distributed.admin.log-length": 500,
         "distributed.admin.system-monitor.interval": "10s",
         "distributed.admin.system-monitor.log-length": 120,
+        # Its HTTP servers have nothing to say that this program does not say itself.
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+        # A line for every health check would be nearly all that a scheduler logs; what a stranger tried is a warning and stays.
+        "distributed.logging": {"distributed": "info", "distributed.comm.tcp": "warning"},
     }
 )
 

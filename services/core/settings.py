@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 from pydantic import Field, SecretStr, ValidationError
 
@@ -68,7 +69,8 @@ class ServerSettings(Record):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
     data: Path = Field(default=Path("dentine-data"), description="folder of the jobs and, by default, the database")
-    database: SecretStr | None = Field(default=None, description="postgresql://USER:PASSWORD@HOST/NAME; default is SQLite in the data folder")
+    database: SecretStr | None = Field(default=None, description="postgresql://USER@HOST/NAME; default is SQLite in the data folder")
+    database_password_file: Path | None = Field(default=None, description="file with the password of the database; read for every connection")
     scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
     tls: Path | None = Field(default=None, description="folder with ca.crt, tls.crt and tls.key: API, scheduler and workers speak TLS; default: without")
     jobs_at_once: int = Field(default=4, ge=1, le=64, description="most jobs that run side by side; captures of further ones begin nevertheless")
@@ -88,8 +90,13 @@ class ServerSettings(Record):
 
     @property
     def database_url(self) -> str:
-        """URL of the database, with its password."""
-        return self.database.get_secret_value() if self.database is not None else f"sqlite:///{self.data.resolve() / DATABASE_FILE}"
+        """URL of the database, with its password or the file that holds it."""
+        if self.database is None:
+            return f"sqlite:///{self.data.resolve() / DATABASE_FILE}"
+        url = self.database.get_secret_value()
+        if self.database_password_file is None:
+            return url
+        return f"{url}{'&' if '?' in url else '?'}password_file={quote(str(self.database_password_file))}"
 
     @property
     def is_loopback(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -21,7 +22,6 @@ from tests.support.small_system import free_port
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = ROOT / "deploy" / "compose.yaml"
-WITH_TLS = ROOT / "deploy" / "compose.tls.yaml"
 DENTINE = [sys.executable, "-m", "services"]
 PATIENCE_S = 600.0
 JOB = """
@@ -39,20 +39,22 @@ pytestmark = pytest.mark.timeout(1800)
 
 
 def services() -> dict[str, dict[str, Any]]:
-    return dict(yaml.safe_load(COMPOSE.read_text())["services"])
+    """The services that start without a profile, with the defaults of their variables."""
+    text = re.sub(r"\$\{\w+:-([^${}]*)\}", r"\1", COMPOSE.read_text())
+    return {name: one for name, one in yaml.safe_load(text)["services"].items() if "profiles" not in one}
 
 
-def test_the_files_follow_the_compose_specification() -> None:
-    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(COMPOSE), str(WITH_TLS)]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stdout
-
-
-def test_tls_is_one_setting_of_every_part_that_speaks_dask() -> None:
+def test_whoever_speaks_dask_speaks_tls() -> None:
     of_dask = {name for name, one in services().items() if "scheduler" in str(one.get("command")) or "DENTINE__SERVER__SCHEDULER" in one.get("environment", {})}
-    secured = yaml.safe_load(WITH_TLS.read_text())["services"]
-    assert secured.keys() == of_dask
-    assert all(one["environment"] == {"DENTINE__SERVER__TLS": "/run/tls"} for one in secured.values())
+    assert of_dask == {"api", "scheduler", "worker", "rig"}
+    assert all(services()[name]["environment"]["DENTINE__SERVER__TLS"] == "/secrets/tls" for name in of_dask)
+
+
+def test_no_password_stands_in_a_variable() -> None:
+    for name, one in services().items():
+        for variable, value in one.get("environment", {}).items():
+            assert "PASSWORD" not in variable or variable.endswith("_FILE"), (name, variable)
+            assert not re.search(r"://[^/]*:[^/]*@", value), (name, variable)
 
 
 def test_only_the_api_is_published_and_only_on_loopback() -> None:
@@ -60,21 +62,40 @@ def test_only_the_api_is_published_and_only_on_loopback() -> None:
 
 
 def test_one_worker_alone_may_reach_the_dome() -> None:
-    able = [name for name, one in services().items() if "DOME=1" in one.get("command", [])]
+    able = [name for name, one in services().items() if any("DOME=1" in part for part in one.get("command", []))]
     assert able == ["rig"]
     assert "deploy" not in services()["rig"]
 
 
-def test_the_dome_is_reached_by_the_api_and_the_rig_alone() -> None:
-    composed = yaml.safe_load(COMPOSE.read_text())
-    assert composed["networks"]["dome"] == {"internal": True}
-    assert {name for name, one in services().items() if "dome" in one.get("networks", ["default"])} == {"api", "rig", "dome"}
-    assert services()["dome"]["networks"] == ["dome"]
+def test_each_network_has_those_who_need_it_and_leads_nowhere() -> None:
+    networks = yaml.safe_load(COMPOSE.read_text())["networks"]
+    assert [name for name, one in networks.items() if not (one or {}).get("internal")] == ["front"]
+    members = {network: {name for name, one in services().items() if network in one.get("networks", [])} for network in networks}
+    assert members["front"] == {"api"}
+    assert members["parts"] == {"api", "scheduler", "worker", "rig"}
+    assert members["database"] == {"api", "postgres", "worker", "rig"}
+    assert members["dome"] == {"api", "rig", "dome"}
+    assert members["default"] == set()
 
 
-def test_every_service_is_checked_and_starts_again() -> None:
+def test_the_authority_is_nobodys_but_that_of_whoever_makes_certificates() -> None:
+    holders = {name for name, one in services().items() if any(volume.startswith("authority:") for volume in one.get("volumes", []))}
+    assert holders == {"secrets"}
+
+
+def test_every_service_is_checked_closed_and_starts_again() -> None:
     for name, one in services().items():
-        assert {"healthcheck", "restart"} <= one.keys(), name
+        assert one["read_only"], name
+        assert one["cap_drop"] == ["ALL"], name
+        assert one["security_opt"] == ["no-new-privileges:true"], name
+        assert one["logging"]["options"]["max-size"], name
+        if name != "secrets":
+            assert {"healthcheck", "mem_limit"} <= one.keys(), name
+            assert one["restart"] == "unless-stopped", name
+
+
+def test_each_image_is_built_once() -> None:
+    assert {name: one["build"]["target"] for name, one in services().items() if "build" in one} == {"api": "api", "worker": "worker"}
 
 
 class Composition:
@@ -90,6 +111,7 @@ class Composition:
             "scheduler:": "127.0.0.1:",
             "dome:": "127.0.0.1:",
             "/data": str(folder / "data"),
+            "/secrets": str(folder / "secrets"),
             "/tmp/dask": str(folder / "dask"),
         }
         self._names |= {port: mine for port, mine in ports.items() if port != "8000"} | {"8000": ports["8000"]}
@@ -99,12 +121,16 @@ class Composition:
         """Of a service, on top of this machine's own."""
         return os.environ | {"PYTHONPATH": str(ROOT)} | {key: self._here(value) for key, value in services()[name].get("environment", {}).items()}
 
-    def start(self, name: str) -> None:
-        """Start a service by its own command."""
+    def command(self, name: str) -> list[str]:
+        """Of a service, after the program's name."""
         program, *arguments = services()[name]["command"]
         assert program == "dentine"
+        return [self._here(part) for part in arguments]
+
+    def start(self, name: str) -> None:
+        """Start a service by its own command."""
         with (self._folder / f"{name}.log").open("wb") as log:
-            command = [*DENTINE, *map(self._here, arguments)]
+            command = [*DENTINE, *self.command(name)]
             self._processes[name] = subprocess.Popen(command, env=self.environment(name), cwd=self._folder, stdout=log, stderr=log, start_new_session=True)
 
     def close(self) -> None:
@@ -131,7 +157,9 @@ def composition(tmp_path: Path) -> Iterator[Composition]:
         made = Composition(tmp_path, postgres)
         try:
             for name in services():
-                if name != "postgres":
+                if name == "secrets":
+                    dentine(tmp_path, made.environment(name), *made.command(name))
+                elif name != "postgres":
                     made.start(name)
             deadline = time.monotonic() + PATIENCE_S
             while not _is_live(made.address):

@@ -2,28 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import sqlalchemy as sql
 
 from services.api.database import writing
+from services.core.errors import PlatformError
 
 FIRST = "0001"
 """The tables that databases had before they were numbered."""
 
 
 def upgrade(engine: sql.Engine, to: str = "head") -> None:
-    """Take all steps that are missing, up to one, and close what was opened for that. Servers that start together wait for each other."""
+    """Take all steps that are missing, up to one, and close what was opened for that. Servers that start together wait for each other.
+
+    Raises:
+        PlatformError: the database cannot be reached, or refuses the password.
+    """
     from alembic import command
     from alembic.config import Config
 
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent))
     config.set_main_option("path_separator", "os")
-    with writing(engine) as connection:
+    with _telling_refusals(engine), writing(engine) as connection:
         config.attributes["connection"] = connection
         tables = sql.inspect(connection).get_table_names()
         if "job" in tables and "alembic_version" not in tables:
             command.stamp(config, FIRST)
         command.upgrade(config, to)
     engine.dispose()
+
+
+@contextmanager
+def _telling_refusals(engine: sql.Engine) -> Iterator[None]:
+    try:
+        yield
+    except sql.exc.OperationalError as problem:
+        if engine.dialect.name == "sqlite":
+            raise
+        reason = str(problem.orig).strip().splitlines()[-1].rpartition("FATAL:")[2].strip()
+        remedy = "check that it runs, its address, and the password, whose file DENTINE__SERVER__DATABASE_PASSWORD_FILE names"
+        raise PlatformError(f"The database at {engine.url.host} does not let this server in ({reason}); {remedy}.") from problem

@@ -1,0 +1,16 @@
+#!/bin/sh
+# Copies a composed system's database and data into a folder while it runs: deploy/backup.sh FOLDER
+# The database first: a job whose folder is newer than its row goes on, one whose folder were missing would start again.
+# DENTINE_COMPOSE is the compose command, by default `docker compose --file deploy/compose.yaml`.
+set -eu
+folder=${1:?give the folder to write to}
+compose=${DENTINE_COMPOSE:-"docker compose --file $(dirname "$0")/compose.yaml"}
+umask 077
+mkdir -p "$folder"
+[ ! -e "$folder/SHA256SUMS" ] || { echo "backup: $folder holds a backup already; give another folder." >&2; exit 2; }
+$compose exec -T postgres pg_dump --username dentine --format custom dentine >"$folder/database.dump"
+# What is being written has a name that begins with a dot, and goes on or is removed by itself.
+$compose exec -T api tar --create --directory /data --exclude './jobs/*/.*.[0-9]*' --warning no-file-changed --warning no-file-removed --file - . \
+    >"$folder/data.tar" || [ $? -eq 1 ]
+(cd "$folder" && sha256sum database.dump data.tar >SHA256SUMS.partial && mv SHA256SUMS.partial SHA256SUMS)
+echo "backup: database and data are in $folder"

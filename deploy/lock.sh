@@ -1,0 +1,14 @@
+#!/bin/sh
+# Writes what each image installs, with versions and hashes: deploy/images/{build,api,worker}.lock. Needs network; commit what it writes.
+#   deploy/lock.sh             keeps the versions that the files name already, where pyproject.toml still allows them
+#   deploy/lock.sh --upgrade   takes the newest
+set -eu
+cd "$(dirname "$0")/.."
+[ -x .venv/bin/uv ] || .venv/bin/python -m pip install --quiet uv
+lock() {
+    .venv/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url --custom-compile-command deploy/lock.sh "$@"
+}
+upgrade=${1:-}
+lock ${upgrade:+"$upgrade"} --extra api --extra postgres --extra capture --output-file deploy/images/api.lock pyproject.toml
+lock ${upgrade:+"$upgrade"} --extra postgres --extra capture --extra preprocess --extra fit --output-file deploy/images/worker.lock pyproject.toml
+printf 'hatchling>=1.25\nnodejs-wheel>=22\n' | lock ${upgrade:+"$upgrade"} --output-file deploy/images/build.lock -

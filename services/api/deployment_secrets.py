@@ -1,0 +1,121 @@
+"""What the parts of one system know of each other and nobody else does: an authority with its certificate for all parts, and the database's password.
+
+::
+
+    FOLDER/authority/ca.key, ca.crt             signs; only whoever makes certificates needs it
+    FOLDER/tls/ca.crt, tls.crt, tls.key         what API, scheduler and workers show each other, see ``dask_tls``
+    FOLDER/database/password                    read by the database, the API and the workers
+
+Each of the three folders can be a volume of its own, so that every part is given what it needs and no more.
+"""
+
+from __future__ import annotations
+
+import secrets
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from services.core.private_files import write_private
+
+AUTHORITY_LIFE = timedelta(days=3650)
+CERTIFICATE_LIFE = timedelta(days=365)
+RENEW_BEFORE = timedelta(days=60)
+"""A certificate with less life than this is made anew when the system starts: a system that is restarted twice a quarter never meets its end."""
+CLOCK_STEP = timedelta(minutes=5)
+"""How far the clocks of hosts may differ when a certificate is new."""
+PASSWORD_BYTES = 24
+READABLE_BY_ALL = 0o444
+"""Of the password's file: the database runs as another user than the parts that ask it. The folder is what keeps others out."""
+
+
+def make_missing(folder: Path, *, renew: bool = False) -> list[str]:
+    """Make what is absent or will soon have ended; ``renew`` makes the certificate of the parts anew in any case.
+
+    Returns:
+        What was made, in words.
+    """
+    authority, tls, database = (folder / name for name in ("authority", "tls", "database"))
+    for one in (authority, tls, database):
+        one.mkdir(parents=True, exist_ok=True)
+    made = []
+    if not (authority / "ca.key").exists() or _ends_soon(authority / "ca.crt"):
+        _make_authority(authority)
+        made.append("authority")
+    if renew or made or _ends_soon(tls / "tls.crt"):
+        _make_certificate(authority, tls)
+        made.append("certificate")
+    if not (database / "password").exists():
+        write_password(database / "password", secrets.token_urlsafe(PASSWORD_BYTES))
+        made.append("database password")
+    return made
+
+
+def write_password(path: Path, password: str) -> None:
+    """Write the database's password where its readers find it."""
+    write_private(path, f"{password}\n".encode(), READABLE_BY_ALL)
+
+
+def _ends_soon(path: Path) -> bool:
+    if not path.exists():
+        return True
+    return x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc < datetime.now(UTC) + RENEW_BEFORE
+
+
+def _make_authority(folder: Path) -> None:
+    key, name = ec.generate_private_key(ec.SECP256R1()), _name("dentine authority")
+    usage = x509.KeyUsage(
+        digital_signature=False,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=True,
+        crl_sign=True,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    builder = _builder(name, name, key, AUTHORITY_LIFE).add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    builder = builder.add_extension(usage, critical=True).add_extension(identifier, critical=False)
+    _write_key(folder / "ca.key", key)
+    write_private(folder / "ca.crt", _pem(builder.sign(key, hashes.SHA256())), READABLE_BY_ALL)
+
+
+def _make_certificate(authority: Path, folder: Path) -> None:
+    signer = serialization.load_pem_private_key((authority / "ca.key").read_bytes(), None)
+    if not isinstance(signer, ec.EllipticCurvePrivateKey):
+        raise TypeError("The authority's key is of another kind than this program makes.")
+    issuer = x509.load_pem_x509_certificate((authority / "ca.crt").read_bytes())
+    key = ec.generate_private_key(ec.SECP256R1())
+    identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
+    builder = _builder(_name("dentine part"), issuer.subject, key, CERTIFICATE_LIFE)
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(identifier, critical=False)
+    # The key first: whoever reads both in between finds that they do not belong together, and tries again.
+    _write_key(folder / "tls.key", key)
+    write_private(folder / "tls.crt", _pem(builder.sign(signer, hashes.SHA256())), READABLE_BY_ALL)
+    write_private(folder / "ca.crt", _pem(issuer), READABLE_BY_ALL)
+
+
+def _builder(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, life: timedelta) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
+    return builder.serial_number(x509.random_serial_number()).not_valid_before(now - CLOCK_STEP).not_valid_after(now + life)
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    pkcs8, unencrypted = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    write_private(path, key.private_bytes(serialization.Encoding.PEM, pkcs8, unencrypted))

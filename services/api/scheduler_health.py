@@ -1,0 +1,27 @@
+"""``python -m services.api.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a container's health check.
+
+A program of its own, as it is started every few seconds: it loads a tenth of what the ``dentine`` command does.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from services.api.dask_tls import Certificates
+from services.api.workers import require_scheduler
+from services.core.errors import DentineError
+
+
+def main(address: str, tls: str | None = None) -> int:
+    """Exit status 0 where the scheduler at ``address`` greets whoever shows it the certificates in the folder ``tls``."""
+    try:
+        require_scheduler(address, Certificates.of(Path(tls)) if tls else None)
+    except DentineError as problem:
+        print(problem.message, file=sys.stderr)
+        return problem.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:3]))

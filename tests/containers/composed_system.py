@@ -1,0 +1,163 @@
+"""The composed system in real containers, as the tests start, disturb and ask it.
+
+Which engine runs it is the environment's choice: ``DENTINE_COMPOSE`` is the compose command (``docker compose`` by default, or ``podman-compose``),
+``DENTINE_ENGINE`` the engine's (``docker`` by default), and ``DOCKER_HOST`` where it listens.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from tests.support.live_server import connect
+from tests.support.small_system import free_port
+
+ROOT = Path(__file__).parents[2]
+COMPOSE_FILES = (ROOT / "deploy" / "compose.yaml", Path(__file__).parent / "compose.override.yaml")
+USER = 10001
+"""Of the images' processes."""
+PATIENCE_S = 300.0
+JOB = {
+    "boundary": "matched",
+    "dentin": "known",
+    "samples_per_pixel": 16,
+    "max_samples_per_pixel": 16,
+    "max_steps": 1,
+    "search_candidates": 100,
+    "advise": False,
+    "seed": 1,
+}
+"""Options of a fit that takes some ten seconds."""
+
+
+class ComposedSystem:
+    """One project of the compose file.
+
+    Args:
+        project: its name, the prefix of its containers, networks and volumes.
+        data: folder on the host that is the data volume.
+    """
+
+    def __init__(self, project: str, data: Path, **environment: str) -> None:
+        self.project, self.data, self.port = project, data, free_port()
+        self._engine = shlex.split(os.environ.get("DENTINE_ENGINE", "docker"))
+        self._compose = shlex.split(os.environ.get("DENTINE_COMPOSE", "docker compose"))
+        self.environment = os.environ | {"DENTINE_TEST_DATA": str(data), "DENTINE_PORT": str(self.port)} | environment
+        self.address = f"http://127.0.0.1:{self.port}"
+
+    def compose(self, *arguments: str, check: bool = True) -> str:
+        """Run a compose command and return what it prints."""
+        files = [part for file in COMPOSE_FILES for part in ("--file", str(file))]
+        return self._run([*self._compose, "--project-name", self.project, *files, *arguments], check=check)
+
+    def engine(self, *arguments: str, check: bool = True) -> str:
+        """Run a command of the engine and return what it prints."""
+        return self._run([*self._engine, *arguments], check=check)
+
+    def inside(self, service: str, *command: str, check: bool = True) -> str:
+        """Run a command in a service's container."""
+        return self.engine("exec", self.container(service), *command, check=check)
+
+    def container(self, service: str) -> str:
+        """Name of the first container of a service."""
+        return f"{self.project}-{service}-1"
+
+    def network(self, name: str) -> str:
+        """The engine's name of one of the file's networks."""
+        return f"{self.project}_{name}"
+
+    def inspect(self, what: str) -> dict[str, Any]:
+        """All that the engine knows of a container or an image."""
+        return dict(json.loads(self.engine("inspect", what))[0])
+
+    def address_of(self, service: str, network: str) -> str:
+        """Where a container is reached on a network."""
+        return str(self.inspect(self.container(service))["NetworkSettings"]["Networks"][self.network(network)]["IPAddress"])
+
+    def client(self, token: str | None = None) -> httpx.Client:
+        """A client of the API."""
+        client = connect(self.address)
+        if token is not None:
+            client.headers["Authorization"] = f"Bearer {token}"
+        return client
+
+    def up(self, *arguments: str) -> float:
+        """Start everything and wait until a job would run; returns how long that took, s."""
+        start = time.monotonic()
+        self.compose("up", "--detach", *arguments)
+        self.wait_until(self.is_live, "the API does not answer")
+        token = self.token("readiness", "read")
+        self.wait_until(lambda: self.is_ready(token), "the system does not become ready")
+        return time.monotonic() - start
+
+    def down(self, *arguments: str) -> None:
+        """Stop and remove the containers; volumes stay unless ``--volumes`` is given."""
+        self.compose("down", *arguments)
+
+    def token(self, name: str, *scopes: str) -> str:
+        """A new token."""
+        chosen = [part for scope in scopes for part in ("--scope", scope)]
+        return self.inside("api", "dentine", "token", "create", name, *chosen).strip().splitlines()[-1]
+
+    def is_live(self) -> bool:
+        """Whether the API answers at all."""
+        try:
+            with self.client() as client:
+                return client.get("/v1/health/live").status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def is_ready(self, token: str) -> bool:
+        """Whether a job would run."""
+        try:
+            with self.client(token) as client:
+                return client.get("/v1/health/ready").status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def wait_until(self, condition: Callable[[], bool], complaint: str, seconds: float = PATIENCE_S) -> None:
+        """Wait for a condition.
+
+        Raises:
+            AssertionError: it does not hold in time; with the last lines of all logs.
+        """
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{complaint}\n{self.compose('logs', '--tail', '15', check=False)}")
+            time.sleep(0.2)
+
+    def run_dentine(self, token: str, *arguments: str, cwd: Path) -> str:
+        """A command of the client on this host."""
+        environment = self.environment | {"DENTINE__CLIENT__TOKEN": token}
+        command = [str(ROOT / ".venv/bin/dentine"), *arguments]
+        done = subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def _run(self, command: list[str], *, check: bool) -> str:
+        done = subprocess.run(command, env=self.environment, capture_output=True, text=True, check=False)
+        assert not check or done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+        return done.stdout + done.stderr
+
+
+def follow(client: httpx.Client, job: str, seconds: float = PATIENCE_S) -> dict[str, Any]:
+    """Wait for a job's end; the API may be away meanwhile."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            detail = client.get(f"/v1/jobs/{job}").json()
+            if detail.get("state") in {"SUCCEEDED", "FAILED", "CANCELLED"}:
+                return dict(detail)
+        except (httpx.TransportError, json.JSONDecodeError):
+            pass
+        assert time.monotonic() < deadline, f"job {job} has not ended"
+        time.sleep(0.3)

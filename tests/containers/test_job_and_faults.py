@@ -1,0 +1,137 @@
+"""A job in real containers ends with the answer of an undisturbed one, whatever is taken away from under it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.containers.composed_system import JOB, ComposedSystem, follow
+from tests.support.store_disk import StoreDisk
+
+CUT_S, FULL_S = 60.0, 10.0
+STAGES = {"prepare": "prepared", "fit": "fit", "export": "asset"}
+
+
+@pytest.fixture(scope="module")
+def capture(system: ComposedSystem, token: str, mouth: Path) -> str:
+    """The uploaded capture."""
+    return system.run_dentine(token, "upload", str(mouth), "--server", system.address, cwd=mouth).strip()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(system: ComposedSystem, token: str, capture: str) -> dict[str, Any]:
+    """Result of the job that nothing happens to."""
+    job = submit(system, token, capture)
+    return result_of(system, token, job)
+
+
+def submit(system: ComposedSystem, token: str, capture: str) -> str:
+    with system.client(token) as client:
+        answer = client.post("/v1/jobs", json=JOB | {"capture": capture, "workers": 1})
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["id"])
+
+
+def result_of(system: ComposedSystem, token: str, job: str) -> dict[str, Any]:
+    """What a job found, without the time that it took; asserts that it succeeded and that one attempt published each stage."""
+    with system.client(token) as client:
+        detail = follow(client, job)
+        assert detail["state"] == "SUCCEEDED", detail["failure"]
+        found = client.get(f"/v1/jobs/{job}/artifacts/parameters.json").json()
+        events = [json.loads(line[6:]) for line in client.get(f"/v1/jobs/{job}/events").text.splitlines() if line.startswith('data: {"id"')]
+    for stage, folder in STAGES.items():
+        finished = [event["attempt"] for event in events if event["stage"] == stage and event["kind"] == "finished"]
+        published = json.loads((system.data / "jobs" / job / folder / "manifest.json").read_text())["attempt"]
+        assert finished == [published], (stage, finished, published)
+    return {name: value for name, value in found.items() if name != "seconds"}
+
+
+def test_the_asset_of_a_job_renders(system: ComposedSystem, token: str, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+    assert undisturbed["parameters"]
+    with system.client(token) as client:
+        job = next(one["id"] for one in client.get("/v1/jobs").json()["jobs"] if one["state"] == "SUCCEEDED")
+        packed = client.get(f"/v1/jobs/{job}/artifacts.zip")
+    (tmp_path / "results.zip").write_bytes(packed.content)
+    subprocess.run(["python3", "-m", "zipfile", "-e", "results.zip", "."], cwd=tmp_path, check=True)
+    script = next(tmp_path.rglob("render.py"))
+    subprocess.run([str(Path.cwd() / ".venv/bin/python"), str(script), "--help"], cwd=script.parent, check=True)
+
+
+def kill(service: str) -> Callable[[ComposedSystem, StoreDisk], None]:
+    """Kill -9 the container's first process; its restart policy starts it again."""
+
+    def strike(system: ComposedSystem, _disk: StoreDisk) -> None:
+        os.kill(system.inspect(system.container(service))["State"]["Pid"], signal.SIGKILL)
+
+    return strike
+
+
+def cut_worker(system: ComposedSystem, _disk: StoreDisk) -> None:
+    with without_network(system, "worker"):
+        time.sleep(CUT_S)
+
+
+@contextmanager
+def without_network(system: ComposedSystem, service: str) -> Iterator[None]:
+    """Every packet to and from a container is lost, but its addresses stay."""
+    inside = ["nsenter", "--net", "--target", str(system.inspect(system.container(service))["State"]["Pid"]), "iptables"]
+    rules = (["INPUT", "!", "-i", "lo", "-j", "DROP"], ["OUTPUT", "!", "-o", "lo", "-j", "DROP"])
+    for rule in rules:
+        subprocess.run([*inside, "-I", *rule], check=True)
+    try:
+        yield
+    finally:
+        for rule in rules:
+            subprocess.run([*inside, "-D", *rule], check=True)
+
+
+def fill_disk(_system: ComposedSystem, disk: StoreDisk) -> None:
+    with disk.full():
+        time.sleep(FULL_S)
+
+
+def down_and_up(system: ComposedSystem, _disk: StoreDisk) -> None:
+    system.down("--timeout", "30")
+    system.up()
+
+
+FAULTS: dict[str, Callable[[ComposedSystem, StoreDisk], None]] = {
+    "API restarted": lambda system, _: system.compose("restart", "api") and None,
+    "worker killed": kill("worker"),
+    "worker cut off": cut_worker,
+    "scheduler killed": kill("scheduler"),
+    "database killed": kill("postgres"),
+    "disk full and freed": fill_disk,
+    "down and up": down_and_up,
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_disturbed_job_gives_the_undisturbed_answer(
+    system: ComposedSystem, disk: StoreDisk, token: str, capture: str, undisturbed: dict[str, Any], figures: dict[str, Any], name: str
+) -> None:
+    job = submit(system, token, capture)
+    system.wait_until(lambda: is_fitting(system, token, job), "the fit does not begin")
+    start = time.monotonic()
+    FAULTS[name](system, disk)
+    found = result_of(system, token, job)
+    figures.setdefault("seconds_from_fault_to_end", {})[name] = round(time.monotonic() - start, 1)
+    assert found == undisturbed
+
+
+def is_fitting(system: ComposedSystem, token: str, job: str) -> bool:
+    try:
+        with system.client(token) as client:
+            return any(one["stage"] == "fit" and one["state"] == "running" for one in client.get(f"/v1/jobs/{job}").json()["stages"])
+    except (httpx.TransportError, KeyError):
+        return False
