@@ -92,8 +92,11 @@ def parse_database_url(url: str) -> sql.URL:
 
 def with_password_file(url: str, path: Path) -> str:
     """The URL of a database whose password stands in a file."""
-    parsed = parse_database_url(url).set(password=None).update_query_dict({PASSWORD_FILE: str(path)})
-    return parsed.render_as_string(hide_password=False)
+    parsed = parse_database_url(url)
+    query = dict(parsed.query) | {PASSWORD_FILE: str(path)}
+    # Made anew, as `URL.set` takes no for "leave it as it is".
+    without = sql.URL.create(parsed.drivername, parsed.username, None, parsed.host, parsed.port, parsed.database, query)
+    return without.render_as_string(hide_password=False)
 
 
 def read_password(path: Path) -> str:

@@ -40,7 +40,9 @@ pytestmark = pytest.mark.timeout(1800)
 
 def services() -> dict[str, dict[str, Any]]:
     """The services that start without a profile, with the defaults of their variables."""
-    text = re.sub(r"\$\{\w+:-([^${}]*)\}", r"\1", COMPOSE.read_text())
+    text = COMPOSE.read_text()
+    for _ in range(2):  # a default may name another variable
+        text = re.sub(r"\$\{\w+:-([^${}]*)\}", r"\1", text)
     return {name: one for name, one in yaml.safe_load(text)["services"].items() if "profiles" not in one}
 
 
@@ -54,7 +56,7 @@ def test_no_password_stands_in_a_variable() -> None:
     for name, one in services().items():
         for variable, value in one.get("environment", {}).items():
             assert "PASSWORD" not in variable or variable.endswith("_FILE"), (name, variable)
-            assert not re.search(r"://[^/]*:[^/]*@", value), (name, variable)
+            assert not re.search(r"://[^/]*:[^/]*@", str(value)), (name, variable)
 
 
 def test_only_the_api_is_published_and_only_on_loopback() -> None:
