@@ -80,5 +80,5 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
 
     certificates = Certificates.of(folder) if folder is not None else None
     secured = [scheduler_address(argument, certificates) for argument in arguments]
-    command = [sys.executable, "-m", "dask", part, *secured, *(certificates.arguments() if certificates else ())]
+    command = [sys.executable, "-m", "dask", part, *secured, "--preload", "services.api.close_http", *(certificates.arguments() if certificates else ())]
     os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

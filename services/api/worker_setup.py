@@ -25,11 +25,7 @@ async def dask_setup(worker: Any) -> None:
 
 
 class WorkerSetup(WorkerPlugin):
-    """Prepares one worker.
-
-    What a worker has to know and no task may carry, such as the database's address with its password, is given to this class
-    and kept by its process.
-    """
+    """Prepares one worker."""
 
     name = "dentine-setup"
 

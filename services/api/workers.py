@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 SIGINT_IS_THE_PARENTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+CLOSE_HTTP = "services.api.close_http"
 CONNECT_S = 10.0
 PROBE_S = 1.0
 LOOK_S = 3.0
@@ -200,19 +201,27 @@ class Workers:
 
     def _open(self) -> Client:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, Security
 
         _leave_dask_alone()
         # For good, and in this process too, as connections that are made later read it.
-        dask.config.set({**DASK_CONFIG, "distributed.worker.preload": [SIGINT_IS_THE_PARENTS]})
+        preloads = {"distributed.worker.preload": [SIGINT_IS_THE_PARENTS, CLOSE_HTTP], "distributed.scheduler.preload": [CLOSE_HTTP]}
+        dask.config.set({**DASK_CONFIG, **preloads})
         if self._scheduler is not None:
             try:
                 security = self._certificates.security() if self._certificates else None
                 return Client(self._scheduler, timeout=CONNECT_S, security=security)
             except OSError as problem:
                 raise SchedulerLostError(f"The scheduler {self._scheduler} does not answer; start it, the job waits.") from problem
+        # Loopback is open to every user of the machine, so workers there show certificates too: made now, kept in memory.
         self._cluster = LocalCluster(
-            n_workers=0, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", resources={STAGES: UNLIMITED}, silence_logs=50
+            n_workers=0,
+            threads_per_worker=1,
+            processes=True,
+            security=Security.temporary(),
+            dashboard_address="127.0.0.1:0",
+            resources={STAGES: UNLIMITED},
+            silence_logs=50,
         )
         return Client(self._cluster)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,8 @@ from tests.containers.composed_system import ComposedSystem
 NETWORKS = ("front", "parts", "database", "dome")
 STRANGER = Path(__file__).with_name("stranger.py")
 NOBODY = 65534
+PYTHON = shutil.which("python3", path=os.defpath) or sys.executable
+"""The system's, as another user may not enter the folder of this one."""
 POSTGRES, SCHEDULER, API, DOME = 5432, 8786, 8000, 5020
 _LISTENING = "0A"
 
@@ -55,7 +59,7 @@ def test_a_container_on_a_network_is_let_into_nothing(system: ComposedSystem, ne
 
 def test_another_user_of_the_host_is_let_into_nothing(system: ComposedSystem) -> None:
     aims = targets(system)
-    command = [sys.executable, "-c", STRANGER.read_text(), json.dumps(list(aims))]
+    command = [PYTHON, "-c", STRANGER.read_text(), json.dumps(list(aims))]
     told = subprocess.run(command, user=NOBODY, group=NOBODY, extra_groups=[], capture_output=True, text=True, check=True, cwd="/")
     reached = check(aims, json.loads(told.stdout))
     assert reached <= {"api", "scheduler", "worker", "rig", "postgres", "dome"}
