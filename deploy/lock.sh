@@ -10,5 +10,5 @@ lock() {
 }
 upgrade=${1:-}
 lock ${upgrade:+"$upgrade"} --extra api --extra postgres --extra capture --output-file deploy/images/api.lock pyproject.toml
-lock ${upgrade:+"$upgrade"} --extra postgres --extra capture --extra preprocess --extra fit --output-file deploy/images/worker.lock pyproject.toml
+lock ${upgrade:+"$upgrade"} --extra postgres --extra capture --extra worker --output-file deploy/images/worker.lock pyproject.toml
 printf 'hatchling>=1.25\nnodejs-wheel>=22\n' | lock ${upgrade:+"$upgrade"} --output-file deploy/images/build.lock -
