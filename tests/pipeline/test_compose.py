@@ -121,7 +121,7 @@ class Composition:
 
     def environment(self, name: str) -> dict[str, str]:
         """Of a service, on top of this machine's own."""
-        return os.environ | {"PYTHONPATH": str(ROOT)} | {key: self._here(value) for key, value in services()[name].get("environment", {}).items()}
+        return os.environ | {"PYTHONPATH": str(ROOT)} | {key: self._here(value or "") for key, value in services()[name].get("environment", {}).items()}
 
     def command(self, name: str) -> list[str]:
         """Of a service, after the program's name."""
@@ -149,7 +149,7 @@ class Composition:
 
     def _here(self, text: str) -> str:
         for theirs, ours in self._names.items():
-            text = text.replace(theirs, ours)
+            text = re.sub(rf"(?<!\w){re.escape(theirs)}\b", ours, text) if theirs.startswith("/") else text.replace(theirs, ours)
         return text
 
 
