@@ -23,7 +23,7 @@ apt_install() {
     for package in "$@"; do
         [ -n "$(apt-cache search --names-only "^$package\$")" ] || continue
         say "installing $package with apt"
-        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$package" </dev/null >&2
+        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$package" </dev/null >/dev/null
         return
     done
     return 1
@@ -35,7 +35,7 @@ prepare_packages() {
     command -v python3 >/dev/null || apt_install python3 || die "Python 3.11 or later is needed; install python3."
     python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || die "$(python3 --version) is too old; install Python 3.11 or later as python3."
     if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
-        python3 -m venv --clear .venv 2>/dev/null || { apt_install python3-venv && python3 -m venv --clear .venv; } ||
+        python3 -m venv --clear .venv >/dev/null 2>&1 || { apt_install python3-venv && python3 -m venv --clear .venv; } ||
             die "python3 -m venv does not work here; install python3-venv."
     fi
     say "installing packages into .venv"
