@@ -6,7 +6,7 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from distributed import WorkerPlugin
 
 from services.fit.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
-from services.fit.shares import Share
+from services.fit.shares import Board, Share
 
 Task = Callable[..., Any]
 TASKS_AHEAD = 2
@@ -69,6 +69,8 @@ class DaskExecutor:
 
         self._client, self._factory, self._prefix, self._submitted = client, factory, prefix, itertools.count()
         self._flag, self._needs, self._share = flag, dict(needs or {}), share or Share()
+        self._board = Board(client, prefix, self._share)
+        self._board.join()
         self._waiting: deque[_Planned] = deque()
         self._flying: dict[Any, _Planned] = {}
         self._ended = as_completed(loop=client.loop)
@@ -88,6 +90,7 @@ class DaskExecutor:
         while missing:
             while self._waiting and len(self._flying) < most:
                 self._send(self._waiting.popleft())
+            self._board.tell()
             for future in self._ended.next_batch():
                 planned = self._flying.pop(future)
                 if future.status != "finished":
@@ -97,6 +100,10 @@ class DaskExecutor:
                     planned.timed = future.result()
                     self._share.end(planned.timed.seconds, planned.timed.tasks)
         return [planned.timed.value for planned in pending]
+
+    def close(self) -> None:
+        """This fit needs the workers no more."""
+        self._board.leave()
 
     def _send(self, planned: _Planned) -> None:
         # What an earlier task returns goes from worker to worker.
@@ -210,5 +217,6 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: flo
         return
     from distributed import worker_client
 
-    with worker_client() as client:
-        yield DaskExecutor(client, factory, f"{surroundings.key}-{prefix}", flag, surroundings.needs, Share(weight))
+    name, share = f"{surroundings.key}-{prefix}", Share(weight)
+    with worker_client() as client, closing(DaskExecutor(client, factory, name, flag, surroundings.needs, share)) as run_on:
+        yield run_on

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
-from services.fit.shares import FADING_S, Share
+from services.fit.shares import BOARD, FADING_S, TELL_S, Board, Share
 
 WORKERS, AHEAD, BLOCKS, PAUSE_S = 2, 4, 12, 0.5
 
@@ -81,3 +82,41 @@ def test_use_fades_and_what_is_under_way_counts() -> None:
     assert share.begin() == pytest.approx(-20.0)
     now_s = FADING_S
     assert share.begin() == pytest.approx(-20.0 / 2.718281828 - 20.0 / 3)
+
+
+class Metadata:
+    """What a scheduler keeps for its clients."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, dict[str, Any]] = {}
+
+    def get_metadata(self, keys: list[str], default: Any) -> Any:
+        return self.kept.get(keys[0], default)
+
+    def set_metadata(self, keys: list[str], value: Any) -> None:
+        self.kept.setdefault(keys[0], {})[keys[1]] = value
+
+
+def test_a_newcomer_begins_at_the_lowest_level_of_those_under_way() -> None:
+    now_s, scheduler = 1000.0, Metadata()
+
+    def joined(name: str, used_s: float = 0.0, weight: float = 1.0) -> tuple[Board, Share]:
+        share = Share(weight, lambda: now_s)
+        board = Board(scheduler, name, share, lambda: now_s)
+        board.join()
+        share.begin_at(used_s or share.level)
+        return board, share
+
+    first, _ = joined("first", used_s=60.0)
+    now_s += TELL_S
+    first.tell()
+    _, heavy = joined("heavy", weight=4.0)
+    assert heavy.level == pytest.approx(60.0 * 2.718281828 ** (-TELL_S / FADING_S))
+    now_s += TELL_S
+    _, third = joined("third")
+    assert third.level == pytest.approx(heavy.level)
+    first.leave()
+    assert scheduler.kept[BOARD]["first"] is None
+    now_s += FADING_S
+    _, late = joined("late")
+    assert late.level == 0.0, "who has told nothing for so long is not under way"
