@@ -21,6 +21,8 @@ from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import MAX_ON_TIME_S, RigSpec
 
+MAX_BLACK_FRAMES = 1000
+"""Their mean then has 3 % of one frame's noise."""
 GLIMPSE_S = 0.005
 """How long a preflight lights each light to see that it emits."""
 
@@ -46,6 +48,8 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
         SettingsError: the level is below one register step, or an exposure is longer than a light may be on. ExposureLimitError: the plan passes a
             dose limit.
     """
+    if rig.black_frames > MAX_BLACK_FRAMES:
+        raise SettingsError(f"rig.black_frames {rig.black_frames} are more than {MAX_BLACK_FRAMES}, which average all noise away; lower it.")
     frames = tuple(_frame(rig, lights, index, light) for index, light in enumerate(_order(rig, lights)))
     require_exposure(frames, lights, rig)
     if (on_s := rig.settle_s + rig.exposure_s) > MAX_ON_TIME_S:

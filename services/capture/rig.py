@@ -16,9 +16,12 @@ from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, 
 from services.capture.simulated_cameras import PlaybackCameras, SimulatedCameras
 from services.capture.stills import Stills
 from services.core.calibration import require_consistent
-from services.core.errors import CaptureInputError, RigError
-from services.core.records import FolderCapture, RigSpec
+from services.core.errors import CaptureInputError, RigError, SettingsError
+from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec
 from services.core.store import read_record
+
+MAX_MOTION_PX = 1000.0
+"""Far beyond what the preparation undoes."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class PlannedRig:
             CaptureInputError: the mouth folder. SettingsError, ExposureLimitError: the plan cannot be.
         """
         description = _read_description(spec.mouth / "capture.json")
+        _require_sensor(spec.simulation)
         lights = len(description.lights)
         plan = plan_capture(spec, lights)
         # The preflight takes its part of the dose: without it the plan would end at the limit before its last frames.
@@ -76,6 +80,22 @@ class PlannedRig:
             return PlaybackCameras(self.stills, spec, level, plan, wait)
         motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
         return SimulatedCameras(self.stills, spec, level, motion, host, port, wait)
+
+
+def _require_sensor(sensor: SimulatedCameraSpec) -> None:
+    """Refuse a simulated sensor that no camera has.
+
+    Raises:
+        SettingsError: names the option.
+    """
+    full_scale = 2**sensor.bits - 1
+    if not 0 <= sensor.black_level < full_scale / 2:
+        what = f"rig.simulation.black_level {sensor.black_level} does not lie between 0 and half of the {full_scale} counts of {sensor.bits} bits"
+        raise SettingsError(f"{what}; lower it.")
+    if not 0 <= sensor.seed < 2**63:
+        raise SettingsError(f"rig.simulation.seed {sensor.seed} is no seed; give a whole number from 0 to 2**63 - 1.")
+    if sensor.motion_px > MAX_MOTION_PX:
+        raise SettingsError(f"rig.simulation.motion_px {sensor.motion_px:g} is more than {MAX_MOTION_PX:g} pixels, which no subject moves; lower it.")
 
 
 def _read_description(path: Path) -> FolderCapture:

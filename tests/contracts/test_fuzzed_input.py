@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from services.capture.rig import PlannedRig
@@ -200,7 +201,8 @@ def plan(path: Path) -> None:
     with only_sentences():
         spec = read_job(path)
         if spec.rig is not None:
-            PlannedRig.read(spec.rig)
+            rig = PlannedRig.read(spec.rig)
+            rig._cameras("127.0.0.1", 1, time.sleep)  # which connect when they are opened
 
 
 @EXAMPLES
@@ -212,6 +214,12 @@ def test_every_option_of_a_job(capture: Path, tmp_path: Path, option: str, value
 
 
 @EXAMPLES
+@example(rig={"black_frames": 10**9}, simulation={})
+@example(rig={"exposure_s": 1e300}, simulation={})
+@example(rig={"level": 0}, simulation={})
+@example(rig={}, simulation={"seed": -1})
+@example(rig={}, simulation={"black_level": 4095})
+@example(rig={}, simulation={"motion_px": 1e308})
 @given(
     rig=st.dictionaries(st.sampled_from(RIG_OPTIONS), st.one_of(NUMBERS, VALUES), max_size=2),
     simulation=st.dictionaries(st.sampled_from(CAMERA_OPTIONS), st.one_of(NUMBERS, VALUES), max_size=2),
