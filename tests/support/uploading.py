@@ -90,3 +90,12 @@ def checksum(content: bytes, algorithm: str = "sha256") -> str:
 def send(client: httpx.Client, capture: str, path: str, content: bytes) -> httpx.Response:
     """Create an upload and send the whole file."""
     return patch(client, create_upload(client, capture, path, content), 0, content)
+
+
+def upload_capture(client: httpx.Client, contents: dict[str, bytes]) -> str:
+    """Send and commit a whole capture; returns its id."""
+    capture = str(announce(client, contents)["id"])
+    for path, content in contents.items():
+        assert send(client, capture, path, content).status_code == 204
+    assert client.post(f"/v1/captures/{capture}/commit").status_code == 200
+    return capture

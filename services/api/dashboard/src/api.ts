@@ -1,5 +1,7 @@
 /** The public REST API, as far as this page uses it. */
 
+import type { OptionSchema } from "./optionField";
+
 const REOPEN_MS = 3000;
 
 export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
@@ -38,6 +40,28 @@ export interface JobDetail extends Job {
   waits_for: string | null;
   /** Null unless the job waits or runs. */
   remaining: TimeRange | null;
+}
+
+/** Options by name, with a default, limits and help each. */
+export interface OptionsSchema {
+  properties: Record<string, OptionSchema>;
+  $defs: Record<string, { properties?: Record<string, OptionSchema & { $ref?: string }> }>;
+}
+
+/** Options that are set together. */
+export interface Preset {
+  name: string;
+  summary: string;
+  options: Record<string, unknown>;
+}
+
+/** An uploaded capture. */
+export interface Capture {
+  id: string;
+  state: "open" | "committed" | "expired";
+  subject: string | null;
+  created_s: number;
+  bytes: number;
 }
 
 /** The receipt of a deleted job. */
@@ -178,6 +202,11 @@ export const signOut = (): Promise<void> => ask("/session", "DELETE");
 export const listJobs = (limit: number, before?: number): Promise<JobPage> => ask(`/jobs?limit=${limit}${before === undefined ? "" : `&before=${before}`}`);
 export const listWorkers = (): Promise<Workers> => ask("/workers");
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
+export const getOptions = (): Promise<OptionsSchema> => ask("/options");
+export const listPresets = (): Promise<Preset[]> => ask("/presets");
+export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name}`);
+export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
+export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
 export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");

@@ -5,9 +5,18 @@ import { DomeView } from "./domeView";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
 import { JobView } from "./jobView";
+import { NEW, NewJobView, RIG } from "./newJobView";
+import { RigView } from "./rigView";
 import { SetupView } from "./setupView";
 import { SignIn } from "./signIn";
+import { SubmitView } from "./submitView";
 import { WorkerList } from "./workerList";
+
+interface View {
+  readonly root: HTMLElement;
+  start: () => void | Promise<void>;
+  stop: () => void;
+}
 
 const REFRESH_MS = 3000;
 const DOME = "#/dome";
@@ -22,7 +31,10 @@ const domeLink = find<HTMLAnchorElement>("dome");
 const list = new JobList(jobs);
 const workers = find("workers");
 const workerList = new WorkerList(workers);
-let view: JobView | DomeView | null = null;
+/** Kept, as an upload goes on in it while another view is shown. */
+const newJob = new NewJobView();
+const newLink = find<HTMLAnchorElement>("new");
+let view: View | null = null;
 let listTrouble = "";
 let viewTrouble = "";
 let isSignedOut = false;
@@ -48,7 +60,7 @@ async function refreshList(): Promise<void> {
     const newest = await list.refresh();
     listTrouble = "";
     if (isAccountDue) void showAccount();
-    if (isViewDue && newest && !isOfPage(location.hash)) history.replaceState(null, "", `#/${newest}`);
+    if (isViewDue && !isOfPage(location.hash)) history.replaceState(null, "", newest ? `#/${newest}` : NEW);
     if (isViewDue) void open();
   } catch (problem) {
     if (problem instanceof Unauthenticated) askForToken();
@@ -61,17 +73,16 @@ async function open(): Promise<void> {
   if (!isOfPage(location.hash) || isSignedOut) return;
   leave();
   const id = location.hash.match(/^#\/(\w+)$/)?.[1] ?? "";
-  const isDome = location.hash === DOME;
   list.select(id);
-  if (isDome) domeLink.setAttribute("aria-current", "page");
-  else domeLink.removeAttribute("aria-current");
+  mark(domeLink, location.hash === DOME);
+  mark(newLink, location.hash === NEW);
   if (!isViewDue) main.replaceChildren();
   isViewDue = false;
-  if (!id) {
+  const opened = viewOf(location.hash, id);
+  if (!opened) {
     showProblem(`No job has the address ${location.hash}; choose one from the list.`);
     return;
   }
-  const opened = isDome ? new DomeView(showViewConnection) : new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection);
   view = opened;
   try {
     await opened.start();
@@ -83,6 +94,21 @@ async function open(): Promise<void> {
     isViewDue = mayPass(problem);
     showProblem(isViewDue ? `${sentenceOf(problem)} Trying again.` : sentenceOf(problem));
   }
+}
+
+/** What an address names; null if nothing. */
+function viewOf(hash: string, id: string): View | null {
+  if (hash === DOME) return new DomeView(showViewConnection);
+  if (hash === NEW) return newJob;
+  if (hash === RIG) return new RigView();
+  const source = hash.match(/^#\/submit(?:\/(\w+))?$/);
+  if (source) return new SubmitView(source[1] ?? "");
+  return id ? new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection) : null;
+}
+
+function mark(link: HTMLAnchorElement, isHere: boolean): void {
+  if (isHere) link.setAttribute("aria-current", "page");
+  else link.removeAttribute("aria-current");
 }
 
 /** Where a job was deleted: the newest one that is left. */
@@ -119,6 +145,7 @@ function askForToken(): void {
 function hideAll(): void {
   jobs.hidden = true;
   domeLink.hidden = true;
+  newLink.hidden = true;
   workers.hidden = true;
   account.replaceChildren();
 }
@@ -133,7 +160,9 @@ async function showAccount(): Promise<void> {
     isAccountDue = mayPass(problem);
     return;
   }
-  domeLink.hidden = !session.is_open && !["admin", "operate-dome"].some((scope) => session.scopes.includes(scope));
+  const may = (scope: string) => session.is_open || session.scopes.includes("admin") || session.scopes.includes(scope);
+  domeLink.hidden = !may("operate-dome");
+  newLink.hidden = !may("submit");
   if (session.is_open) return;
   const button = element("button", { type: "button" }, "Sign out");
   button.addEventListener("click", () => void signOut().finally(() => location.reload()));
@@ -153,6 +182,7 @@ async function start(): Promise<void> {
   isAccountDue = true;
   jobs.hidden = false;
   workers.hidden = false;
+  newLink.hidden = false;
   main.replaceChildren();
   await refreshList();
   if (isSignedOut) return;

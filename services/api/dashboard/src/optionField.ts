@@ -1,0 +1,128 @@
+/** One option of a job as a form field, built from its JSON schema: label, input, help with unit, and what is wrong with it. */
+
+import { element } from "./element";
+
+export interface OptionSchema {
+  type?: string;
+  anyOf?: OptionSchema[];
+  enum?: (string | number)[];
+  items?: { type: string };
+  const?: string;
+  format?: string;
+  default?: unknown;
+  description?: string;
+  minimum?: number;
+  maximum?: number;
+  exclusiveMinimum?: number;
+}
+
+/** Units are the ends of names. */
+const UNITS: Record<string, string> = { _s: "s", _px: "px", _mm: "mm", _deg: "°" };
+
+type Input = HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement;
+
+export class OptionField {
+  readonly root: HTMLElement;
+  private readonly input: Input;
+  private readonly refusal: HTMLElement;
+  private readonly schema: OptionSchema;
+
+  constructor(
+    readonly name: string,
+    schema: OptionSchema,
+    isRequired = false,
+  ) {
+    this.schema = { ...schema, ...(schema.anyOf?.find((one) => one.type !== "null") ?? {}) };
+    const id = `option-${name.replace(".", "-")}`;
+    this.input = build(this.schema, id);
+    if (isRequired) this.input.required = true;
+    const unit = Object.entries(UNITS).find(([end]) => name.endsWith(end))?.[1];
+    const label = element("label", { for: id }, words(name), unit ? element("span", { class: "soft" }, `, ${unit}`) : null);
+    const help = element("p", { id: `${id}-help`, class: "soft help" }, this.help());
+    this.refusal = element("p", { id: `${id}-wrong`, class: "bad", role: "alert" });
+    this.input.setAttribute("aria-describedby", `${help.id} ${this.refusal.id}`);
+    this.root = element("div", { class: this.schema.type === "boolean" ? "option check" : "option" }, label, this.input, help, this.refusal);
+    this.input.addEventListener("input", () => this.accuse(""));
+    this.reset();
+  }
+
+  reset(): void {
+    this.set(this.schema.default);
+  }
+
+  set(value: unknown): void {
+    if (this.input instanceof HTMLInputElement && this.input.type === "checkbox") this.input.checked = value === true;
+    else if (Array.isArray(value)) this.input.value = value.join(", ");
+    else if (value && typeof value === "object") this.input.value = Object.entries(value).map(([key, one]) => `${key} = ${one}`).join("\n");
+    else this.input.value = value === undefined || value === null ? "" : String(value);
+  }
+
+  /** What the job is to be given; undefined where it is the default. */
+  value(): unknown {
+    const value = this.read();
+    return JSON.stringify(value) === JSON.stringify(this.schema.default ?? null) ? undefined : value;
+  }
+
+  /** Whether the browser finds it good; what it finds wrong stands beside the field. */
+  check(): boolean {
+    const good = this.input.checkValidity();
+    this.accuse(good ? "" : this.input.validationMessage);
+    return good;
+  }
+
+  /** Say what is wrong with it, nothing by an empty text. */
+  accuse(sentence: string): void {
+    this.refusal.textContent = sentence;
+    this.input.setAttribute("aria-invalid", sentence ? "true" : "false");
+  }
+
+  focus(): void {
+    this.input.closest("details")?.setAttribute("open", "");
+    this.input.focus();
+  }
+
+  private read(): unknown {
+    if (this.input instanceof HTMLInputElement && this.input.type === "checkbox") return this.input.checked;
+    const text = this.input.value.trim();
+    if (this.schema.type === "object") return table(text);
+    if (!text) return null;
+    if (this.schema.type === "array") return text.split(",").map((part) => part.trim()).filter((part) => part);
+    if (this.schema.enum?.some((one) => typeof one === "number")) return Number(text);
+    return this.schema.type === "number" || this.schema.type === "integer" ? Number(text) : text;
+  }
+
+  private help(): string {
+    const { minimum, maximum, exclusiveMinimum, type } = this.schema;
+    const limits = minimum !== undefined && maximum !== undefined ? `${minimum} to ${maximum}` : minimum !== undefined ? `${minimum} or more` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
+    const form = type === "array" ? "names, separated by commas" : type === "object" ? "one a line" : "";
+    const told = this.schema.description ?? "";
+    const parts = [told && told[0]?.toUpperCase() + told.slice(1), limits, form].filter((part) => part);
+    return parts.length ? `${parts.join("; ")}.` : "";
+  }
+}
+
+function build(schema: OptionSchema, id: string): Input {
+  if (schema.enum) return element("select", { id }, ...schema.enum.map((one) => element("option", { value: `${one}` }, `${one}`)));
+  if (schema.type === "boolean") return element("input", { id, type: "checkbox" });
+  if (schema.type === "object") return element("textarea", { id, rows: "2", spellcheck: "false" });
+  const input = element("input", { id, type: "text", autocomplete: "off", spellcheck: "false" });
+  if (schema.type !== "number" && schema.type !== "integer") return input;
+  input.type = "number";
+  input.required = schema.default !== undefined && schema.default !== null;
+  input.step = schema.type === "integer" ? "1" : "any";
+  if (schema.minimum !== undefined) input.min = `${schema.minimum}`;
+  if (schema.maximum !== undefined) input.max = `${schema.maximum}`;
+  return input;
+}
+
+/** 'enamel.sigma = 4.5', one a line; what is no number is sent as it is, so that the server says so. */
+function table(text: string): Record<string, unknown> {
+  const rows = text.split("\n").map((line) => line.split("=").map((part) => part.trim())).filter(([key]) => key);
+  return Object.fromEntries(rows.map(([key, value]) => [key, value && Number.isFinite(Number(value)) ? Number(value) : (value ?? null)]));
+}
+
+function words(name: string): string {
+  if (name === "ior") return "Index of refraction";
+  const text = (name.split(".").at(-1) ?? name).replace(/_(s|px|mm|deg)$/, "").replaceAll("_", " ");
+  return text[0]?.toUpperCase() + text.slice(1);
+}

@@ -1,0 +1,154 @@
+/** The form for a job, built from the server's own schema of options: source, preset, name, then groups of options. */
+
+import { type Capture, getOptions, listCaptures, listPresets, type OptionsSchema, type Preset, sentenceOf, submitJob, Unauthenticated } from "./api";
+import { element } from "./element";
+import { bytes, when } from "./format";
+import { OptionField } from "./optionField";
+
+const SOURCES = new Set(["capture", "rig"]);
+/** Groups by the options that they hold; what the schema has besides comes last, so that no option is missing. */
+const GROUPS: [string, string[]][] = [
+  ["What is fitted", ["kind", "boundary", "ior", "dentin", "stains", "lobes"]],
+  ["Images", ["channels", "held_out_lights", "calibration", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
+  ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "search_candidates", "advise", "seed", "priority", "workers", "device"]],
+  ["Solver", ["solver", "loss", "adam_steps", "adam_rate", "prior", "held"]],
+];
+const RIG_FIRST = ["dome", "mouth", "level", "exposure_s"];
+const LONGEST_NAME = "80";
+const DEMO = "demo";
+
+export class SubmitView {
+  readonly root = element("form", { class: "submit", novalidate: "" });
+  private readonly source = element("select", { id: "source" });
+  private readonly capture = element("select", { id: "capture" });
+  private readonly preset = element("select", { id: "preset" });
+  private readonly summary = element("p", { class: "soft help" });
+  private readonly name = element("input", { id: "name", type: "text", maxlength: LONGEST_NAME, autocomplete: "off" });
+  private readonly go = element("button", { class: "primary" }, "Submit the job");
+  private readonly refusal = element("p", { class: "failure", role: "alert" });
+  private readonly options = element("div");
+  private readonly rigOptions = element("section", {}, element("h3", {}, "Rig"));
+  private fields: OptionField[] = [];
+  private rigFields: OptionField[] = [];
+  private presets: Preset[] = [];
+
+  /** `chosen`: id of a capture, or "rig"; else the newest capture. */
+  constructor(private readonly chosen: string) {
+    this.refusal.hidden = true;
+    this.source.addEventListener("change", () => this.showSource());
+    this.preset.addEventListener("change", () => this.takePreset());
+    this.root.addEventListener("submit", (event) => {
+      event.preventDefault();
+      void this.submit();
+    });
+  }
+
+  async start(): Promise<void> {
+    const [schema, presets, captures] = await Promise.all([getOptions(), listPresets(), listCaptures()]);
+    this.fill(schema, presets, captures.captures.filter((one) => one.state === "committed"));
+  }
+
+  stop(): void {}
+
+  private fill(schema: OptionsSchema, presets: Preset[], captures: Capture[]): void {
+    this.presets = presets.filter((one) => !("rig" in one.options));
+    const option = (value: string, text: string) => element("option", { value }, text);
+    this.source.append(option("capture", "An uploaded capture"), option("rig", "A rig"), option(DEMO, "The demonstration's virtual incisor"));
+    this.capture.append(...captures.map((one) => option(one.id, `${one.subject ?? one.id}, ${bytes(one.bytes)}, ${when(one.created_s)}`)));
+    this.preset.append(...this.presets.map((one) => option(one.name, one.name)));
+    this.preset.value = "standard";
+    this.source.value = this.chosen === "rig" ? "rig" : captures.length || this.chosen ? "capture" : DEMO;
+    if (captures.some((one) => one.id === this.chosen)) this.capture.value = this.chosen;
+
+    const rig = schema.$defs["RigSpec"]?.properties ?? {};
+    const inOrder = [...RIG_FIRST, ...Object.keys(rig).filter((name) => !RIG_FIRST.includes(name) && rig[name]?.["$ref"] === undefined)];
+    this.rigFields = inOrder.map((name) => new OptionField(`rig.${name}`, rig[name] ?? {}, name === "mouth"));
+    this.rigOptions.append(element("div", { class: "options" }, ...this.rigFields.map((field) => field.root)));
+
+    const grouped = new Set(GROUPS.flatMap(([, names]) => names));
+    const others = Object.keys(schema.properties).filter((name) => !grouped.has(name) && !SOURCES.has(name));
+    for (const [title, names] of [...GROUPS, ["Other options", others] as [string, string[]]]) {
+      const fields = names.filter((name) => name in schema.properties).map((name) => new OptionField(name, schema.properties[name] ?? {}));
+      if (!fields.length) continue;
+      this.fields.push(...fields);
+      const group = element("details", {}, element("summary", {}, title), element("div", { class: "options" }, ...fields.map((field) => field.root)));
+      if (title === GROUPS[0]?.[0]) group.open = true;
+      this.options.append(group);
+    }
+    this.arrange(captures.length > 0);
+  }
+
+  private arrange(hasCaptures: boolean): void {
+    const labelled = (text: string, input: HTMLElement, ...more: HTMLElement[]) => element("div", { class: "option" }, element("label", { for: input.id }, text), input, ...more);
+    const upload = element("a", { href: "#/new" }, hasCaptures ? "Upload another one" : "There is none yet; upload one");
+    this.capture.hidden = !hasCaptures;
+    this.root.append(
+      element("h2", {}, "Submit a job"),
+      element("section", {}, element("h3", {}, "Source"), element("div", { class: "options" }, labelled("What is fitted from", this.source), labelled("Capture", this.capture, element("p", { class: "help" }, upload)))),
+      this.rigOptions,
+      element("section", {}, element("h3", {}, "Options"), element("div", { class: "options" }, labelled("Preset", this.preset, this.summary), labelled("Name of the job", this.name, element("p", { class: "soft help" }, "A label for people, up to 80 characters; may stay empty."))), this.options),
+      this.refusal,
+      element("p", {}, this.go),
+    );
+    this.takePreset();
+    this.showSource();
+  }
+
+  private showSource(): void {
+    this.rigOptions.hidden = this.source.value !== "rig";
+    const place = this.capture.parentElement;
+    if (place) place.hidden = this.source.value !== "capture";
+  }
+
+  /** The demonstration's own preset is its source's. */
+  private takePreset(): void {
+    const preset = this.presets.find((one) => one.name === this.preset.value);
+    this.summary.textContent = preset?.summary ?? "";
+    for (const field of this.fields) {
+      if (preset && field.name in preset.options) field.set(preset.options[field.name]);
+      else field.reset();
+    }
+  }
+
+  private async submit(): Promise<void> {
+    this.refusal.hidden = true;
+    const isRig = this.source.value === "rig";
+    const asked = [...(isRig ? this.rigFields : []), ...this.fields];
+    const wrong = asked.filter((field) => !field.check());
+    wrong[0]?.focus();
+    if (wrong.length) return;
+    this.go.disabled = true;
+    try {
+      const job = await submitJob({ ...values(this.fields), ...this.origin(), ...(this.name.value.trim() ? { name: this.name.value.trim() } : {}) });
+      location.hash = `#/${job.id}`;
+    } catch (problem) {
+      if (problem instanceof Unauthenticated) throw problem;
+      this.refuse(sentenceOf(problem), asked);
+    } finally {
+      this.go.disabled = false;
+    }
+  }
+
+  private origin(): object {
+    if (this.source.value === DEMO) return { rig: { mouth: DEMO } };
+    if (this.source.value === "rig") return { rig: Object.fromEntries(Object.entries(values(this.rigFields)).map(([name, value]) => [name.slice("rig.".length), value])) };
+    return { capture: `captures/${this.capture.value}` };
+  }
+
+  /** A sentence that begins with an option's name stands beside that option. */
+  private refuse(sentence: string, fields: OptionField[]): void {
+    const name = sentence.match(/^(?:Option )?'([\w.]+)'/)?.[1] ?? "";
+    const field = fields.find((one) => one.name === name || name.startsWith(`${one.name}.`));
+    if (field) {
+      field.accuse(sentence);
+      field.focus();
+      return;
+    }
+    this.refusal.hidden = false;
+    this.refusal.textContent = sentence;
+  }
+}
+
+function values(fields: OptionField[]): Record<string, unknown> {
+  return Object.fromEntries(fields.map((field) => [field.name, field.value()]).filter(([, value]) => value !== undefined));
+}

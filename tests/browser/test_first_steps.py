@@ -1,0 +1,159 @@
+"""The first minutes of a stranger: an empty page leads to the demonstration's report, or to a rig; the form says what it takes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from services.api.app import create_app
+from services.core.records import JobSpec
+from services.core.settings import DomeSettings, ServerSettings
+from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.support.guarded_server import run_nothing
+from tests.support.live_server import serving, toy_server
+from tests.support.uploading import contents_of, upload_capture, write_capture
+
+pytestmark = pytest.mark.browser
+
+LOOKS = [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])]
+
+
+@pytest.fixture
+def server(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[httpx.Client]:
+    dome = DomeSettings(address=getattr(request, "param", None))
+    with serving(create_app(ServerSettings(data=tmp_path / "data", dome=dome), run_nothing)) as client:
+        yield client
+
+
+def address_of(server: httpx.Client) -> str:
+    return str(server.base_url).rstrip("/")
+
+
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
+def test_an_empty_page_leads_to_the_report_in_three_clicks(chromium: Browser, tmp_path: Path, scheme: str, width: int) -> None:
+    with toy_server(tmp_path / "data") as (server, _), watched_page(chromium, address_of(server), scheme, width) as page:
+        page.goto("/")
+        expect(page.get_by_role("heading", name="New job")).to_be_visible()
+        looked_at(page, f"empty-{scheme}-{width}")
+        clicks = [page.get_by_role("button", name="Run the demo"), page.get_by_role("link", name="Open the report")]
+        assert len(clicks) <= 3
+        clicks[0].click()
+        expect(page.locator(".job h2")).to_have_text("Job 1 · Demonstration")
+        expect(page.locator(".stages li strong")).to_have_text(["phantom", "capture", "prepare", "fit", "export"])
+        expect(page.locator(".job .badge")).to_have_text("succeeded")
+        looked_at(page, f"demo-{scheme}-{width}")
+        with page.context.expect_page() as opened:
+            clicks[1].click()
+        expect(opened.value).to_have_title("report")
+        page.get_by_role("link", name="New job").click()  # the ways stay where there are jobs
+        expect(page.get_by_role("button", name="Run the demo")).to_be_visible()
+        expect(page.locator("#new")).to_have_attribute("aria-current", "page")
+
+
+def test_what_the_demonstration_is_refused_for_is_told(chromium: Browser, server: httpx.Client) -> None:
+    with watched_page(chromium, address_of(server), expected=("507",)) as page:
+        page.goto("/")
+        page.route(
+            "**/v1/jobs",
+            lambda route: route.fulfill(status=507, json={"detail": "2 workers need more memory."}) if route.request.method == "POST" else route.fallback(),
+        )
+        page.get_by_role("button", name="Run the demo").click()
+        expect(page.get_by_role("alert")).to_have_text("2 workers need more memory.")
+
+
+@pytest.mark.parametrize("server", ["simulated"], indirect=True)
+@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
+def test_a_rig_is_explained_and_its_dome_is_looked_at(chromium: Browser, server: httpx.Client, scheme: str, width: int) -> None:
+    with watched_page(chromium, address_of(server), scheme, width) as page:
+        page.goto("/")
+        page.get_by_role("link", name="Connect a rig").click()
+        expect(page.locator(".rig [role=status]")).to_have_text(re.compile(r"The dome at simulated.* answers: 155 lights, firmware .+\."))
+        looked_at(page, f"rig-{scheme}-{width}")
+        page.get_by_role("link", name="Submit a job with a rig").click()
+        expect(page.get_by_label("What is fitted from")).to_have_value("rig")
+
+
+def test_a_server_without_a_dome_says_so(chromium: Browser, server: httpx.Client) -> None:
+    with watched_page(chromium, address_of(server), expected=("404",)) as page:
+        page.goto("/#/rig")
+        expect(page.locator(".rig [role=status]")).to_contain_text("DENTINE__SERVER__DOME__ADDRESS")
+
+
+def submitted(server: httpx.Client, page: Page) -> dict[str, Any]:
+    expect(page.locator(".job h2")).to_be_visible()
+    job: dict[str, Any] = server.get("/v1/jobs").json()["jobs"][0]
+    return job
+
+
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
+def test_the_form_is_the_schema_and_submits_what_was_changed(chromium: Browser, server: httpx.Client, tmp_path: Path, scheme: str, width: int) -> None:
+    uploaded = upload_capture(server, contents_of(write_capture(tmp_path / "mine")))
+    with watched_page(chromium, address_of(server), scheme, width) as page:
+        page.goto(f"/#/submit/{uploaded}")
+        expect(page.get_by_label("What is fitted from")).to_have_value("capture")
+        expect(page.get_by_label("Capture", exact=True)).to_have_value(uploaded)
+        shown = {name.removeprefix("option-") for name in page.locator("details [id^=option-]").evaluate_all("all => all.map(one => one.id)")}
+        shown = {name for name in shown if not name.endswith(("-help", "-wrong"))}
+        assert shown == set(JobSpec.model_fields) - {"capture", "rig"}
+
+        page.get_by_label("Preset").select_option("quick")
+        expect(page.locator("#option-pixel_step")).to_have_value("3")
+        page.get_by_label("Preset").select_option("accurate")
+        expect(page.locator("#option-pixel_step")).to_have_value("1")
+        for group in page.locator("details").all():
+            group.evaluate("group => group.open = true")
+        looked_at(page, f"form-{scheme}-{width}")
+        page.get_by_label("Name of the job").fill("Anna")
+        page.get_by_label("Dentin").select_option("known")
+        page.get_by_label("Lobes").select_option("2")
+        page.get_by_label("Held out lights").fill("l1")
+        page.get_by_label("Held", exact=True).fill("enamel.sigma = 4.5\nenamel.alpha = 0.99")
+        page.get_by_label("Advise").uncheck()
+        page.get_by_role("button", name="Submit the job").click()
+        job = submitted(server, page)
+    changed = JobSpec.model_validate(job["spec"])
+    asked = {"capture": f"captures/{uploaded}", "samples_per_pixel": 128, "max_samples_per_pixel": 4096, "max_steps": 24, "search_candidates": 200000}
+    asked |= {"dentin": "known", "lobes": 2, "held_out_lights": ["l1"], "held": {"enamel.sigma": 4.5, "enamel.alpha": 0.99}, "advise": False}
+    assert changed == JobSpec.model_validate(asked)
+    assert job["name"] == "Anna"
+
+
+def test_what_is_wrong_stands_beside_its_field(chromium: Browser, server: httpx.Client, tmp_path: Path) -> None:
+    upload_capture(server, contents_of(write_capture(tmp_path / "mine")))
+    with watched_page(chromium, address_of(server), expected=("422",)) as page:
+        page.goto("/#/submit")
+        page.get_by_label("Index of refraction").fill("7")
+        page.get_by_role("button", name="Submit the job").click()
+        wrong = page.locator("#option-ior-wrong")
+        expect(wrong).to_contain_text("3")  # the browser's own words: it must be 3 or less
+        expect(page.get_by_label("Index of refraction")).to_be_focused()
+        page.get_by_label("Index of refraction").fill("1.6")
+        expect(wrong).to_have_text("")
+        page.locator("details", has_text="Solver").last.evaluate("group => group.open = true")
+        page.get_by_label("Held", exact=True).fill("enamel.colour = 3")
+        page.locator("details", has_text="Solver").last.evaluate("group => group.open = false")
+        page.get_by_role("button", name="Submit the job").click()
+        expect(page.get_by_role("alert").filter(has_text="enamel.colour")).to_be_visible()
+    assert server.get("/v1/jobs").json()["jobs"] == []
+
+
+def test_a_rig_is_submitted_with_its_options(chromium: Browser, server: httpx.Client, tmp_path: Path) -> None:
+    mouth = write_capture(tmp_path / "mouth")
+    with watched_page(chromium, address_of(server), expected=("422",)) as page:
+        page.goto("/#/submit/rig")
+        page.get_by_role("button", name="Submit the job").click()
+        expect(page.get_by_label("Mouth")).to_be_focused()
+        page.get_by_label("Mouth").fill("/nowhere")
+        page.get_by_role("button", name="Submit the job").click()
+        expect(page.locator("#option-rig-mouth-wrong")).to_contain_text("/nowhere does not exist on the server; upload it")
+        page.get_by_label("Mouth").fill(str(mouth))
+        page.get_by_label("Exposure, s", exact=True).fill("0.02")
+        page.get_by_role("button", name="Submit the job").click()
+        job = submitted(server, page)
+    assert (job["spec"]["rig"]["mouth"], job["spec"]["rig"]["exposure_s"], job["spec"]["rig"]["dome"]) == (str(mouth), 0.02, "simulated")
