@@ -1,0 +1,105 @@
+"""A slab folder to its material, wavelength by wavelength: the door that a job or a command goes through."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from services.core.geometry import Record
+from services.core.store import write_atomic
+from services.fit.slab.dictionary import Material
+from services.fit.slab.folder import SlabFolder, read_folder
+from services.fit.slab.forward import Blocks, render
+from services.fit.slab.gauss_newton import Budget, GaussNewton
+from services.fit.slab.images import Measurements, read_images
+from services.fit.slab.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.rig import Rig, rig_of
+from services.fit.slab.start import start
+from services.fit.slab.uncertainty import uncertainty_of
+
+LAST_LOOK = 2**30
+"""Number of the render, counted apart from the solver's, that errors are taken from."""
+
+
+class SlabOptions(Record):
+    """What a fit may be told."""
+
+    seed: int = 1
+    effort: float = 1.0
+    """Paths, in units of the default budget."""
+
+
+def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = map) -> tuple[SlabFit, ...]:
+    """Fit every wavelength of a folder.
+
+    Args:
+        blocks: runs blocks of paths; ``map`` does so here, one after the other.
+
+    Raises:
+        CaptureInputError: the folder cannot be read.
+    """
+    options = options or SlabOptions()
+    folder = read_folder(root)
+    everything = [(wavelength, read_images(root, folder, wavelength)) for wavelength in folder.wavelengths_nm]
+    return tuple(_fit(folder, wavelength, measured, options, blocks) for wavelength, measured in everything)
+
+
+def _fit(folder: SlabFolder, wavelength_nm: float, measured: Measurements, options: SlabOptions, blocks: Blocks) -> SlabFit:
+    begun_s = time.process_time()
+    rig = rig_of(folder, wavelength_nm)
+    solver = GaussNewton(rig, measured, options.seed, _budget(options.effort), blocks)
+    solution = solver.solve(start(rig, measured, options.seed, blocks))
+    material, uncertainty = solution.material, uncertainty_of(solution)
+    phase = phase_of(material, uncertainty)
+    return SlabFit(
+        wavelength_nm=wavelength_nm,
+        parameters=parameters_of(material, uncertainty, rig.interface.index),
+        phase=phase,
+        errors=_errors(rig, measured, material, solver.budget, options.seed, blocks),
+        notes=_notes(measured, phase, converged=solution.converged),
+        converged=solution.converged,
+        paths=solution.paths,
+        core_seconds=time.process_time() - begun_s,
+    )
+
+
+def _budget(effort: float) -> Budget:
+    plain = Budget()
+    last = tuple((max(1, round(effort * paths)), batches) for paths, batches in plain.last)
+    return Budget(first_paths=max(1, round(effort * plain.first_paths)), search_paths=max(1, round(effort * plain.search_paths)), last=last)
+
+
+def _errors(rig: Rig, measured: Measurements, material: Material, budget: Budget, seed: int, blocks: Blocks) -> Errors:
+    """Errors of the images that were fitted, and of those that were not."""
+    paths = 4 * budget.last[-1][0]
+    first, second = render(rig, material, seed=seed, step=LAST_LOOK, batches=2, paths=paths, scores=False, blocks=blocks).images
+    told = []
+    for chosen in (~measured.held_out, measured.held_out):
+        arrays = (image[chosen] for image in (first, second, measured.values, measured.variances))
+        told.append(image_error(*arrays) if chosen.any() else None)
+    assert told[0] is not None
+    return Errors(fit_error=told[0], held_out_error=told[1])
+
+
+def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> tuple[str, ...]:
+    notes = []
+    if measured.assumed_noise:
+        notes.append("Images without a variance file are taken to have shot noise of 1 % at a pixel of the image's mean.")
+    if lost := int(np.count_nonzero(~np.isfinite(measured.variances))):
+        notes.append(f"{lost} values are not finite or have no variance and were left out.")
+    for low, high in phase.undetermined_bands_deg():
+        notes.append(f"The images do not determine the phase function from {low:.1f} to {high:.1f} degrees; what is given there is the prior's.")
+    if not converged:
+        notes.append("The search spent its steps before they stopped to help; the last steps were made all the same.")
+    return tuple(notes)
+
+
+def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
+    """Write ``parameters.json``, ``phase.json`` and ``errors.json``, by wavelength."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name, part in (("parameters", "parameters"), ("phase", "phase"), ("errors", "errors")):
+        told = {f"{fit.wavelength_nm:g}": getattr(fit, part).model_dump() for fit in fits}
+        write_atomic(out / f"{name}.json", json.dumps(told, indent=1).encode())

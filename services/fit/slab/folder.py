@@ -1,0 +1,170 @@
+"""A slab folder: ``slab.json`` beside linear images of a cell under narrow beams. Lengths mm, angles degrees in air."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Name, Record
+from services.core.store import read_record
+
+Positive = Annotated[float, Field(gt=0)]
+Index = Annotated[float, Field(ge=1, le=4)]
+Angle = Annotated[float, Field(gt=-90, lt=90)]
+Side = Literal["front", "back"]
+
+
+class Glass(Record):
+    """Walls of the cell, the same at both faces."""
+
+    index: Index
+    thickness_mm: Positive
+
+
+class Cell(Record):
+    """The cell and what surrounds it."""
+
+    width_mm: Positive = Field(description="way through the sample along the normal")
+    index: Index | None = Field(description="of the sample; null where the through-beam's shift tells it")
+    index_outside: Index = 1.0
+    boundary: Literal["smooth", "matched"] = "smooth"
+    glass: Glass | None = None
+
+    @model_validator(mode="after")
+    def _matched_has_no_glass(self) -> Cell:
+        if self.boundary == "matched" and self.glass is not None:
+            raise ValueError("a matched boundary neither bends nor reflects, so it has no glass; leave glass out or choose smooth")
+        return self
+
+
+class Beam(Record):
+    """Cross-section of the beam, perpendicular to its axis."""
+
+    profile: Literal["gaussian", "disc"]
+    sigma_mm: Positive | None = None
+    radius_mm: Positive | None = None
+    power: Positive = Field(default=1.0, description="before any Fresnel loss; images are given per unit of it")
+
+    @model_validator(mode="after")
+    def _size_of_its_profile(self) -> Beam:
+        wanted, other = ("sigma_mm", "radius_mm") if self.profile == "gaussian" else ("radius_mm", "sigma_mm")
+        if getattr(self, wanted) is None or getattr(self, other) is not None:
+            raise ValueError(f"a {self.profile} beam is given by {wanted} alone")
+        return self
+
+    @property
+    def size_mm(self) -> float:
+        """Standard deviation or radius."""
+        return self.sigma_mm or self.radius_mm or 0.0
+
+
+class PixelGrid(Record):
+    """Pixels on a face, in the world's x and y; element [0, 0] of a file lies at x from, y from."""
+
+    x_mm: tuple[float, float]
+    y_mm: tuple[float, float]
+    columns: Annotated[int, Field(gt=0, le=4096)]
+    rows: Annotated[int, Field(gt=0, le=4096)]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> PixelGrid:
+        for name, (low, high) in (("x_mm", self.x_mm), ("y_mm", self.y_mm)):
+            if not low < high:
+                raise ValueError(f"{name} must go from a smaller to a larger value")
+        return self
+
+
+class Light(Record):
+    """A collimated beam; its axis meets its face at x = y = 0."""
+
+    name: Name
+    side: Side
+    angle_deg: Angle
+
+
+class SlabCamera(Record):
+    """An orthographic camera that sees light leave a face at an angle."""
+
+    name: Name
+    side: Side
+    angle_deg: Angle
+    kind: Literal["orthographic"] = "orthographic"
+
+
+class SlabImage(Record):
+    """One image: exit radiance per power of the beam, per mm2 and sr, averaged over each pixel."""
+
+    camera: Name
+    light: Name
+    wavelength_nm: Positive | None = None
+    file: str
+    variance_file: str | None = None
+    held_out: bool = False
+
+
+class SlabFolder(Record):
+    """What ``slab.json`` says."""
+
+    kind: Literal["slab"]
+    units: Literal["mm"]
+    wavelengths_nm: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    cell: Cell
+    beam: Beam
+    pixels: PixelGrid
+    lights: Annotated[tuple[Light, ...], Field(min_length=1)]
+    cameras: Annotated[tuple[SlabCamera, ...], Field(min_length=1)]
+    images: Annotated[tuple[SlabImage, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> SlabFolder:
+        for what, things in (("light", self.lights), ("camera", self.cameras)):
+            names = [thing.name for thing in things]
+            if twice := {name for name in names if names.count(name) > 1}:
+                raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
+        if self.cell.boundary == "smooth" and self.cell.index is None:
+            raise ValueError("cell.index is null, and the through-beam is not evaluated yet; give the sample's index")
+        seen: set[tuple[str, str, float]] = set()
+        for image in self.images:
+            self._require_known(image)
+            key = image.camera, image.light, self.wavelength_of(image)
+            if key in seen:
+                raise ValueError(f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice; keep one")
+            seen.add(key)
+        return self
+
+    def _require_known(self, image: SlabImage) -> None:
+        for what, name, things in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):
+            if name not in {thing.name for thing in things}:
+                raise ValueError(f"image {image.file} names {what} {name}, which is not among the {what}s; correct the name")
+        if image.wavelength_nm is None and len(self.wavelengths_nm) > 1:
+            raise ValueError(f"image {image.file} has no wavelength_nm, and there are {len(self.wavelengths_nm)}; name one")
+        if image.wavelength_nm is not None and image.wavelength_nm not in self.wavelengths_nm:
+            raise ValueError(f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or correct it")
+
+    def wavelength_of(self, image: SlabImage) -> float:
+        """The image's wavelength, nm."""
+        return self.wavelengths_nm[0] if image.wavelength_nm is None else image.wavelength_nm
+
+
+def read_folder(root: Path) -> SlabFolder:
+    """Read ``root/slab.json`` and see that its files exist.
+
+    Raises:
+        CaptureInputError: names what is missing or contradictory.
+    """
+    origin = root / "slab.json"
+    folder = read_record(origin, SlabFolder)
+    for image in folder.images:
+        for file in (image.file, image.variance_file):
+            if file is None:
+                continue
+            if not (root / file).resolve().is_relative_to(root.resolve()):
+                raise CaptureInputError(f"Image file {file} lies outside the slab folder {root}; put it inside.")
+            if not (root / file).is_file():
+                raise CaptureInputError(
+                    f"Image file {root / file} (camera {image.camera}, light {image.light}) does not exist; put it there or remove its entry."
+                )
+    return folder

@@ -1,0 +1,99 @@
+"""Measured images of one wavelength: radiance and variance on the rig's grid, checked and folded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.fit.slab.folder import SlabFolder, SlabImage
+from services.fit.slab.rig import Grid, grid_of
+
+Array = NDArray[np.float64]
+
+DEFAULT_NOISE = 0.01
+"""Standard deviation of shot noise where no variance is given, as a share of a pixel that has the image's mean."""
+DARKEST = 0.01
+"""Shot noise is not believed to fall further below this share of the image's mean."""
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Values (images, pixels); variance is infinite where a pixel is not finite."""
+
+    values: Array
+    variances: Array
+    held_out: NDArray[np.bool_]
+    names: tuple[str, ...]
+    """Camera and light of each image."""
+    assumed_noise: bool
+    """Whether some image came without its variance."""
+
+
+def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measurements:
+    """The images of one wavelength, per unit of the beam's power.
+
+    Raises:
+        CaptureInputError: a file cannot be read, has another shape, or is not finite.
+    """
+    grid = grid_of(folder.pixels)
+    entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
+    if not entries:
+        raise CaptureInputError(f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength.")
+    values, variances = [], []
+    for entry in entries:
+        image = _read(root, folder, entry, entry.file)
+        variance = shot_noise(image) if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
+        usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+        if not usable.any():
+            raise CaptureInputError(f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again.")
+        value, of_value = _folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
+        values.append(value)
+        variances.append(of_value)
+    held_out = np.array([entry.held_out for entry in entries])
+    if held_out.all():
+        raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
+    return Measurements(
+        np.stack(values), np.stack(variances), held_out, tuple(f"{entry.camera} under {entry.light}" for entry in entries),
+        any(entry.variance_file is None for entry in entries),
+    )  # fmt: skip
+
+
+def shot_noise(image: Array, share: float = DEFAULT_NOISE) -> Array:
+    """Variance of Poisson noise that is ``share`` of a pixel at the image's mean."""
+    finite = image[np.isfinite(image)]
+    mean = max(float(finite.mean()), 0.0) if finite.size else 0.0
+    return share**2 * mean * np.maximum(image, DARKEST * mean)
+
+
+def _read(root: Path, folder: SlabFolder, entry: SlabImage, file: str) -> Array:
+    place = f"Image file {root / file} (camera {entry.camera}, light {entry.light})"
+    if Path(file).suffix.lower() != ".npy":
+        raise CaptureInputError(f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float.")
+    try:
+        image = np.load(root / file, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as problem:
+        raise CaptureInputError(f"{place} cannot be read ({problem}); it may be truncated, so copy or export it again.") from problem
+    expected = folder.pixels.rows, folder.pixels.columns
+    if not isinstance(image, np.ndarray) or image.shape != expected or not np.issubdtype(image.dtype, np.floating):
+        found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else "an archive"
+        raise CaptureInputError(f"{place} holds {found} instead of floats {expected} (rows, columns); export it on the folder's grid.")
+    return image.astype(np.float64)
+
+
+def _folded(value: Array, variance: Array, grid: Grid) -> tuple[Array, Array]:
+    """Means of the two halves by inverse variance where the grid is folded, and their variances; flat (pixels,)."""
+    if not grid.folded:
+        return value.ravel(), variance.ravel()
+    halves = np.stack([value[: grid.rows][::-1], value[grid.rows :]])
+    weights = 1 / np.stack([variance[: grid.rows][::-1], variance[grid.rows :]])
+    total = weights.sum(axis=0)
+    # Both halves have the same expectation, so they are weighed alike where both are usable: weights by noisy values are biased.
+    usable = weights > 0
+    count = usable.sum(axis=0)
+    mean = (halves * usable).sum(axis=0) / np.maximum(count, 1)
+    spread = np.where(usable, 1 / np.maximum(weights, 1e-300), 0).sum(axis=0) / np.maximum(count, 1) ** 2
+    return mean.ravel(), np.where(total > 0, spread, np.inf).ravel()

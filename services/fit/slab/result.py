@@ -1,0 +1,114 @@
+"""Records of a slab's result, as ``parameters.json``, ``phase.json`` and ``errors.json`` hold them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from services.core.geometry import Record
+from services.fit.slab.dictionary import ANGLES_RAD, Material
+from services.fit.slab.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
+
+
+class Quantity(Record):
+    """A measured number."""
+
+    value: float
+    se: float = Field(description="standard error")
+    unit: Literal["1/mm", "1"]
+    determined: bool = Field(description="whether the images fix it, and not the prior")
+
+
+class Parameters(Record):
+    """Of one wavelength."""
+
+    sigma_t: Quantity
+    sigma_s: Quantity
+    sigma_a: Quantity
+    sigma_s_reduced: Quantity
+    g: Quantity
+    index: Quantity
+
+
+class PhaseFunction(Record):
+    """At the dictionary's knots, normalised so that 2 pi times the integral of p sin(theta) is 1."""
+
+    theta_deg: tuple[float, ...]
+    value_per_sr: tuple[float, ...]
+    se_per_sr: tuple[float, ...]
+    determined: tuple[bool, ...]
+
+    def undetermined_bands_deg(self) -> tuple[tuple[float, float], ...]:
+        """Ranges of angle whose values come from the prior."""
+        bands: list[tuple[float, float]] = []
+        open_at: float | None = None
+        for theta, determined in zip(self.theta_deg, self.determined, strict=True):
+            if not determined:
+                open_at, last = (theta if open_at is None else open_at), theta
+            elif open_at is not None:
+                bands.append((open_at, last))
+                open_at = None
+        return (*bands, (open_at, last)) if open_at is not None else tuple(bands)
+
+
+class Errors(Record):
+    """Images predicted against measured, noise of both taken out."""
+
+    fit_error: float
+    held_out_error: float | None
+
+
+class SlabFit(Record):
+    """All that is told of one wavelength."""
+
+    wavelength_nm: float
+    parameters: Parameters
+    phase: PhaseFunction
+    errors: Errors
+    notes: tuple[str, ...] = Field(description="sentences about what was assumed and what the images do not tell")
+    converged: bool
+    paths: int
+    core_seconds: float
+
+
+def parameters_of(material: Material, uncertainty: Uncertainty, index: float) -> Parameters:
+    """The coefficients with their standard errors. One of a small value is judged by the extinction that it is part of."""
+    values = {
+        "sigma_t": material.extinction_per_mm,
+        "sigma_s": material.scattering_per_mm,
+        "sigma_a": material.absorption_per_mm,
+        "sigma_s_reduced": material.scattering_per_mm * (1 - material.mean_cosine),
+        "g": material.mean_cosine,
+    }
+    told = {}
+    for name, slope in slopes(material).items():
+        reference = {"g": 1.0, "sigma_a": material.extinction_per_mm}.get(name, abs(values[name]))
+        told[name] = Quantity(
+            value=values[name],
+            se=uncertainty.standard_error(slope),
+            unit="1" if name == "g" else "1/mm",
+            determined=uncertainty.undetermined_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
+        )
+    return Parameters(**told, index=Quantity(value=index, se=0.0, unit="1", determined=True))
+
+
+def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:
+    """The phase function with its bands."""
+    errors, determined = phase_errors(material, uncertainty)
+    return PhaseFunction(
+        theta_deg=tuple(np.degrees(ANGLES_RAD).tolist()),
+        value_per_sr=tuple(material.phase_per_sr.tolist()),
+        se_per_sr=tuple(errors.tolist()),
+        determined=tuple(determined.tolist()),
+    )
+
+
+def image_error(first: NDArray[np.float64], second: NDArray[np.float64], values: NDArray[np.float64], variances: NDArray[np.float64]) -> float:
+    """Relative error from two independent renders, the measurements' noise taken out of both sums."""
+    usable = np.isfinite(variances)
+    y, noise = values[usable], float(variances[usable].sum())
+    square = (float((first[usable] - y) @ (second[usable] - y)) - noise) / max(float(y @ y) - noise, 1e-300)
+    return float(np.sqrt(max(square, 0.0)))

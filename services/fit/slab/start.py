@@ -1,0 +1,71 @@
+"""A first guess: an HG medium of three numbers, which many different images already fix."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.slab.dictionary import KNOTS, Material, henyey_greenstein, hg_values
+from services.fit.slab.forward import Blocks, render
+from services.fit.slab.images import Measurements
+from services.fit.slab.normal import normal_equations, smoothed_variance
+from services.fit.slab.rig import Rig
+
+Array = NDArray[np.float64]
+
+THICKNESSES = (0.3, 1.0, 3.0, 9.0)
+COSINES = (0.0, 0.7)
+FIRST_ALBEDO = 0.97
+LARGEST_COSINE, SMALLEST_COSINE = 0.8, -0.5
+"""The forward peak of a larger cosine may lie where no camera looks; the free fit finds it from here."""
+MODEL_ERROR = 0.1
+"""Share of a pixel by which an HG medium may be off: it keeps the brightest pixels from deciding alone."""
+TABLE_PATHS, STEP_PATHS, BATCHES, STEPS = 1000, 2000, 4, 6
+
+
+def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Material:
+    """The best of a table of HG media, then Gauss-Newton in ln sigma_s, g and sigma_a."""
+    fitted = np.isfinite(measured.variances) & ~measured.held_out[:, None]
+    tolerated = measured.variances + (MODEL_ERROR * np.maximum(measured.values, 0)) ** 2
+    best, lowest = None, math.inf
+    for number, (thickness, g) in enumerate((t, g) for t in THICKNESSES for g in COSINES):
+        sigma_s = thickness / rig.width_mm
+        guess = henyey_greenstein(sigma_s, g, sigma_s * (1 / FIRST_ALBEDO - 1))
+        images = render(rig, guess, seed=seed, step=-number - 1 + 2**32, batches=2, paths=TABLE_PATHS, scores=False, blocks=blocks).images
+        first, second = images - measured.values
+        misfit = float((first * second / tolerated)[fitted].sum())
+        if misfit < lowest:
+            best, lowest = (math.log(sigma_s), g, guess.absorption_per_mm), misfit
+    assert best is not None
+    point = np.array(best)
+    for step in range(STEPS):
+        point = _improved(rig, measured, point, np.where(fitted, tolerated, np.inf), seed, step, blocks)
+    return _material(point)
+
+
+def _material(point: Array) -> Material:
+    return henyey_greenstein(math.exp(point[0]), float(point[1]), float(point[2]))
+
+
+def _improved(rig: Rig, measured: Measurements, point: Array, tolerated: Array, seed: int, step: int, blocks: Blocks) -> Array:
+    material = _material(point)
+    batches = render(rig, material, seed=seed, step=step + 2**31, batches=BATCHES, paths=STEP_PATHS, scores=True, blocks=blocks)
+    weights = 1 / (tolerated + smoothed_variance(batches.images, (rig.grid.rows, rig.grid.columns)))
+    equations = normal_equations(batches, material, measured.values, weights)
+
+    # Chain rule from ln f and sigma_a to the three numbers; the cosine's column by differences of ln p.
+    chain = np.zeros((KNOTS + 1, 3))
+    chain[:KNOTS, 0] = 1
+    small = 1e-4
+    chain[:KNOTS, 1] = (np.log(hg_values(point[1] + small)) - np.log(hg_values(point[1] - small))) / (2 * small)
+    chain[KNOTS, 2] = 1
+    matrix = chain.T @ equations.matrix @ chain + chain.T @ equations.noise @ chain
+    change = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(3), chain.T @ equations.gradient)
+    sigma_s = math.exp(point[0])
+    limits = np.array([1.0, 0.3, 0.5 * sigma_s])
+    moved = point + np.clip(change, -limits, limits)
+    moved[1] = np.clip(moved[1], SMALLEST_COSINE, LARGEST_COSINE)
+    moved[2] = max(moved[2], 0.0)
+    return moved

@@ -1,0 +1,288 @@
+"""The walk of one light: orders two and up, with the scores of all knots, compiled by Numba.
+
+A path is the beam's; at each of its vertices from the second on it is connected to every camera through the flat face. A
+contribution's derivative by ln f_n is itself times (sum over its scatters of the share of knot n in f(theta)) less
+f_n Omega_n times its way, by Eq. 18 of Gkioulekas et al. (2013) as ``optics.md`` corrects it: so each image carries a row
+of KNOTS sums of shares, and one sum of ways.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from services.fit.slab.dictionary import KNOTS, SPACING_RAD
+from services.fit.slab.streams import path_state, uniform
+from services.fit.slab.tables import GUIDE
+
+MAX_SCATTERS = 8192
+"""A path ends there; what it still carries is reported."""
+FIRST_ROULETTE = 0.1
+"""Paths of less weight than this share of the beam survive by halves."""
+SPARSE_SCATTERS = 48
+"""Up to so many scatters a path's shares are added one by one; beyond, all knots at once are as fast."""
+REFLECTED_SHARE = 0.125
+"""Probability that a vertex is also connected by way of one more reflection; those carry some 2 % of the light."""
+LATE_ORDER = 8
+"""From this order on only a share of the vertices is connected where the cell is thick."""
+
+
+@njit(cache=True, inline="always")
+def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
+    """Unpolarised Fresnel reflectance, eta = n_beyond / n_before."""
+    q2 = (eta - 1) * (eta + 1) + cosine * cosine
+    if q2 <= 0:
+        return 1.0
+    q = math.sqrt(q2)
+    s = (cosine - q) / (cosine + q)
+    p = (eta * eta * cosine - q) / (eta * eta * cosine + q)
+    return 0.5 * (s * s + p * p)
+
+
+@njit(cache=True)
+def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
+    """Whether light comes back from a face, and how far it went sideways in the glass, in units of its lateral direction.
+
+    glass: (n_outside / n, n_glass / n or 0, thickness).
+    """
+    outside, wall, thickness = glass
+    u, state = uniform(state)
+    if wall == 0:
+        return u < reflectance(cosine, outside), 0.0, state
+    near = reflectance(cosine, wall)
+    if u < near:
+        return True, 0.0, state
+    sine = math.sqrt(max(1 - cosine * cosine, 0.0)) / wall
+    inner = math.sqrt(max(1 - sine * sine, 1e-12))
+    far = reflectance(inner, outside / wall)
+    # Lateral way per unit of lateral direction in the medium: t tan(a_glass) / sin(a).
+    way = thickness / (wall * inner)
+    shift = 0.0
+    while True:
+        shift += way
+        u, state = uniform(state)
+        if u >= far:
+            return False, shift, state
+        shift += way
+        u, state = uniform(state)
+        if u >= near:
+            return True, shift, state
+
+
+@njit(cache=True)
+def shift_of_a_return(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
+    """How far light went sideways in the glass, given that it comes back."""
+    while True:
+        back, shift, state = meet_face(cosine, glass, state)
+        if back:
+            return shift, state
+
+
+@njit(cache=True, inline="always")
+def draw_cosine(u, v, cumulative, cosines, guide):  # type: ignore[no-untyped-def]  # compiled
+    """A scattering cosine, and the cell that it lies in."""
+    cell = guide[int(u * GUIDE)]
+    while cumulative[cell] < u:
+        cell += 1
+    return cosines[cell] + v * (cosines[cell + 1] - cosines[cell]), cell
+
+
+@njit(cache=True, inline="always")
+def at_angle(cosine, scattering):  # type: ignore[no-untyped-def]  # compiled
+    """f(theta), the knot below theta, and the shares of both knots in f."""
+    place = math.acos(min(max(cosine, -1.0), 1.0)) / SPACING_RAD
+    knot = min(int(place), KNOTS - 2)
+    upper = (place - knot) * scattering[knot + 1]
+    lower = (knot + 1 - place) * scattering[knot]
+    value = lower + upper
+    return value, knot, lower / value, upper / value
+
+
+@njit(cache=True, inline="always")
+def turned(x, y, z, cosine, azimuth):  # type: ignore[no-untyped-def]  # compiled
+    """A direction turned by a scattering angle, renormalised (Duff et al. 2017 for the frame)."""
+    sine = math.sqrt(max(1 - cosine * cosine, 0.0))
+    a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
+    sign = 1.0 if z >= 0 else -1.0
+    k = -1.0 / (sign + z)
+    xy = x * y * k
+    nx = cosine * x + a * (1 + sign * x * x * k) + b * xy
+    ny = cosine * y + a * sign * xy + b * (sign + y * y * k)
+    nz = cosine * z - a * sign * x - b * y
+    scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx * scale, ny * scale, nz * scale
+
+
+@njit(cache=True, inline="always")
+def beam_offset(beam, state):  # type: ignore[no-untyped-def]  # compiled
+    """A random point of the beam's cross-section; beam: (is a disc, size along x, along y)."""
+    u, state = uniform(state)
+    v, state = uniform(state)
+    radius = math.sqrt(u) if beam[0] else math.sqrt(-2 * math.log(u))
+    return radius * math.cos(2 * math.pi * v) * beam[1], radius * math.sin(2 * math.pi * v) * beam[2], state
+
+
+@njit(cache=True)
+def trace(  # type: ignore[no-untyped-def]  # compiled
+    key,
+    paths,
+    medium,
+    width,
+    late_share,
+    glass,
+    light,
+    beam,
+    far,
+    sines,
+    scales,
+    shifts,
+    mirrors,
+    grid,
+    scores,
+    images,
+    rows,
+    totals,
+):
+    """Add ``paths`` paths to images (C, P), rows (C, P, KNOTS + 1) and totals (light out of the front, the back, cut off).
+
+    light: (sine, transmittance, shift, total reflectance along the beam). mirrors: reflectance of a face along each camera.
+    grid: (x from, y from, pitch x, pitch y, columns, rows, folded). Without ``scores`` rows stay as they are.
+    """
+    scattering, sigma_t, albedo, cumulative, cosines, densities, guide = medium
+    x_from, y_from, pitch_x, pitch_y, columns, row_count, folded = grid
+    knots = np.empty(MAX_SCATTERS, np.int64)
+    lowers = np.empty(MAX_SCATTERS)
+    uppers = np.empty(MAX_SCATTERS)
+    dense = np.zeros(KNOTS)
+    beam_cosine = math.sqrt(1 - light[0] ** 2)
+    crossing = width / beam_cosine
+    collided = -math.expm1(-sigma_t * crossing)
+    repeat = light[3] * (1 - collided)
+
+    for path in range(paths):
+        state = path_state(key, path)
+        # The first scatter is forced: the beam's passes between the faces form a geometric series that is drawn from exactly.
+        weight = light[1] * albedo * collided / (1 - repeat)
+        x, y, way = light[2], 0.0, 0.0
+        dx, dy, dz = light[0], 0.0, beam_cosine
+        u, state = uniform(state)
+        while u < repeat:
+            u /= repeat
+            way += crossing
+            x += dx * crossing
+            if glass[1] > 0:
+                shift, state = shift_of_a_return(beam_cosine, glass, state)
+                x += dx * shift
+            dz = -dz
+        u, state = uniform(state)
+        step = -math.log1p(-u * collided) / sigma_t
+        way += step
+        x += dx * step
+        z = dz * step if dz > 0 else width + dz * step
+
+        scatters = 0
+        alive = True
+        while alive:
+            # Scatter by the phase function; the weight makes up for the even density within a cell.
+            u, state = uniform(state)
+            v, state = uniform(state)
+            cosine, cell = draw_cosine(u, v, cumulative, cosines, guide)
+            value, knot, lower, upper = at_angle(cosine, scattering)
+            weight *= value / densities[cell]
+            knots[scatters], lowers[scatters], uppers[scatters] = knot, lower, upper
+            dense[knot] += lower
+            dense[knot + 1] += upper
+            scatters += 1
+            u, state = uniform(state)
+            dx, dy, dz = turned(dx, dy, dz, cosine, 2 * math.pi * u)
+
+            # Fly to the next scatter, or out.
+            u, state = uniform(state)
+            step = -math.log(u) / sigma_t
+            while True:
+                edge = width if dz > 0 else 0.0
+                reach = (edge - z) / dz if dz != 0 else math.inf
+                if step < reach:
+                    break
+                step -= reach
+                way += reach
+                back, shift, state = meet_face(abs(dz), glass, state)
+                x += dx * (reach + shift)
+                y += dy * (reach + shift)
+                z = edge
+                if not back:
+                    totals[1 if dz > 0 else 0] += weight
+                    alive = False
+                    break
+                dz = -dz
+            if not alive:
+                break
+            way += step
+            x += dx * step
+            y += dy * step
+            z += dz * step
+            weight *= albedo
+
+            # Connect this vertex with all cameras, directly and by way of a geometric number of reflections.
+            share = 1.0
+            if scatters + 1 >= LATE_ORDER and late_share < 1:
+                u, state = uniform(state)
+                share = 1 / late_share if u < late_share else 0.0
+            if share > 0:
+                offset_x, offset_y, state = beam_offset(beam, state)
+                reflections = 0
+                while True:
+                    for camera in range(len(far)):
+                        lateral = sines[camera]
+                        out = math.sqrt(1 - lateral * lateral)
+                        towards_far = far[camera] != (reflections % 2 == 1)
+                        deep = (width - z if towards_far else z) + reflections * width
+                        flight = deep / out
+                        value, knot, lower, upper = at_angle(dx * lateral + (dz if towards_far else -dz) * out, scattering)
+                        amount = share * weight * value / (sigma_t * albedo) * math.exp(-sigma_t * flight) * scales[camera]
+                        if reflections > 0:
+                            amount *= (mirrors[camera] / REFLECTED_SHARE) ** reflections
+                        shift = shifts[camera]
+                        for _ in range(reflections):
+                            if glass[1] > 0:
+                                more, state = shift_of_a_return(out, glass, state)
+                                shift += lateral * more
+                        px = (x + lateral * flight + shift + offset_x - x_from) / pitch_x
+                        py = y + offset_y
+                        py = ((abs(py) if folded else py) - y_from) / pitch_y
+                        if px < 0 or py < 0 or px >= columns or py >= row_count:
+                            continue
+                        pixel = int(py) * columns + int(px)
+                        images[camera, pixel] += amount
+                        if not scores:
+                            continue
+                        row = rows[camera, pixel]
+                        row[knot] += amount * lower
+                        row[knot + 1] += amount * upper
+                        row[KNOTS] += amount * (way + flight)
+                        if scatters <= SPARSE_SCATTERS:
+                            for j in range(scatters):
+                                row[knots[j]] += amount * lowers[j]
+                                row[knots[j] + 1] += amount * uppers[j]
+                        else:
+                            for j in range(KNOTS):
+                                row[j] += amount * dense[j]
+                    u, state = uniform(state)
+                    if light[3] == 0 or u >= REFLECTED_SHARE:
+                        break
+                    reflections += 1
+
+            # End paths that are faint by roulette, and those that are too long.
+            if weight < FIRST_ROULETTE:
+                u, state = uniform(state)
+                if u < 0.5:
+                    alive = False
+                weight *= 2
+            if scatters == MAX_SCATTERS:
+                totals[2] += weight
+                alive = False
+        for j in range(scatters):
+            dense[knots[j]] = 0.0
+            dense[knots[j] + 1] = 0.0
