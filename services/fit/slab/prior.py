@@ -35,9 +35,9 @@ def second_differences() -> Array:
     return matrix / SPACING_RAD**2
 
 
-def precision(scale: float) -> Array:
-    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS); nothing is assumed of the absorption."""
-    bends = second_differences() / scale
+def precision(scale: float | Array) -> Array:
+    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS) for one scale or one per knot; nothing is assumed of the absorption."""
+    bends = second_differences() / np.broadcast_to(scale, KNOTS)[:, None]
     matrix = np.zeros((UNKNOWNS, UNKNOWNS))
     matrix[:KNOTS, :KNOTS] = bends.T @ bends
     return matrix

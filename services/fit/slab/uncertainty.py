@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-from services.fit.slab.dictionary import KNOTS, Material, cosine_moments, tent_solid_angles
+from services.fit.slab.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.gauss_newton import Solution
-from services.fit.slab.prior import precision
+from services.fit.slab.normal import UNKNOWNS
+from services.fit.slab.prior import RIDGE, precision
 
 Array = NDArray[np.float64]
 
-FLAG_CURVATURE = 100.0
-"""Scale of the prior, per rad2, under which a value counts as determined by the images: HG 0.8 bends by 60 at its peak, so a
-narrower one would let the prior's smoothness pass for a measurement."""
+SHARPEST, BLUNTEST, POLE_RAD = 300.0, 10.0, math.radians(8)
+"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
+HG 0.9 bends by 270 at its peak; any narrower prior there would let smoothness pass for a measurement."""
+LEAST_SIGNAL = 0.1
+"""Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
 LARGEST_SHARE = 0.1
 """Standard error, as a share of the value, up to which a value of the phase function is determined."""
 LARGEST_COEFFICIENT_SHARE = 0.05
@@ -43,17 +48,26 @@ class Uncertainty:
 def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
-    The curvature is that of the mean derivatives, noise included, as the unbiased one may be indefinite; the gradient's own
-    Monte Carlo noise is added by the sandwich. Both make the answer a little too wide rather than too narrow.
+    The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
+    directions whose curvature stands out count. The images' Monte Carlo noise is in the weights, as the shot noise is.
     """
-    curvature = solution.quadratic.matrix + solution.quadratic.noise
-    return Uncertainty(*(_covariance(curvature, solution.gradient_noise, scale) for scale in (solution.scale, FLAG_CURVATURE)))
+    return Uncertainty(*(_covariance(solution, precision(scale)) for scale in (solution.scale, flag_scales())))
 
 
-def _covariance(curvature: Array, gradient_noise: Array, scale: float) -> Array:
-    total = curvature + precision(scale)
-    inverse = np.linalg.pinv(total, rcond=1e-14, hermitian=True)
-    return np.asarray(inverse + inverse @ gradient_noise @ inverse)
+def flag_scales() -> Array:
+    """The weak prior's scale at each knot, by the angle from the nearer pole."""
+    from_pole = np.minimum(ANGLES_RAD, math.pi - ANGLES_RAD)
+    return np.asarray(np.maximum(SHARPEST / (1 + (from_pole / POLE_RAD) ** 2), BLUNTEST))
+
+
+def _covariance(solution: Solution, prior: Array) -> Array:
+    ridge = RIDGE * float(np.abs(np.diag(solution.quadratic.matrix)).max()) * np.eye(UNKNOWNS)
+    reference = prior + solution.quadratic.noise + ridge
+    signals, vectors = linalg.eigh(solution.quadratic.matrix, reference)
+    # With vectors V, V^T reference V = 1, so that matrix = reference V signals V^T reference.
+    told = reference @ vectors
+    curvature = (told * np.where(signals > LEAST_SIGNAL, signals, 0)) @ told.T
+    return np.asarray(np.linalg.inv(curvature + prior + ridge))
 
 
 def slopes(material: Material) -> dict[str, Array]:
