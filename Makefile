@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo deploy-test deploy-check manifests gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
+.PHONY: demo bom deploy-test deploy-check manifests gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -43,6 +43,9 @@ deploy-test: setup ## build the images, run the composed system in real containe
 
 deploy-check: setup ## the files of deploy/ against their formats' own validators
 	@$(BIN)/python -m pytest tests/pipeline/test_deploy_files.py
+
+bom: setup ## what each image is made of, as CycloneDX bills of material in bom/
+	@deploy/bom.sh bom
 
 manifests: setup ## write deploy/kubernetes/dentine.yaml from deploy/compose.yaml
 	@$(BIN)/python deploy/kubernetes/render.py

@@ -1,0 +1,71 @@
+"""What the program is made of may be given on: every dependency, of Python and of the page, names a licence that allows it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[2]
+LOCK_OF_THE_PAGE = ROOT / "services" / "api" / "dashboard" / "package-lock.json"
+ROLES = ("api", "postgres", "capture", "worker", "bench")
+PERMISSIVE = re.compile(
+    r"\b(MIT(-0|-CMU)?|0?BSD(-[23]-Clause)?|ISCL?|Apache(-2\.0)?|PSF(-2\.0)?|Python Software Foundation"
+    r"|Zlib|CC0-1\.0|Unlicense|HPND|MPL(-2\.0)?|Mozilla)\b"
+)
+"""The Mozilla licence binds changes to its own files alone."""
+LINKED = {"psycopg": "LGPL-3.0-only", "psycopg-binary": "LGPL-3.0-only"}
+"""Weak copyleft: may be used unchanged as a library, and stays replaceable, which an installed Python package is."""
+STRONG = re.compile(r"\bA?GPL|GNU (Affero )?General Public")
+
+
+def licence(of: Distribution) -> str:
+    """As the package's metadata state it."""
+    told = of.metadata
+    classified = [one.rpartition(" :: ")[2] for one in told.get_all("Classifier", []) if one.startswith("License ::")]
+    return str(told.get("License-Expression") or "; ".join(classified) or (told.get("License") or "").partition("\n")[0])
+
+
+def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator[Distribution]:
+    """All that a package with its extras brings along here."""
+    for text in distribution(name).requires or ():
+        wanted = Requirement(text)
+        applies = wanted.marker is None or any(wanted.marker.evaluate({"extra": extra}) for extra in ("", *extras))
+        key = wanted.name.lower().replace("_", "-") + "".join(sorted(wanted.extras))
+        if not applies or key in seen:
+            continue
+        seen.add(key)
+        try:
+            found = distribution(wanted.name)
+        except PackageNotFoundError:  # for another platform
+            continue
+        if wanted.name != "dentine":
+            yield found
+        yield from dependencies(wanted.name, tuple(wanted.extras), seen)
+
+
+def test_every_python_package_may_be_given_on() -> None:
+    found = {one.name.lower().replace("_", "-"): licence(one) for one in dependencies("dentine", ROLES, set())}
+    assert {"mitsuba", "psycopg", "numpy", "fastapi"} <= found.keys()
+    for name, text in found.items():
+        assert text, f"{name} names no licence"
+        allowed = LINKED[name] == text if name in LINKED else bool(PERMISSIVE.search(text)) and not STRONG.search(text)
+        assert allowed, f"{name}: {text}"
+
+
+def test_every_package_of_the_page_may_be_given_on() -> None:
+    packages = json.loads(LOCK_OF_THE_PAGE.read_text())["packages"]
+    assert len(packages) > 2
+    for path, package in packages.items():
+        if path:
+            assert PERMISSIVE.search(package["license"]), (path, package["license"])
+
+
+@pytest.mark.parametrize("text", ["GPL-3.0-only", "GNU General Public License v3 (GPLv3)", "AGPL-3.0", "GNU Affero General Public License v3", "Commercial"])
+def test_a_licence_that_binds_the_whole_is_found(text: str) -> None:
+    assert STRONG.search(text) or not PERMISSIVE.search(text)
