@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shlex
 import subprocess
 import time
@@ -103,9 +104,9 @@ class ComposedSystem:
         self.compose("down", *arguments)
 
     def token(self, name: str, *scopes: str) -> str:
-        """A new token."""
+        """A new token, whose name begins with ``name``."""
         chosen = [part for scope in scopes for part in ("--scope", scope)]
-        return self.inside("api", "dentine", "token", "create", name, *chosen).strip().splitlines()[-1]
+        return self.inside("api", "dentine", "token", "create", f"{name}-{secrets.token_hex(3)}", *chosen).strip().splitlines()[-1]
 
     def is_live(self) -> bool:
         """Whether the API answers at all."""
