@@ -10,7 +10,9 @@ mkdir -p "$folder"
 [ ! -e "$folder/SHA256SUMS" ] || { echo "backup: $folder holds a backup already; give another folder." >&2; exit 2; }
 $compose exec -T postgres pg_dump --username dentine --format custom dentine >"$folder/database.dump"
 # What is being written has a name that begins with a dot, and goes on or is removed by itself.
-$compose exec -T api tar --create --directory /data --exclude './jobs/*/.*.[0-9]*' --warning no-file-changed --warning no-file-removed --file - . \
-    >"$folder/data.tar" || [ $? -eq 1 ]
+# Status 1 of tar is a file that changed while it was read.
+$compose exec -T api sh -c \
+    'tar --create --directory /data --exclude "./jobs/*/.*.[0-9]*" --exclude ./lost+found --warning no-file-changed --warning no-file-removed --file - . || [ $? -eq 1 ]' \
+    >"$folder/data.tar"
 (cd "$folder" && sha256sum database.dump data.tar >SHA256SUMS.partial && mv SHA256SUMS.partial SHA256SUMS)
 echo "backup: database and data are in $folder"
