@@ -10,7 +10,7 @@ $compose up --detach --wait postgres
 $compose exec -T postgres dropdb --username dentine --if-exists --force dentine
 $compose exec -T postgres createdb --username dentine dentine
 $compose exec -T postgres pg_restore --username dentine --dbname dentine --exit-on-error <"$folder/database.dump"
-$compose run --rm --no-deps -T api find /data -mindepth 1 -not -path '/data/lost+found*' -delete
+$compose run --rm --no-deps -T api find /data -mindepth 1 -maxdepth 1 -not -name lost+found -exec rm -rf {} +
 $compose run --rm --no-deps -T api tar --extract --directory /data --file - <"$folder/data.tar"
 $compose up --detach
 echo "restore: done; jobs that were under way go on from what they had published"
