@@ -44,10 +44,14 @@ def test_a_setup_link_works_once(chromium: Browser, server: httpx.Client, link: 
         looked_at(page, f"setup-{scheme}-{width}")
         page.get_by_role("button", name="Make the administrator's token").click()
         token = page.locator(".token").inner_text()
+        expect(page.get_by_role("button", name="Run the demo")).to_be_visible()
         looked_at(page, f"setup-done-{scheme}-{width}")
         assert "setup" not in page.url
         assert server.get("/v1/tokens", headers={"Authorization": f"Bearer {token}"}).status_code == 200
-        page.get_by_role("button", name="Go on to the page").click()
+        page.get_by_role("link", name="New job").click()
+        expect(page.locator(".token")).to_be_visible()  # until its owner has kept it
+        page.get_by_role("button", name="I have kept it").click()
+        expect(page.locator(".token")).to_have_count(0)
         expect(page.locator("#account")).to_contain_text("administrator")
         expect(page.locator("#jobs")).to_be_visible()
         assert page.evaluate("[document.cookie, localStorage.length, sessionStorage.length]") == ["", 0, 0]

@@ -7,7 +7,7 @@ import { JobList } from "./jobList";
 import { JobView } from "./jobView";
 import { NEW, NewJobView, RIG } from "./newJobView";
 import { RigView } from "./rigView";
-import { SetupView } from "./setupView";
+import { SetupView, tokenCard } from "./setupView";
 import { SignIn } from "./signIn";
 import { SubmitView } from "./submitView";
 import { WorkerList } from "./workerList";
@@ -41,6 +41,7 @@ let isSignedOut = false;
 /** Whether the next refresh opens the address: nothing was opened yet, or what was failed in a way that may pass. */
 let isViewDue = true;
 let isAccountDue = true;
+let unkept: HTMLElement | null = null;
 
 function showConnection(): void {
   connection.textContent = isSignedOut ? "" : listTrouble || viewTrouble;
@@ -76,7 +77,7 @@ async function open(): Promise<void> {
   list.select(id);
   mark(domeLink, location.hash === DOME);
   mark(newLink, location.hash === NEW);
-  if (!isViewDue) main.replaceChildren();
+  if (!isViewDue) show();
   isViewDue = false;
   const opened = viewOf(location.hash, id);
   if (!opened) {
@@ -86,7 +87,7 @@ async function open(): Promise<void> {
   view = opened;
   try {
     await opened.start();
-    if (view === opened) main.replaceChildren(opened.root);
+    if (view === opened) show(opened.root);
   } catch (problem) {
     if (problem instanceof Unauthenticated) askForToken();
     if (view !== opened) return;
@@ -114,7 +115,7 @@ function mark(link: HTMLAnchorElement, isHere: boolean): void {
 /** Where a job was deleted: the newest one that is left. */
 async function showNewest(): Promise<void> {
   leave();
-  main.replaceChildren();
+  show();
   history.replaceState(null, "", "#");
   isViewDue = true;
   await refreshList();
@@ -129,7 +130,7 @@ function leave(): void {
 
 /** A sentence that stands there already is not told again. */
 function showProblem(sentence: string): void {
-  if (main.textContent !== sentence) main.replaceChildren(element("p", { class: "failure", role: "alert" }, sentence));
+  if (main.textContent !== sentence) show(element("p", { class: "failure", role: "alert" }, sentence));
 }
 
 function askForToken(): void {
@@ -138,7 +139,7 @@ function askForToken(): void {
   leave();
   hideAll();
   const form = new SignIn(() => void start());
-  main.replaceChildren(form.root);
+  show(form.root);
   form.root.querySelector("input")?.focus();
 }
 
@@ -169,12 +170,27 @@ async function showAccount(): Promise<void> {
   account.replaceChildren(`${session.name} `, button);
 }
 
+/** Put something into the main part, below a token that its owner has not kept yet. */
+function show(...content: HTMLElement[]): void {
+  main.replaceChildren(...(unkept ? [unkept] : []), ...content);
+}
+
+function showToken(token: string): void {
+  const card = tokenCard(token, () => {
+    unkept = null;
+    card.remove();
+    main.focus();
+  });
+  unkept = card;
+  void start();
+}
+
 async function start(): Promise<void> {
   const secret = location.hash.match(SETUP)?.[1];
   if (secret) {
     isSignedOut = true;
     hideAll();
-    main.replaceChildren(new SetupView(secret, () => void start()).root);
+    show(new SetupView(secret, showToken).root);
     return;
   }
   isSignedOut = false;
@@ -183,7 +199,7 @@ async function start(): Promise<void> {
   jobs.hidden = false;
   workers.hidden = false;
   newLink.hidden = false;
-  main.replaceChildren();
+  show();
   await refreshList();
   if (isSignedOut) return;
   void workerList.refresh();

@@ -1,4 +1,4 @@
-/** What a setup link opens: makes the administrator's token, shows it this once, and signs the browser in. */
+/** What a setup link opens: makes the administrator's token and signs the browser in; the token is shown this once, beside the page. */
 
 import { sentenceOf, setUp } from "./api";
 import { element } from "./element";
@@ -10,7 +10,7 @@ export class SetupView {
 
   constructor(
     private readonly secret: string,
-    private readonly onSuccess: () => void,
+    private readonly onSuccess: (token: string) => void,
   ) {
     this.refusal.hidden = true;
     this.make.addEventListener("click", () => void this.redeem());
@@ -27,31 +27,32 @@ export class SetupView {
     this.refusal.hidden = true;
     try {
       const { token } = await setUp(this.secret);
-      history.replaceState(null, "", "#/"); // the link is void, and need not be seen again
-      this.show(token);
+      history.replaceState(null, "", location.pathname); // the link is void, and need not be seen again
+      this.onSuccess(token);
     } catch (problem) {
       this.refusal.hidden = false;
       this.refusal.textContent = sentenceOf(problem);
       this.make.disabled = false;
     }
   }
+}
 
-  private show(token: string): void {
-    const shown = element("code", { class: "token", tabindex: "0" }, token);
-    const copied = element("span", { class: "done", role: "status" });
-    const copy = element("button", { type: "button" }, "Copy");
-    copy.addEventListener("click", () => void copyText(shown).then((sentence) => (copied.textContent = sentence)));
-    const go = element("button", { type: "button", class: "primary" }, "Go on to the page");
-    go.addEventListener("click", () => this.onSuccess());
-    this.root.replaceChildren(
-      element("h2", {}, "Your administrator's token"),
-      element("p", {}, "Keep it where you keep passwords: it is not shown again. This browser is signed in already; the command line reads it from the variable DENTINE__CLIENT__TOKEN."),
-      shown,
-      element("p", { class: "fields" }, copy, copied),
-      go,
-    );
-    go.focus();
-  }
+/** The token on a card that stays until its owner has kept it. */
+export function tokenCard(token: string, onKept: () => void): HTMLElement {
+  const shown = element("code", { class: "token", tabindex: "0" }, token);
+  const copied = element("span", { class: "done", role: "status" });
+  const copy = element("button", { type: "button" }, "Copy");
+  copy.addEventListener("click", () => void copyText(shown).then((sentence) => (copied.textContent = sentence)));
+  const kept = element("button", { type: "button" }, "I have kept it");
+  kept.addEventListener("click", onKept);
+  return element(
+    "section",
+    { class: "setup" },
+    element("h2", {}, "Your administrator's token"),
+    element("p", {}, "Keep it where you keep passwords: it is not shown again. This browser is signed in already; the command line reads it from the variable DENTINE__CLIENT__TOKEN."),
+    shown,
+    element("p", { class: "fields" }, copy, kept, copied),
+  );
 }
 
 /** Copies where the browser lets pages copy, else selects; answers with a sentence. */
