@@ -1,4 +1,4 @@
-"""A slab folder to its material: a small cell, its images by the walk itself."""
+"""A slab folder to its material: a small cell by the walk itself, and the three truths that another program made."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.fit.slab.dictionary import henyey_greenstein
+from services.fit.slab.dictionary import ANGLES_RAD, henyey_greenstein
 from services.fit.slab.fit import SlabOptions, fit_slab, write_results
-from services.fit.slab.folder import SlabFolder
+from services.fit.slab.folder import SlabFolder, read_folder
 from services.fit.slab.forward import render
 from services.fit.slab.result import SlabFit
 from services.fit.slab.rig import rig_of
+from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 NOISE = 0.01
@@ -87,3 +88,63 @@ def test_the_command_refuses_a_folder_that_is_none(tmp_path: Path) -> None:
     assert refused.exit_code == 2
     assert "slab.json does not exist" in refused.output
     assert not (tmp_path / "out").exists()
+
+
+def noisy_truth(name: str, out: Path, seed: int) -> dict[str, object]:
+    """A truth's folder with 1 % Poisson noise added to its images and to their variances; returns what is true."""
+    root = shared_path(f"data/slab-truth/{name}")
+    folder = read_folder(root)
+    (out / "slab.json").write_bytes((root / "slab.json").read_bytes())
+    noise = np.random.default_rng(seed)
+    for entry in folder.images:
+        image, variance = (np.load(root / file).astype(np.float64) for file in (entry.file, str(entry.variance_file)))
+        added = NOISE**2 * image * image.mean()
+        np.save(out / entry.file, image + np.sqrt(added) * noise.normal(size=image.shape))
+        np.save(out / str(entry.variance_file), variance + added)
+    return dict(json.loads((root / "truth.json").read_text()))
+
+
+def errors_of(fit: SlabFit, truth: dict[str, object]) -> dict[str, float]:
+    """Relative errors: sigma_s, sigma_s', phase L2 on steps of 0.5 degrees, and sine-weighted."""
+    angles, true = np.radians(np.array(truth["theta_deg"])), np.array(truth["phase_per_sr"])
+    found = np.interp(angles, ANGLES_RAD, np.array(fit.phase.value_per_sr))
+    squares, sines = (found - true) ** 2, np.sin(angles)
+    sigma_s, g = float(str(truth["sigma_s"])), float(str(truth["g"]))
+    return {
+        "sigma_s": fit.parameters.sigma_s.value / sigma_s - 1,
+        "sigma_s_reduced": fit.parameters.sigma_s_reduced.value / (sigma_s * (1 - g)) - 1,
+        "phase": float(np.sqrt(squares.sum() / (true**2).sum())),
+        "phase_by_sine": float(np.sqrt((sines * squares).sum() / (sines * true**2).sum())),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ["mie-500nm", "two-lobe"])
+def test_cells_seen_near_the_beam_are_measured(name: str, tmp_path: Path) -> None:
+    # Issue's tolerances, by the rms over five seeds.
+    errors = []
+    for seed in range(11, 16):
+        truth = noisy_truth(name, tmp_path, seed)
+        (fit,) = fit_slab(tmp_path, SlabOptions(seed=seed))
+        errors.append(errors_of(fit, truth))
+        assert fit.core_seconds < 1800
+    rms = {key: float(np.sqrt(np.mean([error[key] ** 2 for error in errors]))) for key in errors[0]}
+    for key, tolerance in (("sigma_s", 0.01), ("sigma_s_reduced", 0.01), ("phase", 0.02), ("phase_by_sine", 0.03)):
+        assert rms[key] <= tolerance, (key, errors)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_angles_that_no_camera_sees_are_flagged(tmp_path: Path) -> None:
+    errors = []
+    for seed in range(11, 16):
+        truth = noisy_truth("hg-paper-angles", tmp_path, seed)
+        (fit,) = fit_slab(tmp_path, SlabOptions(seed=seed))
+        errors.append(errors_of(fit, truth)["sigma_s"])
+        # Cameras and beams differ by 7.5 degrees in the medium at least; beyond 20 degrees all is seen. The seventh and eighth
+        # knot are next to that and may be determined by it.
+        flagged = np.array(fit.phase.theta_deg)[~np.array(fit.phase.determined)]
+        assert (flagged < 6).sum() >= 6
+        assert not ((flagged > 20) & (flagged < 90)).any()
+    assert float(np.sqrt(np.mean(np.square(errors)))) <= 0.015

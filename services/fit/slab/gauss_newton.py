@@ -31,6 +31,8 @@ MOST_HALVINGS = 4
 
 WORTHWHILE = 2.0
 """A step that promises less than so many times what noise alone does waits for more paths."""
+UNFINISHED = 5.0
+"""At the end, a step that promised more than so many times what noise does is followed by another."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it strayed."""
 
@@ -44,7 +46,9 @@ class Budget:
     search_paths: int = 8000
     """At most, until the last step."""
     last: tuple[tuple[int, int], ...] = ((15000, 16), (30000, 24))
-    """Paths and batches of the steps at the end."""
+    """Paths and batches of the stages at the end."""
+    most_last: int = 4
+    """Steps of a stage."""
     most_steps: int = 10
 
 
@@ -124,13 +128,18 @@ class GaussNewton:
         return State(state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping), False
 
     def finish(self, state: State, steps: int, converged: bool) -> Solution:
-        """A step from many paths, and one more from the most."""
+        """Steps from many paths, then from the most: each stage until its paths tell of nothing more."""
         material = state.material
         for paths, batches in self.budget.last:
-            equations = self.linearised(material, paths, batches)
-            quadratic, x = quadratic_at(material, equations), unknowns(material)
-            scale = self.best_scale(material, quadratic)
-            material = material_at(x + self.change(quadratic, precision(scale), x, DAMPING))
+            for _ in range(self.budget.most_last):
+                equations = self.linearised(material, paths, batches)
+                quadratic, x = quadratic_at(material, equations), unknowns(material)
+                scale = self.best_scale(material, quadratic)
+                prior = precision(scale)
+                change = self.change(quadratic, prior, x, DAMPING)
+                material = material_at(x + change)
+                if promised(quadratic, prior, x, change) < UNFINISHED * noise_of_promise(quadratic, prior, equations.gradient_noise):
+                    break
         return Solution(material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths)
 
     @staticmethod

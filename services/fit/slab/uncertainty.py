@@ -16,9 +16,9 @@ from services.fit.slab.prior import RIDGE, precision
 
 Array = NDArray[np.float64]
 
-SHARPEST, BLUNTEST, POLE_RAD = 300.0, 10.0, math.radians(8)
+SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
 """Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
-HG 0.9 bends by 270 at its peak; any narrower prior there would let smoothness pass for a measurement."""
+HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
 LEAST_SIGNAL = 0.1
 """Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
 LARGEST_SHARE = 0.1
