@@ -51,7 +51,7 @@ make_machine() {
         *) mirror=http://deb.debian.org/debian parts=main ;;
     esac
     packages=make,python3
-    [ "$who" = root ] || packages=$packages,sudo
+    [ "$who" = root ] || packages=$packages,passwd,sudo
     say "making $suite"
     mmdebstrap --quiet --variant=apt --include="$packages" --components="$parts" ${BARE_KEYRING:+--keyring="$BARE_KEYRING"} \
         "$suite" "$machine" "${BARE_MIRROR:-$mirror}" </dev/null >"$logs/$suite-machine.log" 2>&1 || die "mmdebstrap failed; see $logs/$suite-machine.log." 1
