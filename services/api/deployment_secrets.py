@@ -12,6 +12,7 @@ Each of the three folders can be a volume of its own, so that every part is give
 from __future__ import annotations
 
 import secrets
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from services.core.errors import SettingsError
 from services.core.private_files import write_private
 
 AUTHORITY_LIFE = timedelta(days=3650)
@@ -38,6 +40,9 @@ def make_missing(folder: Path, *, renew: bool = False) -> list[str]:
 
     Returns:
         What was made, in words.
+
+    Raises:
+        SettingsError: a file that is there is no certificate or key of the kind that this program makes.
     """
     authority, tls, database = (folder / name for name in ("authority", "tls", "database"))
     for one in (authority, tls, database):
@@ -63,7 +68,22 @@ def write_password(path: Path, password: str) -> None:
 def _ends_soon(path: Path) -> bool:
     if not path.exists():
         return True
-    return x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc < datetime.now(UTC) + RENEW_BEFORE
+    return _certificate(path).not_valid_after_utc < datetime.now(UTC) + RENEW_BEFORE
+
+
+def _certificate(path: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except ValueError as problem:
+        raise SettingsError(f"{path} is no PEM certificate; restore it, or remove it and what it signed so that both are made anew.") from problem
+
+
+def _signing_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    with suppress(ValueError, TypeError):  # TypeError: it wants a passphrase
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+        if isinstance(key, ec.EllipticCurvePrivateKey):
+            return key
+    raise SettingsError(f"{path} is no plain elliptic-curve key in PEM; restore it, or remove the folder so that another authority is made.")
 
 
 def _make_authority(folder: Path) -> None:
@@ -87,10 +107,7 @@ def _make_authority(folder: Path) -> None:
 
 
 def _make_certificate(authority: Path, folder: Path) -> None:
-    signer = serialization.load_pem_private_key((authority / "ca.key").read_bytes(), None)
-    if not isinstance(signer, ec.EllipticCurvePrivateKey):
-        raise TypeError("The authority's key is of another kind than this program makes.")
-    issuer = x509.load_pem_x509_certificate((authority / "ca.crt").read_bytes())
+    signer, issuer = _signing_key(authority / "ca.key"), _certificate(authority / "ca.crt")
     key = ec.generate_private_key(ec.SECP256R1())
     identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
     builder = _builder(_name("dentine part"), issuer.subject, key, CERTIFICATE_LIFE)

@@ -13,6 +13,7 @@ from cryptography import x509
 from services.api import deployment_secrets
 from services.api.dask_tls import Certificates
 from services.api.deployment_secrets import make_missing
+from services.core.errors import SettingsError
 
 
 def mode(path: Path) -> int:
@@ -51,6 +52,18 @@ def test_a_certificate_is_renewed_before_it_ends_by_the_same_authority(tmp_path:
     assert make_missing(tmp_path, renew=True) == ["certificate"]
     assert (tmp_path / "authority" / "ca.crt").read_bytes() == authority
     Certificates.of(tmp_path / "tls")
+
+
+@pytest.mark.parametrize(("path", "reason"), [("authority/ca.key", "no plain elliptic-curve key"), ("authority/ca.crt", "no PEM certificate")])
+def test_a_damaged_file_is_named_and_nothing_is_made(tmp_path: Path, path: str, reason: str) -> None:
+    make_missing(tmp_path)
+    (tmp_path / path).chmod(0o600)
+    (tmp_path / path).write_text("damaged\n")
+    before = (tmp_path / "tls" / "tls.crt").read_bytes()
+    with pytest.raises(SettingsError, match=reason) as told:
+        make_missing(tmp_path, renew=True)
+    assert str(tmp_path / path) in told.value.message
+    assert (tmp_path / "tls" / "tls.crt").read_bytes() == before
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only the superuser reads what nobody else may")
