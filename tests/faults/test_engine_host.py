@@ -7,12 +7,13 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
-from distributed import Client, Future, LocalCluster, get_worker
+from distributed import Client, LocalCluster, get_worker
 
 from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
 from services.fit.anatomy.incisor import build_incisor
@@ -147,11 +148,12 @@ def test_a_cancel_in_mid_kernel_leaves_the_worker_the_same_process(recipe: Store
         flag, started = tmp_path / "cancel", tmp_path / "started"
         run_on = DaskExecutor(client, BROKEN, "cancelled", flag)
         (before,) = run_on.gather([run_on.submit("pid", worker_pid)])
-        pending: Future = run_on.submit("hang", hang, recipe, str(started))
-        while not started.exists():
-            time.sleep(0.01)
-        flag.touch()
-        with pytest.raises(JobCancelledError):
-            pending.result(timeout=300)
+        with ThreadPoolExecutor(1) as waiting:
+            pending = waiting.submit(run_on.gather, [run_on.submit("hang", hang, recipe, str(started))])
+            while not started.exists():
+                time.sleep(0.01)
+            flag.touch()
+            with pytest.raises(JobCancelledError):
+                pending.result(timeout=300)
         free = DaskExecutor(client, BROKEN, "next", tmp_path / "no")
         assert free.gather([free.submit("pid", worker_pid)]) == [before]

@@ -49,7 +49,7 @@ class InThisProcess:
             patch.setattr("services.api.pipeline._run_tasks", self._run)
             run_stages(spec, folder, ("prepare", "fit", "export"), events=events, doors=toy_stages.DOORS | {"prepare": "services.preprocess.stage:run"})
 
-    def _run(self, _processes: object, _count: int, tasks: list[StageTask], _watch: object) -> None:
+    def _run(self, _processes: object, _count: int, tasks: list[StageTask], *_: object) -> None:
         assert self.go.wait(60)
         for task in tasks:
             task()
