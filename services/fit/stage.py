@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ENGINE = "services.fit.transport.engine:Engine"
 
 
-PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "PIL", "rtree", "scipy", "xatlas")
+PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "numba", "PIL", "rtree", "scipy", "xatlas")
 """What the extra ``fit`` brings, by the names under which it is imported."""
 
 
