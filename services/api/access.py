@@ -69,8 +69,12 @@ def refuse_open_network(settings: ServerSettings) -> None:
         )
 
 
-def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks) -> None:
-    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write."""
+def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks, dark_auditors: Clerks) -> None:
+    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
+
+    Args:
+        dark_auditors: write what darkens a dome, so that its answer waits behind no other change's row.
+    """
     from services.api.access_routes import build_access_router
     from services.api.body_limit import BodyLimit
     from services.api.gate import Gate
@@ -81,4 +85,4 @@ def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
     app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
     app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
-    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors)
+    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors)

@@ -7,6 +7,7 @@ from pydantic import Field, SecretStr
 
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
+from services.api.bodies import Sent
 from services.api.database import MOST_ID
 from services.api.guard import needs
 from services.api.problems import refusals
@@ -22,7 +23,7 @@ class TokenRequest(Record):
     """A token to make."""
 
     name: str = Field(description="who or what uses it", json_schema_extra={"pattern": f"^{NAME}$"})
-    scopes: tuple[Scope, ...] = Field(description="what it may do", json_schema_extra={"minItems": 1})
+    scopes: tuple[Scope, ...] = Field(fail_fast=True, description="what it may do", json_schema_extra={"minItems": 1})
     expires_days: Number | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
 
 
@@ -52,7 +53,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
-    def create(wanted: TokenRequest, request: Request, response: Response) -> IssuedToken:
+    def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:
         """Make a token. Its secret is in this answer and nowhere else."""
         issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["deed"])
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
@@ -73,7 +74,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         response.set_cookie(COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure)
 
     @router.post("/setup", status_code=201, tags=["access"])
-    def set_up(link: SetupRequest, request: Request, response: Response) -> IssuedToken:
+    def set_up(link: Sent[SetupRequest], request: Request, response: Response) -> IssuedToken:
         """Make the first administrator's token by the link in the server's log, which works once, and open a browser session for it."""
         if access.sessions is None:
             raise SetupLinkError("This server asks nobody for a token, so there is nothing to set up; open its page.")

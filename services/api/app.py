@@ -26,6 +26,12 @@ if TYPE_CHECKING:
 PHANTOMS = "phantoms"
 """In the data folder: mouths of demonstrations, each rendered once. Whatever is removed there is made again."""
 STATIC = Path(__file__).parent / "dashboard" / "static"
+DARKENERS = 8
+"""Threads that do nothing but ALL OFF, so that nothing that hangs keeps anybody from darkness: as many as may be asked for at once."""
+CANCELLERS = 4
+"""Threads that cancel jobs. Each of them may wait for the database, which ALL OFF does only once it is dark."""
+OPERATORS = 8
+"""Threads that ask a dome for its state and light single lights. One that hangs holds each of them for half a minute."""
 UNBUILT = STATIC.with_name("unbuilt")
 """The page that says how the dashboard is built."""
 
@@ -83,6 +89,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             dome.close()
 
     readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
+    # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
+    darkeners, dark_auditors, cancellers, operators = Clerks(DARKENERS), Clerks(1), Clerks(CANCELLERS), Clerks(OPERATORS)
     feed = EventFeed(jobs.repository, readers.ask)
     observation = Observation(jobs, settings, readers, openers, certificates, None if run else workers.condition)
 
@@ -100,20 +108,21 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
-            for close in (darken, readers.close, openers.close, lookers.close, auditors.close, jobs.close, workers.close):
+            everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators)
+            for close in (darken, *(clerks.close for clerks in everybody), jobs.close, workers.close):
                 await closing.ask(close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
     app.state.darken = darken
     problems.install(app)
-    app.include_router(build_router(jobs, feed, readers, openers, lookers))
+    app.include_router(build_router(jobs, feed, readers, openers, lookers, cancellers))
     app.include_router(build_captures_router(jobs.captures))
     app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
     app.include_router(build_masks_router(jobs, Masks(jobs)))
-    app.include_router(build_dome_router(dome))
+    app.include_router(build_dome_router(dome, darkeners, operators))
     app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
-    access.install(app, settings, jobs.repository.engine, auditors)
+    access.install(app, settings, jobs.repository.engine, auditors, dark_auditors)
     app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
     names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
     app.add_middleware(Shield, names=names, secure=not settings.is_loopback)

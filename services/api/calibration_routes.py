@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
 
+from services.api.bodies import Sent
 from services.api.calibrations import NAME, CalibrationDetail, Calibrations, NamedCalibration
 from services.api.captures import Captures
 from services.api.guard import needs
@@ -29,7 +30,7 @@ def build_calibrations_router(calibrations: Calibrations, captures: Captures) ->
         return calibrations.get(name)
 
     @router.put("/calibrations/{name}", status_code=201, responses={200: {"model": CalibrationDetail}}, dependencies=[needs("submit")])
-    def put(name: Name, calibration: Calibration, response: Response) -> CalibrationDetail:
+    def put(name: Name, calibration: Sent[Calibration], response: Response) -> CalibrationDetail:
         """Store a calibration under a new name: 201, or 200 where it is there already. A name never changes its content: 409."""
         creation = calibrations.put(name, calibration)
         response.status_code = 201 if creation.is_new else 200

@@ -34,7 +34,7 @@ class ManifestFile(Record):
 class UploadManifest(Record):
     """What a client wants to upload."""
 
-    files: tuple[ManifestFile, ...] = Field(min_length=1, description="every file of the capture")
+    files: tuple[ManifestFile, ...] = Field(min_length=1, fail_fast=True, description="every file of the capture")
     subject: str | None = Field(default=None, pattern=f"^{SUBJECT}$", description="pseudonymous label of the person; never a name")
 
     def digest(self) -> str:

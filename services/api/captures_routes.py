@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.api.bodies import Sent
 from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
 from services.api.database import MOST_ID
@@ -54,7 +55,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
     under = APIRouter(prefix="/v1/captures", responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
 
     @under.post("", status_code=201, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
-    def create(manifest: UploadManifest, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> CaptureDetail:
+    def create(manifest: Sent[UploadManifest], response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> CaptureDetail:
         """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
         creation = captures.create(manifest, idempotency_key)
         response.status_code = 201 if creation.is_new else 200

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -32,7 +33,7 @@ EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
 """What the API's description says of a stream."""
 
 
-_UNBUFFERED = MappingProxyType({"X-Accel-Buffering": "no"})
+UNBUFFERED = MappingProxyType({"X-Accel-Buffering": "no"})
 
 
 class EventStream(StreamingResponse):
@@ -43,13 +44,19 @@ class EventStream(StreamingResponse):
 
 @dataclass(frozen=True)
 class Chapter:
-    """Events of a job after some id, as they are sent; the last one carries the final state, which may be that the job is being deleted."""
+    """Events of a job after some id, as they are sent."""
 
     text: bytes
     last_id: int
-    is_last: bool
+    ended: JobState | None
+    """The state in which the job ended, where these are its last events: a final one, or that it is being deleted."""
     is_full: bool
     """Whether more may have happened already."""
+
+    @property
+    def told(self) -> bytes:
+        """As a stream of this job alone sends it."""
+        return self.text if self.ended is None else self.text + format_sse_event(event="end", data_str=f'"{self.ended}"')
 
 
 @dataclass
@@ -97,9 +104,9 @@ class EventFeed:
         """
         turn = self._turns[-1]
         chapter = await self._read(turn, job_id, after)
-        if chapter.is_last:
-            return Response(chapter.text, headers=_UNBUFFERED, media_type=EventStream.media_type)
-        return EventStream(self.follow(job_id, after, (turn, chapter)), headers=_UNBUFFERED)
+        if chapter.ended is not None:
+            return Response(chapter.told, headers=UNBUFFERED, media_type=EventStream.media_type)
+        return EventStream(self.follow(job_id, after, (turn, chapter)), headers=UNBUFFERED)
 
     async def follow(self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None) -> AsyncIterator[bytes]:
         """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or the job's deletion.
@@ -114,11 +121,11 @@ class EventFeed:
             except UnknownJobError:
                 return
             except sql.exc.SQLAlchemyError:
-                chapter = Chapter(b"", after, is_last=False, is_full=False)  # the next ping's look makes up for it
+                chapter = Chapter(b"", after, ended=None, is_full=False)  # the next ping's look makes up for it
             opening = None
-            if chapter.text:
-                yield chapter.text
-            if chapter.is_last:
+            if told := chapter.told:
+                yield told
+            if chapter.ended is not None:
                 return
             after = chapter.last_id
             while not chapter.is_full:
@@ -132,6 +139,47 @@ class EventFeed:
                 if job_id in turn.jobs or following is None:
                     break
                 turn = following
+
+    async def follow_several(self, after: Mapping[str, int]) -> AsyncIterator[bytes]:
+        """Events of several jobs in one stream, each after an id, replayed and then live, until all have ended or are deleted.
+
+        A browser has six connections to a server; a stream for each job that it shows would leave none for anything else. Each job ends with event 'end',
+        whose data names it and its final state, null for a job that is not there.
+        """
+        reached, due, turn = dict(after), set(after), self._turns[-1]
+        while reached:
+            for job_id in sorted(due):
+                try:
+                    chapter = await self._read(turn, job_id, reached[job_id])
+                except UnknownJobError:
+                    yield _end_of(job_id, None)
+                    del reached[job_id]
+                    continue
+                except sql.exc.SQLAlchemyError:
+                    continue  # the next ping's look makes up for it
+                if chapter.text:
+                    yield chapter.text
+                if chapter.ended is not None:
+                    yield _end_of(job_id, chapter.ended)
+                    del reached[job_id]
+                    continue
+                reached[job_id] = chapter.last_id
+                if chapter.is_full:
+                    break
+            else:
+                due = set()
+            while reached and not due:
+                try:
+                    async with asyncio.timeout(PING_S):
+                        await turn.ended.wait()
+                except TimeoutError:
+                    yield KEEPALIVE_COMMENT
+                    due = set(reached)
+                    break
+                following = self._after(turn)
+                due = reached.keys() & turn.jobs if following is not None else set(reached)
+                turn = following or self._turns[-1]
+            due &= reached.keys()
 
     def _after(self, turn: Turn) -> Turn | None:
         """The turn after one that has ended; None if it is not remembered. Turns do not know it, or a stalled stream would keep all that came after."""
@@ -150,8 +198,11 @@ class EventFeed:
 def _read(repository: Repository, job_id: str, after: int) -> Chapter:
     state = repository.get(job_id).state  # before its events: those of a final state are then among them
     events = repository.events_of(job_id).read(after, MOST_EVENTS)
-    told = [format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events]
+    told = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
     is_full = len(events) == MOST_EVENTS
-    if is_last := (state.is_final or state is JobState.DELETING) and not is_full:
-        told.append(format_sse_event(event="end", data_str=f'"{state}"'))
-    return Chapter(b"".join(told), events[-1].id if events else after, is_last, is_full)
+    has_ended = (state.is_final or state is JobState.DELETING) and not is_full
+    return Chapter(told, events[-1].id if events else after, state if has_ended else None, is_full)
+
+
+def _end_of(job_id: str, state: JobState | None) -> bytes:
+    return format_sse_event(event="end", data_str=json.dumps({"job": job_id, "state": state}))

@@ -36,9 +36,9 @@ RECHECK_S = 5.0
 class Gate:
     """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
 
-    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks) -> None:
+    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks, dark_auditors: Clerks) -> None:
         self._app, self._owner, self._access, self._rates = app, owner, access, rates
-        self._audit, self._auditors = audit, auditors
+        self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -110,7 +110,9 @@ class Gate:
 
     async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
         scope = request.scope
-        is_audited = scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
+        declared = route.needs if route is not None else None
+        is_audited = scope["method"] not in SAFE_METHODS or (declared is not None and declared.audited)
+        auditors = self._dark_auditors if declared is not None and declared.darkens else self._auditors
         known_at, is_over = time.monotonic(), False
 
         async def send_audited(message: Message) -> None:
@@ -120,7 +122,7 @@ class Gate:
             if message["type"] == "http.response.start" and is_audited:
                 deed.ids |= _made(message)
                 try:
-                    await self._auditors.ask(self._audit.append, deed, message["status"])
+                    await auditors.ask(self._audit.append, deed, message["status"])
                 except SQLAlchemyError:
                     is_over = True
                     full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
@@ -140,7 +142,7 @@ class Gate:
             except Exception:
                 if is_audited:
                     with suppress(SQLAlchemyError):
-                        await self._auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                        await auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
                 raise
 
     async def _is_still_known(self, request: HTTPConnection) -> bool:

@@ -29,19 +29,24 @@ PAGE = "dashboard"
 class Needs(HTTPBearer):
     """Refuses callers without a scope; also what the OpenAPI description says of the route."""
 
-    def __init__(self, scope: Scope, *, audited: bool) -> None:
+    def __init__(self, scope: Scope, *, audited: bool, darkens: bool) -> None:
         super().__init__(scheme_name="token", auto_error=False)
-        self.scope, self.audited = scope, audited
+        self.scope, self.audited, self.darkens = scope, audited, darkens
 
     async def __call__(self, request: Request) -> None:  # type: ignore[override]
         """Check the caller that the gate has found; the gate has refused already, unless somebody built an application without it."""
         require(request.scope.get("caller"), self.scope)
 
 
-def needs(scope: str, *, audited: bool = False) -> params.Security:
-    """Declare the one scope that a route needs. Changes are always audited; ``audited`` says it of a route that only reads."""
+def needs(scope: str, *, audited: bool = False, darkens: bool = False) -> params.Security:
+    """Declare the one scope that a route needs.
+
+    Args:
+        audited: of a route that only reads; changes always are.
+        darkens: whether it darkens a dome, so that its row of the audit is written before those of others.
+    """
     known = Scope(scope)
-    return params.Security(Needs(known, audited=audited), scopes=[known])
+    return params.Security(Needs(known, audited=audited, darkens=darkens), scopes=[known])
 
 
 def require(caller: Caller | None, scope: Scope) -> None:

@@ -138,12 +138,18 @@ class Jobs:
         Raises:
             UnknownJobError: there is no such job. JobStateError: it has ended.
         """
+        if self.repository.get(job_id).state is JobState.RUNNING:
+            # Darkness before the record of it: whoever reads the database never waits, and whoever writes may wait for seconds.
+            self._tell_to_stop(job_id)
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
-            try:
-                request_cancel(self.folder(job_id))
-            except OSError as problem:  # the runner asks again in each of its rounds
-                logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
+            self._tell_to_stop(job_id)  # again, as a job that was just begun forgets what was told before
         return self.repository.get(job_id)
+
+    def _tell_to_stop(self, job_id: str) -> None:
+        try:
+            request_cancel(self.folder(job_id))
+        except OSError as problem:  # the runner asks again in each of its rounds
+            logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
 
     def retry(self, job_id: str) -> Job:
         """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it had published and is still good.
@@ -185,8 +191,10 @@ class Jobs:
 
     def cancel_captures(self) -> list[str]:
         """Cancel every job that captures or will capture next; returns their ids."""
-        cancelled = []
-        for job in self._to_capture(self.repository.queued()) + self.capturing():
+        cancelled, capturing = [], self.capturing()
+        for job in capturing:  # all of them before the first is recorded, as each may have a dome of its own
+            self._tell_to_stop(job.id)
+        for job in self._to_capture(self.repository.queued()) + capturing:
             with suppress(JobStateError):
                 self.cancel(job.id)
                 cancelled.append(job.id)

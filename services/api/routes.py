@@ -5,13 +5,14 @@ import json
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import Field
+from pydantic import Field, StringConstraints
 
 from services.api.answers import in_json
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
+from services.api.bodies import Sent
 from services.api.clerks import Clerks
 from services.api.database import MOST_ID
-from services.api.feed import EVENT_ANSWERS, EventFeed
+from services.api.feed import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream
 from services.api.guard import needs, require
 from services.api.job_table import JobFilter
 from services.api.jobs import Jobs, StageProgress
@@ -25,6 +26,12 @@ from services.core.records import JobName, JobSpec
 
 LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
+
+
+MOST_STREAMED = 64
+"""Jobs in one stream of events."""
+_PLACE = "a job's id, and after a colon the id of its last event that is known already"
+Place = Annotated[str, StringConstraints(pattern=r"^[0-9a-zA-Z]{1,40}(:[0-9]{1,9})?$")]
 
 
 class Submission(JobSpec):
@@ -64,8 +71,8 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, lookers: Clerks) -> APIRouter:
-    """Routes over the given jobs; ``openers`` read their files, ``lookers`` their captures, which may hang."""
+def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, lookers: Clerks, cancellers: Clerks) -> APIRouter:
+    """Routes over the given jobs; ``openers`` read their files, ``lookers`` their captures, which may hang, and ``cancellers`` cancel."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
 
@@ -86,7 +93,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
             return TimeRange(reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again.")
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
-    def submit(wanted: Submission, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
+    def submit(wanted: Sent[Submission], request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200.
 
         A job with a rig needs scope operate-dome too, unless its dome is simulated.
@@ -122,11 +129,12 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found))
 
     @router.patch("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
-    def rename(job_id: str, label: Label) -> Job:
+    def rename(job_id: str, label: Sent[Label]) -> Job:
         """Give a job another label, or none; nothing else of it can be changed."""
         return jobs.repository.rename(job_id, label.name)
 
-    @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
+    @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit", darkens=True)])
+    @cancellers.answering
     def cancel(job_id: str) -> Job:
         """Cancel a job. The lights go off first; what it has published is kept."""
         return jobs.cancel(job_id)
@@ -157,6 +165,12 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
     async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> Response:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         return await feed.answer(job_id, last_event_id or 0)
+
+    @router.get("/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
+    async def events_of_several(job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MOST_STREAMED, description=_PLACE)]) -> Response:
+        """The events of several jobs in one stream, as a browser has few connections; event 'end' names the job and its final state, null for an absent one."""
+        places = (place.partition(":") for place in job)
+        return EventStream(feed.follow_several({job_id: int(after or 0) for job_id, _, after in places}), headers=UNBUFFERED)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
     @openers.answering

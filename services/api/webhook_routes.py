@@ -6,6 +6,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
+from services.api.bodies import Sent
 from services.api.database import MOST_ID
 from services.api.deliveries import Deliveries, Delivery
 from services.api.guard import needs
@@ -28,7 +29,7 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
     router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], responses=refusals(404, 409, 422), dependencies=[needs("admin")])
 
     @router.post("", status_code=201)
-    def create(wanted: WebhookRequest, response: Response) -> NewWebhook:
+    def create(wanted: Sent[WebhookRequest], response: Response) -> NewWebhook:
         """Subscribe to changes of jobs' states from now on. The secret is shown this once."""
         made = webhooks.create(wanted)
         response.headers["Location"] = f"/v1/webhooks/{made.id}"
@@ -45,7 +46,7 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
         return webhooks.get(webhook_id)
 
     @router.patch("/{webhook_id}")
-    def change(webhook_id: str, wanted: WebhookChange) -> Webhook:
+    def change(webhook_id: str, wanted: Sent[WebhookChange]) -> Webhook:
         """Change the address or the states, or switch it on or off."""
         return webhooks.change(webhook_id, wanted)
 

@@ -24,7 +24,10 @@ MOST_WEBHOOKS = 100
 KEY_PREFIX = "whsec_"
 _SECRET_BYTES = 32
 
-States = Annotated[tuple[JobState, ...], Field(min_length=1, max_length=len(JobState), description="states of a job to tell of when it enters them")]
+States = Annotated[
+    tuple[JobState, ...],
+    Field(min_length=1, max_length=len(JobState), fail_fast=True, description="states of a job to tell of when it enters them"),
+]
 Url = Annotated[str, Field(min_length=1, max_length=2000, description="where to POST; https, and no private address unless the server's settings allow it")]
 
 ENDED = tuple(state for state in JobState if state.is_final)

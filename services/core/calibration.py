@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Record
 from services.core.records import CaptureManifest, FolderCapture
@@ -27,9 +29,9 @@ class Calibration(Record):
     """The part of ``capture.json`` that a rig is calibrated for."""
 
     units: Literal["mm"]
-    channels: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    lights: tuple[Light, ...]
+    channels: tuple[str, ...] = Field(fail_fast=True)
+    cameras: tuple[Camera, ...] = Field(fail_fast=True)
+    lights: tuple[Light, ...] = Field(fail_fast=True)
 
 
 def published_capture(capture: Path) -> tuple[Path, str] | None:

@@ -70,10 +70,10 @@ class FolderCapture(Record):
     """``capture.json`` of a folder capture, also the description of a rig (then ``images`` may be empty)."""
 
     units: Literal["mm"]
-    channels: tuple[Name, ...]
-    cameras: tuple[Camera, ...]
-    lights: tuple[Light, ...]
-    images: tuple[ImageEntry, ...] = ()
+    channels: tuple[Name, ...] = Field(fail_fast=True)
+    cameras: tuple[Camera, ...] = Field(fail_fast=True)
+    lights: tuple[Light, ...] = Field(fail_fast=True)
+    images: tuple[ImageEntry, ...] = Field(default=(), fail_fast=True)
 
 
 class SimulatedCameraSpec(Record):
@@ -126,6 +126,10 @@ HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "be
 """Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
 
 
+MAX_HELD = 1000
+"""Parameters that a job may hold: more than any model has."""
+
+
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
@@ -138,7 +142,7 @@ class JobSpec(Record):
     dentin: Literal["known", "fit", "none"] = Field(
         default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
     )
-    held: dict[str, float] = Field(default={}, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
+    held: dict[str, float] = Field(default={}, max_length=MAX_HELD, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
     loss: Loss = Field(default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders")
     solver: Literal["gauss-newton", "adam"] = Field(default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples")
     adam_steps: Whole = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
@@ -146,8 +150,10 @@ class JobSpec(Record):
     prior: Literal["weak", "literature"] = Field(default="weak", description="literature: media are drawn towards measured teeth where the images say little")
     stains: bool = Field(default=False, description="fit a texture of stains on the enamel after the media")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
-    held_out_lights: tuple[str, ...] | None = Field(default=None, description="lights kept from the fit; default: the capture's own, else every fourth")
-    channels: tuple[str, ...] | None = Field(default=None, description="channels to fit; default: all")
+    held_out_lights: tuple[str, ...] | None = Field(
+        default=None, fail_fast=True, description="lights kept from the fit; default: the capture's own, else every fourth"
+    )
+    channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
     samples_per_pixel: Whole = Field(default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import json
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -78,6 +79,36 @@ def test_every_stream_is_told_everything_once_and_in_order_however_slow_it_is(re
     assert len(stored) == STEPS + 4
     assert [ids_of(text) for text in texts] == [stored] * STREAMS
     assert all(text.endswith('event: end\ndata: "SUCCEEDED"\n\n') for text in texts)
+
+
+def events_in(text: str) -> list[tuple[str, str]]:
+    """Kind and data of each event of a stream."""
+    told = [dict(line.split(": ", 1) for line in one.splitlines() if not line.startswith(":")) for one in text.split("\n\n")]
+    return [(one.get("event", "message"), one["data"]) for one in told if "data" in one]
+
+
+@pytest.mark.parametrize("most", [1000, 7])
+def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(repository: Repository, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    monkeypatch.setattr(feed, "MOST_EVENTS", most)
+    monkeypatch.setattr(feed, "PING_S", 0.05)
+    leases = [start(repository, seed) for seed in range(3)]
+    known = repository.events_of(leases[2].job.id).read()[0].id
+    places = {leases[0].job.id: 0, leases[2].job.id: known, "absent": 0}
+
+    async def watch() -> str:
+        async with running(repository) as one, asyncio.TaskGroup() as group:
+            task = group.create_task(listen(one.follow_several(places), 0.001))
+            for lease in leases:
+                threading.Thread(target=work, args=(repository, lease)).start()
+        return task.result()
+
+    told = events_in(asyncio.run(watch()))
+    for lease, after in ((leases[0], 0), (leases[2], known)):
+        events = [json.loads(data) for kind, data in told if kind == "message"]
+        assert [event["id"] for event in events if event["job"] == lease.job.id] == [one.id for one in repository.events_of(lease.job.id).read(after)]
+    ends = {json.loads(data)["job"]: json.loads(data)["state"] for kind, data in told if kind == "end"}
+    assert ends == {leases[0].job.id: "SUCCEEDED", leases[2].job.id: "SUCCEEDED", "absent": None}
+    assert leases[1].job.id not in {json.loads(data)["job"] for _, data in told}
 
 
 def test_streams_that_are_equally_far_share_a_read(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:

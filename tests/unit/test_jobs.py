@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,11 +11,14 @@ import pytest
 
 from services.api import admission
 from services.api.admission import Needs
+from services.api.database import writing
 from services.api.jobs import Jobs
+from services.api.lifecycle import JobState
 from services.api.repository import Lease
 from services.core.errors import DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.core.stage import CANCEL_FLAG
 
 
 @pytest.fixture
@@ -90,3 +94,20 @@ def test_a_long_round_keeps_no_lease_from_being_renewed(tmp_path: Path, monkeypa
         go_on.set()
         service.close()
     assert set(begun_under) == {1}
+
+
+def test_a_job_is_told_to_stop_while_the_database_keeps_writers_waiting(service: Jobs, tmp_path: Path) -> None:
+    job = service.submit(JobSpec(capture=tmp_path)).job
+    service.repository.lease(job.id, "test", 60.0)
+    flag = service.folder(job.id) / CANCEL_FLAG
+    flag.parent.mkdir(parents=True)
+    with writing(service.repository.engine):
+        cancelling = threading.Thread(target=service.cancel, args=(job.id,))
+        cancelling.start()
+        deadline_s = time.monotonic() + 4  # before the waiting writer gives up
+        while not flag.exists():
+            assert time.monotonic() < deadline_s, "the job was not told to stop before the cancel was recorded"
+            time.sleep(0.005)
+        assert service.repository.get(job.id).state is JobState.RUNNING
+    cancelling.join()
+    assert service.repository.get(job.id).state is JobState.CANCELLING
