@@ -13,7 +13,7 @@ from services.core.settings import ServerSettings
 from tests.support.installed import build_wheel
 from tests.support.live_server import serving
 
-BUNDLE = ("app.js", "app.css")
+BUNDLE = ("app.js", "app.css", "eventWorker.js")
 
 
 @pytest.mark.parametrize("is_built", [True, False])

@@ -1,8 +1,11 @@
 /** The public REST API, as far as this page uses it. */
 
+import { clearTheWay } from "./follow";
+import { inLane } from "./lanes";
 import type { OptionSchema } from "./optionField";
 
-const REOPEN_MS = 3000;
+/** A dome that has not told its state by then has not told it. */
+const DOME_PATIENCE_MS = 3000;
 
 export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
 
@@ -180,12 +183,17 @@ export function mayPass(problem: unknown): boolean {
 }
 
 export function sentenceOf(problem: unknown): string {
+  if (problem instanceof DOMException && problem.name === "TimeoutError") return "The server does not answer.";
   if (problem instanceof TypeError) return "The server cannot be reached.";
   return problem instanceof Error ? problem.message : String(problem);
 }
 
 export async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
   const sent = body ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) } : { method, headers };
+  return inLane(() => request<T>(path, sent));
+}
+
+async function request<T>(path: string, sent: RequestInit): Promise<T> {
   const answer = await fetch(`/v1${path}`, sent);
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
@@ -211,8 +219,17 @@ export const renameJob = (id: string, name: string | null): Promise<Job> => ask(
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
-export const getDome = (): Promise<DomeState> => ask("/dome");
-export const allOff = (): Promise<{ status: DomeStatus; stopped: string[] }> => ask("/dome/off", "POST");
+export const getDome = (): Promise<DomeState> => inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
+
+/**
+ * ALL OFF waits for no lane, and the stream of events makes room for it. A server that asks nobody for a token is sent no cookie either: browsers keep
+ * connections with and without cookies apart, so that this one is free whatever else is under way, downloads too.
+ */
+export function allOff(isOpen: boolean): Promise<{ status: DomeStatus; stopped: string[] }> {
+  clearTheWay();
+  return request("/dome/off", { method: "POST", priority: "high", credentials: isOpen ? "omit" : "same-origin" });
+}
+
 export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> => ask("/dome/light", "PUT", {}, { light, level, on_s });
 export const darken = (): Promise<DomeStatus> => ask("/dome/light", "DELETE");
 export const preflight = (mouth: string): Promise<{ findings: string[] }> => ask("/dome/preflight", "POST", {}, { mouth });
@@ -223,39 +240,4 @@ export const archiveUrl = (id: string): string => `/v1/jobs/${id}/artifacts.zip`
 
 export function artifactUrl(id: string, path: string): string {
   return `/v1/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;
-}
-
-/**
- * Follow a job's events from the first one. After a broken connection the browser reconnects by itself and the server replays what was missed;
- * after a refusal the browser gives up, so the stream is opened anew.
- */
-export function followEvents(id: string, onEvent: (event: JobEvent) => void, onEnd: () => void, onConnection: (open: boolean) => void): () => void {
-  let timer = 0;
-  let newest = 0;
-  let source = open();
-
-  function open(): EventSource {
-    const opened = new EventSource(`/v1/jobs/${id}/events`);
-    opened.onopen = () => onConnection(true);
-    opened.onerror = () => {
-      onConnection(false);
-      if (opened.readyState === EventSource.CLOSED) timer = window.setTimeout(() => (source = open()), REOPEN_MS);
-    };
-    opened.onmessage = (message) => {
-      const event = JSON.parse(message.data) as JobEvent;
-      if (event.id <= newest) return; // a stream opened anew begins at the first event
-      newest = event.id;
-      onEvent(event);
-    };
-    opened.addEventListener("end", () => {
-      opened.close();
-      onEnd();
-    });
-    return opened;
-  }
-
-  return () => {
-    window.clearTimeout(timer);
-    source.close();
-  };
 }

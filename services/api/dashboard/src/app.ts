@@ -41,6 +41,8 @@ let isSignedOut = false;
 /** Whether the next refresh opens the address: nothing was opened yet, or what was failed in a way that may pass. */
 let isViewDue = true;
 let isAccountDue = true;
+/** Whether the server asks nobody for a token. */
+let isOpenServer = false;
 let unkept: HTMLElement | null = null;
 
 function showConnection(): void {
@@ -99,7 +101,7 @@ async function open(): Promise<void> {
 
 /** What an address names; null if nothing. */
 function viewOf(hash: string, id: string): View | null {
-  if (hash === DOME) return new DomeView(showViewConnection);
+  if (hash === DOME) return new DomeView(showViewConnection, () => isOpenServer);
   if (hash === NEW) return newJob;
   if (hash === RIG) return new RigView();
   const source = hash.match(/^#\/submit(?:\/(\w+))?$/);
@@ -162,6 +164,7 @@ async function showAccount(): Promise<void> {
     return;
   }
   const may = (scope: string) => session.is_open || session.scopes.includes("admin") || session.scopes.includes(scope);
+  isOpenServer = session.is_open;
   domeLink.hidden = !may("operate-dome");
   newLink.hidden = !may("submit");
   if (session.is_open) return;

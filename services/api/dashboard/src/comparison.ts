@@ -2,6 +2,7 @@
 
 import { artifactUrl, type JobEvent } from "./api";
 import { element } from "./element";
+import { showPicture } from "./lanes";
 
 interface Preview {
   camera: string;
@@ -96,7 +97,7 @@ export class Comparison {
       [this.residual, shown.residual, "Residual"],
     ] as const) {
       image.alt = `${kind}: ${name}`;
-      image.src = artifactUrl(this.job, path);
+      showPicture(image, artifactUrl(this.job, path));
     }
   }
 

@@ -5,13 +5,20 @@ import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
 const ASK_AGAIN_MS = 1000;
+/** Older than this, what was heard of the dome is shown as unknown. */
+const STALE_MS = 3000;
+/** Whoever has pressed ALL OFF is told after this time that nothing has answered. */
+const OFF_PATIENCE_MS = 1000;
+const EMERGENCY = "Press the dome's emergency stop, or cut its power.";
 const LONGEST_LIGHT_S = 30;
 
 export class DomeView {
   readonly root = element("article", { class: "dome" });
   private readonly state = element("span", { class: "badge", role: "status" });
+  private readonly heard = element("span", { class: "heard soft" });
   private readonly address = element("span", { class: "soft" });
   private readonly off = element("button", { type: "button", class: "all-off" }, "ALL OFF");
+  private readonly offTrouble = element("p", { class: "failure off-trouble", role: "alert" });
   private readonly done = element("p", { class: "done", role: "status" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly silence = element("p", { class: "failure", role: "alert" });
@@ -27,14 +34,22 @@ export class DomeView {
   private capturers = "";
   private deeds = 0;
   private timer = 0;
+  private clock = 0;
+  /** When the dome last told its state, and what it was. */
+  private heardMs: number | null = null;
+  private lastState = "";
   private isStopped = false;
 
-  constructor(private readonly onConnection: (open: boolean) => void) {
+  constructor(
+    private readonly onConnection: (open: boolean) => void,
+    private readonly isOpen: () => boolean,
+  ) {
+    this.offTrouble.hidden = true;
     this.refusal.hidden = true;
     this.silence.hidden = true;
     this.capturing.hidden = true;
     this.off.addEventListener("click", () => void this.allOff());
-    this.dark.addEventListener("click", () => void this.act(async () => this.show(await darken())));
+    this.dark.addEventListener("click", () => void this.act(async () => this.hear(await darken())));
   }
 
   /** Fill the view, ALL OFF first of all, and follow the dome until `stop`. */
@@ -45,8 +60,9 @@ export class DomeView {
       void this.preflight();
     });
     this.root.replaceChildren(
-      element("header", {}, element("h2", {}, "Dome"), this.state, this.address),
+      element("header", {}, element("h2", {}, "Dome"), this.state, this.heard, this.address),
       this.off,
+      this.offTrouble,
       element("p", { class: "soft" }, "Every light goes dark at once and every capture is stopped. It is no emergency stop: that one is a switch."),
       this.done,
       this.refusal,
@@ -55,12 +71,14 @@ export class DomeView {
       section("Preflight", element("p", { class: "soft" }, "Every light for a moment, black level and clipping; takes seconds."), rig, this.findings),
       section("Controller", this.facts),
     );
+    this.clock = window.setInterval(() => this.showAge(), 500);
     void this.askAgain();
   }
 
   stop(): void {
     this.isStopped = true;
     window.clearTimeout(this.timer);
+    window.clearInterval(this.clock);
   }
 
   private fields(): HTMLElement {
@@ -68,16 +86,27 @@ export class DomeView {
   }
 
   private async allOff(): Promise<void> {
-    await this.act(async () => {
-      const { status, stopped } = await allOff();
-      this.show(status);
-      this.done.textContent = `All is dark. ${stopped.length ? `Stopped: ${stopped.join(", ")}.` : "No job was capturing."}`;
-    });
+    this.offTrouble.hidden = true;
+    const late = window.setTimeout(() => {
+      this.offTrouble.textContent = `ALL OFF has had no answer for ${OFF_PATIENCE_MS / 1000} s; it is still being sent. ${EMERGENCY}`;
+      this.offTrouble.hidden = false;
+    }, OFF_PATIENCE_MS);
+    try {
+      await this.act(async () => {
+        const { status, stopped } = await allOff(this.isOpen());
+        this.hear(status);
+        this.done.textContent = `All is dark. ${stopped.length ? `Stopped: ${stopped.join(", ")}.` : "No job was capturing."}`;
+      });
+      if (!this.refusal.hidden) this.refusal.textContent = `ALL OFF was not carried out: ${this.refusal.textContent} ${EMERGENCY}`;
+    } finally {
+      window.clearTimeout(late);
+      this.offTrouble.hidden = true;
+    }
   }
 
   private async light(light: number): Promise<void> {
     for (const input of [this.level, this.seconds]) if (!input.reportValidity()) return;
-    await this.act(async () => this.show(await lightUp(light, this.level.valueAsNumber / 100, this.seconds.valueAsNumber)));
+    await this.act(async () => this.hear(await lightUp(light, this.level.valueAsNumber / 100, this.seconds.valueAsNumber)));
   }
 
   private async preflight(): Promise<void> {
@@ -123,9 +152,9 @@ export class DomeView {
       if (this.isStopped) return;
       const isLost = problem instanceof TypeError;
       this.onConnection(!isLost);
-      this.forget();
+      if (!(problem instanceof DOMException)) this.forget(); // who does not answer in time is forgotten once what he said is old
       tell(this.silence, problem);
-      this.silence.hidden = isLost;
+      this.silence.hidden = isLost || problem instanceof DOMException;
     }
     this.askLater();
   }
@@ -139,9 +168,29 @@ export class DomeView {
     this.facts.replaceChildren();
   }
 
+  /** How long ago the dome was last heard; what it said then is not shown as if it were true now. */
+  private showAge(): void {
+    if (this.heardMs === null) {
+      this.heard.textContent = "not heard yet";
+      return;
+    }
+    const ageMs = performance.now() - this.heardMs;
+    const isStale = ageMs > STALE_MS;
+    this.heard.textContent = `last heard ${Math.floor(ageMs / 1000)} s ago${isStale && this.lastState ? `: ${this.lastState}` : ""}`;
+    this.heard.classList.toggle("stale", isStale);
+    if (isStale && this.state.textContent !== "unknown") this.forget();
+  }
+
+  private hear(status: DomeStatus): void {
+    this.heardMs = performance.now();
+    this.show(status);
+    this.lastState = this.state.textContent ?? "";
+    this.showAge();
+  }
+
   private take(dome: DomeState): void {
     this.silence.hidden = true;
-    this.show(dome.status);
+    this.hear(dome.status);
     this.address.textContent = dome.address;
     this.capturing.hidden = dome.capturing.length === 0;
     if (this.capturers === dome.capturing.join()) return;

@@ -7,6 +7,7 @@ import { sha256 } from "@noble/hashes/sha2.js";
 
 import { ask, Refusal, Unauthenticated } from "./api";
 import type { FolderFile } from "./folder";
+import { inUploadLane } from "./lanes";
 
 const BLOCK_BYTES = 4 * 2 ** 20;
 const LEAST_WAIT_MS = 500;
@@ -109,7 +110,7 @@ async function append(file: KnownFile, start: number, block: Uint8Array<ArrayBuf
 
 /** Ask by tus; answers with the offset of the next byte. */
 async function offsetAfter(method: string, path: string, headers: Record<string, string>, body?: BodyInit): Promise<number> {
-  const answer = await fetch(`/v1${path}`, { method, headers: { ...TUS, ...headers }, ...(body === undefined ? {} : { body }) });
+  const answer = await inUploadLane(() => fetch(`/v1${path}`, { method, headers: { ...TUS, ...headers }, ...(body === undefined ? {} : { body }) }));
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
     const isElsewhere = problem?.code === "upload-offset"; // the server has got other bytes than we believed; it is asked how many

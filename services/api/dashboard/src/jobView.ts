@@ -3,7 +3,6 @@
 import {
   type Artifact,
   artifactUrl,
-  followEvents,
   getJob,
   getParameters,
   type Job,
@@ -16,6 +15,7 @@ import {
 } from "./api";
 import { Comparison } from "./comparison";
 import { element } from "./element";
+import { followEvents } from "./follow";
 import { bytes, remaining, when } from "./format";
 import { JobActions } from "./jobActions";
 import { LossChart } from "./lossChart";

@@ -1,0 +1,130 @@
+/**
+ * One stream of events for all pages of a browser, which opens six connections to a server and no more: a stream for each page would leave none for
+ * ALL OFF. Runs in a shared worker, or in the page itself where there is none.
+ */
+
+const REOPEN_MS = 3000;
+/** Pages that open or leave a job at about the same time share one opening of the stream. */
+const GATHER_MS = 30;
+/** Each page says so often what it follows; a page that was silent for longer was closed without a word. */
+export const TELL_MS = 10_000;
+const SILENCE_MS = 4 * TELL_MS;
+/** So long the stream stays closed for ALL OFF, so that a connection is free. */
+const CLEAR_MS = 2000;
+
+/** What a page says: which jobs it follows, each after the id of an event that it knows, or that all connections are needed. */
+export type Wish = { follow: [job: string, after: number][] } | { clear: true };
+/** What it is told. `text` is an event as JSON; `state` is null of a job that is not there. */
+export type News = { job: string; id: number; text: string } | { job: string; state: string | null } | { open: boolean };
+
+interface Page {
+  places: Map<string, number>;
+  heardMs: number;
+  tell: (news: News) => void;
+}
+
+export class EventHub {
+  private readonly pages = new Map<unknown, Page>();
+  private source: EventSource | null = null;
+  /** The jobs of the stream that is open, or was last. */
+  private streamed = "";
+  /** By job, the id up to which the stream has told, or after which it began. */
+  private told = new Map<string, number>();
+  private timer = 0;
+
+  constructor() {
+    setInterval(() => this.forgetTheSilent(), TELL_MS);
+  }
+
+  /** Take in what a page says. */
+  take(page: unknown, wish: Wish, tell: (news: News) => void): void {
+    if ("clear" in wish) {
+      this.clear();
+      return;
+    }
+    if (!wish.follow.length) {
+      this.pages.delete(page);
+    } else {
+      const known = this.pages.get(page)?.places;
+      const places = new Map(wish.follow.map(([job, after]) => [job, Math.max(after, known?.get(job) ?? 0)]));
+      this.pages.set(page, { places, heardMs: Date.now(), tell });
+      if (this.source?.readyState === EventSource.OPEN) tell({ open: true });
+    }
+    this.openSoon(GATHER_MS);
+  }
+
+  /** By job, the id after which some page lacks events. */
+  private places(): Map<string, number> {
+    const places = new Map<string, number>();
+    for (const page of this.pages.values()) {
+      for (const [job, after] of page.places) places.set(job, Math.min(after, places.get(job) ?? after));
+    }
+    return places;
+  }
+
+  private openSoon(afterMs: number): void {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.open(), afterMs) as unknown as number;
+  }
+
+  private close(): void {
+    this.source?.close();
+    this.source = null;
+    this.streamed = "";
+  }
+
+  /** Open a stream of what is followed now, unless it is open already and no page lacks what it has told. */
+  private open(): void {
+    const places = this.places();
+    const wanted = [...places.keys()].sort().join();
+    if (this.source && wanted === this.streamed && !this.isBehind()) return;
+    this.close();
+    if (!places.size) return;
+    this.streamed = wanted;
+    this.told = new Map(places);
+    const source = new EventSource(`/v1/events?${[...places].map(([job, after]) => `job=${job}:${after}`).join("&")}`);
+    this.source = source;
+    source.onopen = () => this.tellAll({ open: true });
+    source.onerror = () => {
+      if (this.source !== source) return;
+      this.close();
+      this.tellAll({ open: false });
+      this.openSoon(REOPEN_MS);
+    };
+    source.onmessage = (message) => {
+      const { id, job } = JSON.parse(message.data) as { id: number; job: string };
+      this.told.set(job, id);
+      for (const page of this.pages.values()) {
+        const after = page.places.get(job);
+        if (after === undefined || id <= after) continue;
+        page.places.set(job, id);
+        page.tell({ job, id, text: message.data });
+      }
+    };
+    source.addEventListener("end", (message) => {
+      const { job, state } = JSON.parse((message as MessageEvent<string>).data) as { job: string; state: string | null };
+      this.streamed = this.streamed.split(",").filter((one) => one !== job).join();
+      if (!this.streamed) this.close();
+      for (const page of this.pages.values()) if (page.places.delete(job)) page.tell({ job, state });
+    });
+  }
+
+  private isBehind(): boolean {
+    // A page that came later, or came back, needs events that have been told already.
+    return [...this.places()].some(([job, after]) => after < (this.told.get(job) ?? 0));
+  }
+
+  private tellAll(news: News): void {
+    for (const page of this.pages.values()) page.tell(news);
+  }
+
+  private clear(): void {
+    this.close();
+    this.openSoon(CLEAR_MS);
+  }
+
+  private forgetTheSilent(): void {
+    for (const [key, page] of this.pages) if (page.heardMs < Date.now() - SILENCE_MS) this.pages.delete(key);
+    if (this.source) this.openSoon(0);
+  }
+}

@@ -1,0 +1,207 @@
+"""Many pages of one browser, which opens six connections to a server and no more: they share one stream of events, and ALL OFF is answered."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
+
+from services.api.app import STATIC, create_app
+from services.capture.simulator import simulated_dome
+from services.core.settings import DomeSettings, ServerSettings
+from tests.browser.chromium import PATIENCE_MS
+from tests.browser.contrast import contrast_failures
+from tests.browser.pages import looked_at
+from tests.browser.scripted_job import STEPS, ScriptedJob, submit
+from tests.support.live_server import serving
+
+pytestmark = pytest.mark.browser
+
+LIGHTS = 155
+TABS = 8
+CONNECTIONS = 6
+"""That Chromium opens to one server."""
+HIDE = """hidden => {
+  Object.defineProperty(document, "hidden", {value: hidden, configurable: true});
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+@dataclass
+class Bench:
+    """A server with a simulated dome, the streams of events that it sends now, and downloads that hang."""
+
+    address: str
+    job: ScriptedJob
+    streams: list[str] = field(default_factory=list)
+    go_on: threading.Event = field(default_factory=threading.Event)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    if not (STATIC / "app.js").exists():
+        pytest.skip("the dashboard is not built; run make dashboard")
+    bench = Bench("", ScriptedJob())
+    with simulated_dome(LIGHTS, 10.0) as (host, port):
+        settings = ServerSettings(data=tmp_path_factory.mktemp("data"), dome=DomeSettings(address=f"{host}:{port}", watchdog_s=10.0), jobs_at_once=TABS)
+        app = create_app(settings, bench.job)
+
+        async def counting(scope: Any, receive: Any, send: Any) -> None:
+            path = scope.get("path", "")
+            if not path.startswith("/v1/") or not path.endswith("/events"):
+                await app(scope, receive, send)
+                return
+            bench.streams.append(scope["query_string"].decode())
+            try:
+                await app(scope, receive, send)
+            finally:
+                bench.streams.remove(scope["query_string"].decode())
+
+        with serving(counting) as client:  # type: ignore[arg-type]
+            bench.address = str(client.base_url)
+            yield bench
+            bench.go_on.set()
+            bench.job.steps.release(3 * TABS * STEPS)
+
+
+@pytest.fixture
+def context(chromium: Browser, bench: Bench) -> Iterator[BrowserContext]:
+    context = chromium.new_context(base_url=bench.address, viewport={"width": 1280, "height": 900})
+    broken: list[str] = []
+    context.on("weberror", lambda problem: broken.append(str(problem.error)))
+    yield context
+    context.request.post("/v1/dome/off")
+    context.close()
+    assert not broken
+
+
+def dome_page(context: BrowserContext) -> Page:
+    page = context.new_page()
+    page.goto("/#/dome")
+    expect(page.locator(".dome .badge")).to_contain_text("dark")
+    return page
+
+
+def light_up(page: Page) -> None:
+    page.get_by_label("Seconds").fill("30")
+    page.get_by_role("button", name="Light 3", exact=True).click()
+    expect(page.locator(".dome .badge")).to_have_text("light 3 is on")
+
+
+def until(page: Page, condition: Any) -> None:
+    waited_ms = 0
+    while not condition():
+        assert waited_ms < PATIENCE_MS, "waited in vain"
+        page.wait_for_timeout(20)
+        waited_ms += 20
+
+
+def test_eight_job_pages_are_live_by_one_stream_and_all_off_answers(context: BrowserContext, bench: Bench) -> None:
+    dome = dome_page(context)
+    light_up(dome)
+    tabs = [context.new_page() for _ in range(TABS)]
+    jobs = [submit(dome) for _ in tabs]
+    for tab, job in zip(tabs, jobs, strict=True):
+        tab.goto(f"/#/{job}")
+    for tab in tabs:
+        expect(tab.locator(".job h2")).to_contain_text("Job ")
+    until(dome, lambda: len(bench.streams) == 1 and all(job in bench.streams[0] for job in jobs))
+    dome.locator(".all-off").click()
+    expect(dome.locator(".done")).to_have_text("All is dark. No job was capturing.")
+    expect(dome.locator(".dome .badge")).to_have_text("dark, ALL OFF")
+    bench.job.steps.release(TABS * STEPS)
+    for tab in tabs:
+        expect(tab.locator(".job .badge")).to_have_text("succeeded")
+        expect(tab.locator(".stages li", has_text="prepare").locator(".note")).to_have_text("24 images prepared.")
+        expect(tab.locator(".chart figcaption")).to_contain_text(f"{STEPS} steps.")
+    until(dome, lambda: not bench.streams)
+
+
+def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: BrowserContext, bench: Bench) -> None:
+    page = context.new_page()
+    job = submit(page)
+    page.goto(f"/#/{job}")
+    until(page, lambda: len(bench.streams) == 1)
+    page.evaluate(HIDE, arg=True)
+    until(page, lambda: not bench.streams)
+    bench.job.steps.release(STEPS)
+    until(page, lambda: page.request.get(f"/v1/jobs/{job}").json()["state"] == "SUCCEEDED")
+    assert page.locator(".job .badge").text_content() != "succeeded"
+    page.evaluate(HIDE, arg=False)
+    expect(page.locator(".job .badge")).to_have_text("succeeded")
+    expect(page.locator(".chart figcaption")).to_contain_text(f"{STEPS} steps.")
+
+
+def test_all_off_is_answered_while_every_connection_is_held(context: BrowserContext, monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
+    """As by long downloads; a server that asks nobody for a token is asked over a connection of its own."""
+    dome = dome_page(context)
+    light_up(dome)
+    asked: list[str] = []
+
+    def hang(*_: object) -> list[object]:
+        asked.append("")
+        bench.go_on.wait(60)
+        return []
+
+    monkeypatch.setattr("services.api.observe_routes.list_artifacts", hang)
+    job = submit(dome)
+    dome.evaluate("job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }", job)
+    until(dome, lambda: len(asked) == CONNECTIONS)
+    dome.locator(".all-off").click()
+    expect(dome.locator(".done")).to_have_text("All is dark. No job was capturing.")
+    assert len(asked) == CONNECTIONS, "a connection was free after all"
+    assert dome.request.get("/v1/dome").json()["status"]["stopped"]
+    bench.go_on.set()
+
+
+def test_an_all_off_without_an_answer_is_told_in_red_after_a_second(context: BrowserContext) -> None:
+    dome = dome_page(context)
+    light_up(dome)
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    dome.route("**/v1/dome/off", hold)
+    trouble = dome.locator(".off-trouble")
+    expect(trouble).to_be_hidden()
+    dome.locator(".all-off").click()
+    expect(trouble).to_be_visible()
+    expect(trouble).to_have_text("ALL OFF has had no answer for 1 s; it is still being sent. Press the dome's emergency stop, or cut its power.")
+    assert trouble.evaluate("one => getComputedStyle(one).color") == dome.evaluate(
+        "() => { const one = document.createElement('i'); one.style.color = 'var(--bad)'; document.body.append(one); return getComputedStyle(one).color; }"
+    )
+    looked_at(dome, "dome-off-unanswered")
+    held[0].continue_()
+    expect(dome.locator(".done")).to_have_text("All is dark. No job was capturing.")
+    expect(trouble).to_be_hidden()
+    dome.unroute("**/v1/dome/off")
+    dome.route("**/v1/dome/off", lambda route: route.abort())
+    dome.locator(".all-off").click()
+    expect(dome.get_by_role("alert")).to_have_text(
+        "ALL OFF was not carried out: The server cannot be reached. Press the dome's emergency stop, or cut its power."
+    )
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_state_of_the_dome_that_is_old_is_told_with_its_age(context: BrowserContext, scheme: Any) -> None:
+    dome = dome_page(context)
+    dome.emulate_media(color_scheme=scheme)
+    heard, state = dome.locator(".heard"), dome.locator(".dome .badge")
+    expect(heard).to_have_text("last heard 0 s ago")
+    light_up(dome)
+    dome.route("**/v1/dome", lambda _: None)  # neither answered nor refused
+    expect(heard).to_contain_text(" s ago: light 3 is on")
+    expect(state).to_have_text("unknown")
+    expect(dome.locator(".lights [aria-pressed]")).to_have_count(0)
+    looked_at(dome, f"dome-stale-{scheme}")
+    dome.set_viewport_size({"width": 390, "height": 844})
+    looked_at(dome, f"dome-stale-phone-{scheme}")
+    assert contrast_failures(dome) == []
+    dome.unroute_all(behavior="ignoreErrors")
+    expect(state).to_have_text("light 3 is on")
+    expect(heard).to_have_text("last heard 0 s ago")
