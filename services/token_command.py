@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -27,6 +28,7 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
         name: Annotated[str, typer.Argument(help="Who or what uses it.")],
         scope: Annotated[list[str], typer.Option(help="What it may do: read, submit, operate-dome or admin; may be given several times.")],
         expires_days: Annotated[float | None, typer.Option(min=0, help="Days until it ends; default: never.")] = None,
+        group: Annotated[str | None, typer.Option(help="Whose jobs and captures it sees and makes; default: its own alone.")] = None,
         data: Data = None,
         as_json: Json = False,
     ) -> None:
@@ -38,7 +40,10 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
         if unknown := [one for one in scope if one not in set(Scope)]:
             raise InputError(f"Scope {unknown[0]!r} does not exist; known are {', '.join(Scope)}.")
         with _tokens(data, default_url) as tokens:
-            issued = tokens.create(name, [Scope(one) for one in scope], expires_days, Deed("dentine token create", "command line", "local"))
+            deed = Deed("dentine token create", "command line", "local")
+            issued = tokens.create(name, [Scope(one) for one in scope], expires_days, deed, group)
+        if group is None and set(scope) == {Scope.READ}:
+            print(f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it with --group.", file=sys.stderr)
         print(issued.model_dump_json() if as_json else issued.token.get_secret_value())
 
     @app.command("list")
@@ -51,7 +56,8 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
             return
         for token in found:
             ended = f"revoked {_day(token.revoked_s)}" if token.revoked_s else f"expires {_day(token.expires_s)}"
-            print(f"{token.id}  {token.name}  {','.join(token.scopes)}  made {_day(token.created_s)}  {ended}  last used {_day(token.last_used_s)}")
+            who, what = f"{token.id}  {token.name}", f"{','.join(token.scopes)}  group {token.group or 'none'}"
+            print(f"{who}  {what}  made {_day(token.created_s)}  {ended}  last used {_day(token.last_used_s)}")
 
     @app.command()
     def revoke(token: Annotated[str, typer.Argument(metavar="ID", help="Id or name that list prints.")], data: Data = None) -> None:

@@ -25,7 +25,7 @@ class Access:
     """The callers of one server; ``sessions`` is None where access is open."""
 
     def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
-        self.tokens, self.sessions, self._lookers = tokens, sessions, Clerks(LOOKERS)
+        self.tokens, self.sessions, self.lookers = tokens, sessions, Clerks(LOOKERS)
 
     async def identify(self, request: HTTPConnection) -> Caller:
         """The caller, by the Authorization header or else by the session cookie.
@@ -41,12 +41,12 @@ class Access:
                 raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
             presented = presented.strip()
             if (token := self.tokens.trusted(presented=presented)) is None:
-                token = await self._lookers.ask(self.tokens.authenticate, presented)
+                token = await self.lookers.ask(self.tokens.authenticate, presented)
             return Caller.of(token)
         if (cookie := request.cookies.get(COOKIE)) is not None:
-            token_id = self.sessions.token_id(cookie)
-            if (token := self.tokens.trusted(session_of=token_id)) is None:
-                token = await self._lookers.ask(self.tokens.living, token_id)
+            session = self.sessions.read(cookie)
+            if (token := self.tokens.trusted(session_of=session.sha256)) is None:
+                token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
             return Caller.of(token, by_session=True)
         raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
 

@@ -1,5 +1,6 @@
 """Routes of tokens, browser sessions and the audit log. Annotations are evaluated here, because FastAPI reads them."""
 
+from contextlib import suppress
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -25,6 +26,9 @@ class TokenRequest(Record):
     name: str = Field(description="who or what uses it", json_schema_extra={"pattern": f"^{NAME}$"})
     scopes: tuple[Scope, ...] = Field(fail_fast=True, description="what it may do", json_schema_extra={"minItems": 1})
     expires_days: Number | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
+    group: str | None = Field(
+        default=None, description="whose jobs and captures it sees and makes; null: its own alone", json_schema_extra={"pattern": f"^{NAME}$"}
+    )
 
 
 class SetupRequest(Record):
@@ -55,7 +59,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:
         """Make a token. Its secret is in this answer and nowhere else."""
-        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["deed"])
+        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["deed"], wanted.group)
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
         return issued
 
@@ -99,8 +103,12 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         return _session(caller, access)
 
     @router.delete("/session", status_code=204, tags=["access"], dependencies=[needs("read")])
-    def sign_out(response: Response) -> None:
-        """Take the cookie from the browser."""
+    def sign_out(request: Request, response: Response) -> None:
+        """End the browser session, also for whoever has a copy of its cookie, and take the cookie from the browser."""
+        if access.sessions is not None and (cookie := request.cookies.get(COOKIE)) is not None:
+            with suppress(UnauthenticatedError):  # one that is over already
+                session = access.sessions.read(cookie)
+                access.tokens.end_session(session.sha256, session.expires_s)
         response.delete_cookie(COOKIE, path="/v1", httponly=True, samesite="strict", secure=secure)
 
     @router.get("/audit", tags=["access"], dependencies=[needs("admin")])

@@ -35,8 +35,8 @@ ANSWERS = refusals(416) | {
 MOST_BYTES_AT_ONCE = 2**20
 """Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread each."""
 
-REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
-"""A report opens alone and carries all it needs; it may reach nothing, this server included."""
+REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+"""A report opens alone and carries all it needs; it may reach nothing, this server included, and no page may show it inside itself."""
 
 
 class Artifact(Record):

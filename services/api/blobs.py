@@ -93,7 +93,10 @@ class Blobs:
         return PartialFile(self._partial_path(capture, number), offset, self._write)
 
     def adopt(self, capture: str, number: int, sha256: str) -> bool:
-        """Make a received file a content if it has this SHA-256, else discard it; returns which."""
+        """Make a received file a content if it has this SHA-256, else discard it; returns which.
+
+        It stays a partial file too, to be discarded once its content is recorded as known: a server that dies before that finds it whole.
+        """
         partial, final = self._partial_path(capture, number), self.path(sha256)
         with partial.open("rb") as stream:
             is_right = hashlib.file_digest(stream, "sha256").hexdigest() == sha256
@@ -101,9 +104,11 @@ class Blobs:
             partial.unlink()
             return False
         final.parent.mkdir(parents=True, exist_ok=True)
-        partial.chmod(0o400)
-        partial.rename(final)
-        sync_folders(final.parent, self._blobs)
+        if not self.holds(sha256, partial.stat().st_size):
+            partial.chmod(0o400)
+            final.unlink(missing_ok=True)
+            final.hardlink_to(partial)
+            sync_folders(final.parent, self._blobs)
         return True
 
     def discard_partial(self, capture: str, number: int | None = None) -> None:

@@ -8,7 +8,7 @@ from fastapi import Path as PathParameter
 from services.api.bodies import Sent
 from services.api.calibrations import NAME, CalibrationDetail, Calibrations, NamedCalibration
 from services.api.captures import Captures
-from services.api.guard import needs
+from services.api.guard import Asker, needs
 from services.api.problems import refusals
 from services.core.calibration import Calibration
 
@@ -20,19 +20,19 @@ def build_calibrations_router(calibrations: Calibrations, captures: Captures) ->
     router = APIRouter(prefix="/v1", tags=["calibrations"], responses=refusals(404, 409, 422))
 
     @router.get("/calibrations", dependencies=[needs("read")])
-    def every() -> list[NamedCalibration]:
+    def every(asker: Asker) -> list[NamedCalibration]:
         """List calibrations, newest first."""
-        return calibrations.list()
+        return calibrations.list(asker)
 
     @router.get("/calibrations/{name}", dependencies=[needs("read")])
-    def get(name: Name) -> CalibrationDetail:
+    def get(name: Name, asker: Asker) -> CalibrationDetail:
         """One calibration with its cameras and lights."""
-        return calibrations.get(name)
+        return calibrations.get(name, asker)
 
     @router.put("/calibrations/{name}", status_code=201, responses={200: {"model": CalibrationDetail}}, dependencies=[needs("submit")])
-    def put(name: Name, calibration: Sent[Calibration], response: Response) -> CalibrationDetail:
+    def put(name: Name, calibration: Sent[Calibration], asker: Asker, response: Response) -> CalibrationDetail:
         """Store a calibration under a new name: 201, or 200 where it is there already. A name never changes its content: 409."""
-        creation = calibrations.put(name, calibration)
+        creation = calibrations.put(name, calibration, asker)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/calibrations/{name}"
         return creation.detail

@@ -3,7 +3,8 @@
 ::
 
     calibrations/<id>.json             the content; its id is the SHA-256 of these bytes
-    calibrations/names/<name>.json     which content a name means
+    calibrations/names/<name>.json     which content a name means in the default group
+    calibrations/owners/<owner>/<name>.json    and to another owner: each has names of his own
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from services.api.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.core.calibration import Calibration, require_consistent
 from services.core.errors import CalibrationTakenError, SettingsError, UnknownCalibrationError
 from services.core.geometry import Record
@@ -37,6 +39,7 @@ class NamedCalibration(Record):
     name: str
     id: str = Field(description="SHA-256 of its content: the same for the same cameras, lights and channels")
     created_s: float = Field(description="Unix time")
+    owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
 
 
 class CalibrationDetail(NamedCalibration):
@@ -59,50 +62,51 @@ class Calibrations:
 
     def __init__(self, data: Path, now_s: Callable[[], float] = time.time) -> None:
         self._folder, self._now_s = data / FOLDER, now_s
-        self._names = self._folder / "names"
 
-    def put(self, name: str, calibration: Calibration) -> CalibrationCreation:
-        """Store a calibration under a name. Putting the same again changes nothing.
+    def put(self, name: str, calibration: Calibration, viewer: Viewer = LOCAL_VIEWER) -> CalibrationCreation:
+        """Store a calibration under a name of whoever puts it. Putting the same again changes nothing.
 
         Raises:
             CaptureInputError: names or channels contradict each other. CalibrationTakenError: the name means another content.
         """
         require_consistent(calibration, f"Calibration {name}")
         content = (calibration.model_dump_json(indent=1) + "\n").encode()
-        entry = NamedCalibration(name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s())
-        self._names.mkdir(parents=True, exist_ok=True)
+        entry = NamedCalibration(name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s(), owner=viewer.owner)
+        names = self._names(viewer.owner)
+        names.mkdir(parents=True, exist_ok=True)
         if not self._content(entry.id).exists():
             write_atomic(self._content(entry.id), content)
         is_new = self._take_name(entry)
-        known = entry if is_new else read_record(self._names / f"{name}.json", NamedCalibration)
+        known = entry if is_new else read_record(names / f"{name}.json", NamedCalibration)
         if known.id != entry.id:
             raise CalibrationTakenError(f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date.")
         return CalibrationCreation(_detail(known, calibration), is_new)
 
-    def list(self) -> list[NamedCalibration]:
-        """All of them, newest first."""
-        entries = [read_record(path, NamedCalibration) for path in self._names.glob("*.json")]
-        return sorted(entries, key=lambda entry: (-entry.created_s, entry.name))
+    def list(self, viewer: Viewer = LOCAL_VIEWER) -> list[NamedCalibration]:
+        """Those that somebody may see, newest first."""
+        entries = [read_record(path, NamedCalibration) for names in self._seen(viewer) for path in names.glob("*.json")]
+        return sorted(entries, key=lambda entry: (-entry.created_s, entry.name, entry.owner))
 
-    def get(self, name: str) -> CalibrationDetail:
-        """One calibration, by its name.
+    def get(self, name: str, viewer: Viewer = LOCAL_VIEWER) -> CalibrationDetail:
+        """One calibration, by its name: one's own first, for those who see all.
 
         Raises:
-            UnknownCalibrationError: there is none of this name.
+            UnknownCalibrationError: there is none of this name that he may see.
         """
-        path = self._names / f"{name}.json"
-        if re.fullmatch(NAME, name) is None or not path.is_file():
+        paths = [names / f"{name}.json" for names in self._seen(viewer)] if re.fullmatch(NAME, name) else []
+        if (path := next((path for path in paths if path.is_file()), None)) is None:
             raise UnknownCalibrationError(f"There is no calibration {name}; list the calibrations to see their names.")
         entry = read_record(path, NamedCalibration)
         return _detail(entry, read_record(self._content(entry.id), Calibration))
 
-    def require(self, path: Path) -> None:
-        """Refuse the option of a job that names a calibration that is not here.
+    def require(self, path: Path, viewer: Viewer = LOCAL_VIEWER) -> None:
+        """Refuse the option of a job that names a calibration that is not here, or is somebody else's.
 
         Raises:
-            SettingsError: there is none of this id.
+            SettingsError: there is none of this id that he may see.
         """
-        if _ID.fullmatch(path.name) is None or not self._content(path.name).is_file():
+        is_id = _ID.fullmatch(path.name) is not None and self._content(path.name).is_file()
+        if not is_id or not (viewer.sees_all or any(entry.id == path.name for entry in self.list(viewer))):
             raise SettingsError(f"Option 'calibration': there is no {path}; give the 'option' of GET /v1/calibrations/NAME.")
 
     def locate(self, spec: JobSpec) -> JobSpec:
@@ -110,6 +114,14 @@ class Calibrations:
         if spec.calibration is None or not is_stored(spec.calibration):
             return spec
         return spec.model_copy(update={"calibration": self._content(spec.calibration.name)})
+
+    def _names(self, owner: str) -> Path:
+        return self._folder / "names" if owner == DEFAULT_GROUP else self._folder / "owners" / owner
+
+    def _seen(self, viewer: Viewer) -> tuple[Path, ...]:
+        # Folders of names, one's own first.
+        own, others = self._names(viewer.owner), [self._names(DEFAULT_GROUP), *sorted((self._folder / "owners").glob("*"))]
+        return (own, *(other for other in others if other != own)) if viewer.sees_all else (own,)
 
     def _content(self, calibration_id: str) -> Path:
         return self._folder / f"{calibration_id}.json"
@@ -119,7 +131,7 @@ class Calibrations:
         written = self._folder / f".{secrets.token_hex(8)}"
         write_record(written, entry)
         try:
-            os.link(written, self._names / f"{entry.name}.json")
+            os.link(written, self._names(entry.owner) / f"{entry.name}.json")
         except FileExistsError:
             return False
         finally:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from services.api.owners import DEFAULT_GROUP
 from services.core.geometry import Record
 
 SUBJECT = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
@@ -37,10 +38,11 @@ class UploadManifest(Record):
     files: tuple[ManifestFile, ...] = Field(min_length=1, fail_fast=True, description="every file of the capture")
     subject: str | None = Field(default=None, pattern=f"^{SUBJECT}$", description="pseudonymous label of the person; never a name")
 
-    def digest(self) -> str:
-        """The same for the same files in any order and the same subject."""
+    def digest(self, owner: str = DEFAULT_GROUP) -> str:
+        """The same for the same files in any order, the same subject and the same owner."""
         rows = sorted((file.path, file.bytes, file.sha256) for file in self.files)
-        return hashlib.sha256(json.dumps([self.subject, rows]).encode()).hexdigest()
+        whose = [] if owner == DEFAULT_GROUP else [owner]  # as version 0.1 knew no owners
+        return hashlib.sha256(json.dumps([self.subject, rows, *whose]).encode()).hexdigest()
 
 
 class CaptureFile(ManifestFile):
@@ -62,6 +64,7 @@ class Capture(Record):
     expires_s: float = Field(description="Unix time at which it expires if it is still open; later with every byte received")
     file_count: int
     bytes: int = Field(description="size of all files together")
+    owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
 
 
 class CaptureDetail(Capture):

@@ -12,6 +12,7 @@ import sqlalchemy as sql
 from services.api.capture_records import Capture, CaptureState, ManifestFile, UploadManifest
 from services.api.database import metadata, writing
 from services.api.job_table import job_table
+from services.api.owners import DEFAULT_GROUP
 from services.core.errors import CaptureStateError, UnknownCaptureError
 
 capture_table = sql.Table(
@@ -27,6 +28,8 @@ capture_table = sql.Table(
     sql.Column("expires_s", sql.Float, nullable=False),
     sql.Column("file_count", sql.Integer, nullable=False),
     sql.Column("bytes", sql.BigInteger, nullable=False),
+    sql.Column("owner", sql.Text, nullable=False, server_default=DEFAULT_GROUP),
+    sql.Index("capture_of_owner", "owner", "number"),
     sqlite_autoincrement=True,
 )
 file_table = sql.Table(
@@ -40,6 +43,7 @@ file_table = sql.Table(
     sql.Column("received_bytes", sql.BigInteger, nullable=False),
     sql.Column("is_created", sql.Boolean, nullable=False),
     sql.Column("is_corrupt", sql.Boolean, nullable=False),
+    sql.Column("is_known", sql.Boolean, nullable=False, server_default=sql.false()),
 )
 _BATCH = 500
 
@@ -56,6 +60,13 @@ class FileRow:
     """Whether a client has asked for an upload of it and not terminated it."""
     is_corrupt: bool
     """Whether its content was received once and was wrong."""
+    is_known: bool = False
+    """Whether its owner has sent the whole content, for this capture or another one, and it was verified."""
+
+
+def unknown_capture(capture: str) -> UnknownCaptureError:
+    """What is told of a capture that is not there, or is somebody else's."""
+    return UnknownCaptureError(f"There is no capture {capture!r}; list the captures to see their ids.")
 
 
 class CaptureTable:
@@ -65,7 +76,7 @@ class CaptureTable:
         self._engine = engine
 
     def find(self, manifest: str, key: str | None) -> Capture | None:
-        """The capture of this manifest or of this idempotency key.
+        """The capture of this manifest or of this idempotency key, both as its owner's.
 
         Raises:
             CaptureStateError: the key belongs to another manifest.
@@ -74,18 +85,30 @@ class CaptureTable:
         with self._engine.connect() as connection:
             rows = connection.execute(query).mappings().all()
         if any(row["key"] == key and row["manifest"] != manifest for row in rows if key is not None):
-            raise CaptureStateError(f"Idempotency-Key {key!r} was used for another manifest; choose a new key.")
+            shown = (key or "").partition("/")[2]
+            raise CaptureStateError(f"Idempotency-Key {shown!r} was used for another manifest; choose a new key.")
         return _capture(rows[0]) if rows else None
 
-    def insert(self, manifest: UploadManifest, digest: str, key: str | None, received: Sequence[int], created_s: float, expires_s: float) -> Capture:
-        """Add an open capture, of whose files so many bytes are here already."""
+    def insert(
+        self,
+        manifest: UploadManifest,
+        digest: str,
+        key: str | None,
+        known: Sequence[bool],
+        created_s: float,
+        expires_s: float,
+        owner: str = DEFAULT_GROUP,
+    ) -> Capture:
+        """Add an open capture; of each file it is told whether its owner has sent the content already."""
         identity = secrets.token_hex(8)
         files = [
-            {"capture": identity, "number": number, "received_bytes": count, "is_created": False, "is_corrupt": False} | file.model_dump()
-            for number, (file, count) in enumerate(zip(manifest.files, received, strict=True))
+            {"capture": identity, "number": number, "received_bytes": file.bytes if is_known else 0, "is_known": is_known}
+            | {"is_created": False, "is_corrupt": False}
+            | file.model_dump()
+            for number, (file, is_known) in enumerate(zip(manifest.files, known, strict=True))
         ]
         row: dict[str, Any] = {"id": identity, "key": key, "manifest": digest, "state": CaptureState.OPEN, "subject": manifest.subject}
-        row |= {"created_s": created_s, "expires_s": expires_s, "file_count": len(files), "bytes": sum(file.bytes for file in manifest.files)}
+        row |= {"created_s": created_s, "expires_s": expires_s, "file_count": len(files), "bytes": sum(file.bytes for file in manifest.files), "owner": owner}
         with writing(self._engine) as connection:
             connection.execute(capture_table.insert().values(row))
             connection.execute(file_table.insert(), files)
@@ -102,12 +125,14 @@ class CaptureTable:
             with self._engine.connect() as connection:
                 row = connection.execute(sql.select(capture_table).where(capture_table.c.id == capture)).mappings().first()
         if row is None:
-            raise UnknownCaptureError(f"There is no capture {capture!r}; list the captures to see their ids.")
+            raise unknown_capture(capture)
         return _capture(row)
 
-    def page(self, limit: int, before: int | None) -> list[Capture]:
-        """Newest captures first, those with a number below ``before``."""
+    def page(self, limit: int, before: int | None, owner: str | None = None) -> list[Capture]:
+        """Newest captures first, those with a number below ``before``; everybody's unless an owner is named."""
         query = sql.select(capture_table).order_by(capture_table.c.number.desc()).limit(limit)
+        if owner is not None:
+            query = query.where(capture_table.c.owner == owner)
         if before is not None:
             query = query.where(capture_table.c.number < before)
         with self._engine.connect() as connection:
@@ -152,10 +177,24 @@ class CaptureTable:
             if expires_s is not None:
                 connection.execute(capture_table.update().where(capture_table.c.id == capture).values(expires_s=expires_s))
 
-    def mark_known(self, sha256: str) -> None:
-        """Record that every file of this content is received."""
+    def known(self, contents: Iterable[str], owner: str) -> set[str]:
+        """Those contents that an owner has sent whole."""
+        wanted, found = sorted(set(contents)), set[str]()
+        own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
+        with self._engine.connect() as connection:
+            for start in range(0, len(wanted), _BATCH):
+                of_batch = file_table.c.sha256.in_(wanted[start : start + _BATCH])
+                query = sql.select(file_table.c.sha256).where(of_batch, file_table.c.is_known, file_table.c.capture.in_(own))
+                found.update(connection.scalars(query.distinct()))
+        return found
+
+    def mark_known(self, sha256: str, capture: str) -> None:
+        """Record that every file of this content is received, in the captures that belong to the owner of one."""
+        owner = sql.select(capture_table.c.owner).where(capture_table.c.id == capture).scalar_subquery()
+        own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
+        values = {"received_bytes": file_table.c.bytes, "is_corrupt": False, "is_known": True}
         with writing(self._engine) as connection:
-            connection.execute(file_table.update().where(file_table.c.sha256 == sha256).values(received_bytes=file_table.c.bytes, is_corrupt=False))
+            connection.execute(file_table.update().where(file_table.c.sha256 == sha256, file_table.c.capture.in_(own)).values(values))
 
     def change_state(self, capture: str, state: CaptureState) -> None:
         """Set a capture's state; an expired one gives up its key and manifest."""
@@ -210,4 +249,4 @@ def _capture(row: Any) -> Capture:
 
 def _file(row: Any) -> FileRow:
     file = ManifestFile(**{name: row[name] for name in ManifestFile.model_fields})
-    return FileRow(row["capture"], row["number"], file, row["received_bytes"], row["is_created"], row["is_corrupt"])
+    return FileRow(row["capture"], row["number"], file, row["received_bytes"], row["is_created"], row["is_corrupt"], row["is_known"])

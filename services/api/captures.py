@@ -22,8 +22,9 @@ from services.api.blobs import Blobs, Write, sync_folders
 from services.api.capture_contents import content_fault
 from services.api.capture_paths import TEXTS, require_paths
 from services.api.capture_records import CaptureDetail, CaptureFile, CapturePage, CaptureState, FileFault, UploadManifest
-from services.api.capture_table import CaptureTable, FileRow
+from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
+from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.uploads import Uploads, upload_path
 from services.core.calibration import read_description
 from services.core.errors import (
@@ -73,8 +74,8 @@ class Captures:
         self._free_bytes = free_bytes or (lambda: shutil.disk_usage(data).free)
         self._guard = threading.RLock()
 
-    def create(self, manifest: UploadManifest, key: str | None = None) -> CaptureCreation:
-        """Open a capture, or find the one that this manifest or idempotency key has led to already.
+    def create(self, manifest: UploadManifest, key: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> CaptureCreation:
+        """Open a capture, or find the one that this manifest or idempotency key has led its owner to already.
 
         Raises:
             UploadError: a path that no capture may hold; TooLargeError: over a limit. CaptureStateError: the key belongs to another manifest.
@@ -86,15 +87,16 @@ class Captures:
         for file in manifest.files:
             if sizes.setdefault(file.sha256, file.bytes) != file.bytes:
                 raise CorruptUploadError(f"File {file.path} has the SHA-256 of another file of another size; hash the files again.")
-        digest = manifest.digest()
+        digest, key = manifest.digest(viewer.owner), viewer.key(key)
         with self._guard:
             self.sweep()
             if (earlier := self._table.find(digest, key)) is not None:
                 return CaptureCreation(self.get(earlier.id), is_new=False)
-            received = [file.bytes if self._blobs.holds(file.sha256, file.bytes) else 0 for file in manifest.files]
-            self._require_space(sum(file.bytes for file in manifest.files) - sum(received))
+            own = self._table.known((file.sha256 for file in manifest.files), viewer.owner)
+            known = [file.sha256 in own and self._blobs.holds(file.sha256, file.bytes) for file in manifest.files]
+            self._require_space(sum(file.bytes for file, is_known in zip(manifest.files, known, strict=True) if not is_known))
             now_s = self._now_s()
-            capture = self._table.insert(manifest, digest, key, received, now_s, now_s + self._limits.open_for_s)
+            capture = self._table.insert(manifest, digest, key, known, now_s, now_s + self._limits.open_for_s, viewer.owner)
             return CaptureCreation(self.get(capture.id), is_new=True)
 
     def get(self, capture: str) -> CaptureDetail:
@@ -114,9 +116,9 @@ class Captures:
             raise CaptureStateError(f"Capture {capture} is {state}; commit it first with POST /v1/captures/{capture}/commit.")
         return read_description(self._data / FOLDER / capture)
 
-    def page(self, limit: int, before: int | None = None) -> CapturePage:
-        """Newest captures first."""
-        found = self._table.page(limit + 1, before)
+    def page(self, limit: int, before: int | None = None, viewer: Viewer = LOCAL_VIEWER) -> CapturePage:
+        """Newest captures first, of those that somebody may see."""
+        found = self._table.page(limit + 1, before, None if viewer.sees_all else viewer.owner)
         return CapturePage(captures=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     def commit(self, capture: str) -> list[FileFault]:
@@ -172,17 +174,19 @@ class Captures:
                     self._table.delete(capture.id)
 
     @contextmanager
-    def keeping(self, spec: JobSpec) -> Iterator[None]:
+    def keeping(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> Iterator[None]:
         """Keep an uploaded capture from being deleted while a job that names it, as capture or mouth, is recorded; other paths pass.
 
         Raises:
-            SettingsError: no such capture, or it is not committed.
+            SettingsError: no such capture that whoever submits may see, or it is not committed.
         """
         option, path = ("capture", spec.capture) if spec.rig is None else ("rig.mouth", spec.rig.mouth)
         with self._guard:
             if path is not None and is_uploaded(path):
                 try:
                     found = self._table.get(path.name)
+                    if not viewer.may_see(found.owner):
+                        raise unknown_capture(path.name)
                 except UnknownCaptureError as problem:
                     raise SettingsError(f"Option '{option}': {problem.message}") from problem
                 if found.state is not CaptureState.COMMITTED:
@@ -199,8 +203,7 @@ class Captures:
         return spec.model_copy(update={"capture": self._data / spec.capture})
 
     def _shown(self, row: FileRow) -> CaptureFile:
-        is_known = self._blobs.holds(row.file.sha256, row.file.bytes)
-        received = self.uploads.received_bytes(row)
+        is_known, received = self.uploads.is_known(row), self.uploads.received_bytes(row)
         return CaptureFile(**row.file.model_dump(), received_bytes=received, is_known=is_known, upload=upload_path(row.capture, row.number))
 
     def _arrival_fault(self, row: FileRow) -> FileFault | None:

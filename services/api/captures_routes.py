@@ -15,7 +15,7 @@ from services.api.bodies import Sent
 from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
 from services.api.database import MOST_ID
-from services.api.guard import needs
+from services.api.guard import Asker, needs
 from services.api.problems import MEDIA_TYPE, Problem, refusals
 from services.api.threads import in_thread
 from services.api.tus_routes import build_tus_router
@@ -55,17 +55,19 @@ def build_captures_router(captures: Captures) -> APIRouter:
     under = APIRouter(prefix="/v1/captures", responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
 
     @under.post("", status_code=201, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
-    def create(manifest: Sent[UploadManifest], response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> CaptureDetail:
+    def create(
+        manifest: Sent[UploadManifest], asker: Asker, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None
+    ) -> CaptureDetail:
         """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
-        creation = captures.create(manifest, idempotency_key)
+        creation = captures.create(manifest, idempotency_key, asker)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/captures/{creation.capture.id}"
         return creation.capture
 
     @under.get("", dependencies=[needs("read")])
-    def page(limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> CapturePage:
+    def page(asker: Asker, limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> CapturePage:
         """List captures, newest first."""
-        return captures.page(limit, before)
+        return captures.page(limit, before, asker)
 
     @under.get("/{capture}", dependencies=[needs("read")])
     def get(capture: str) -> CaptureDetail:

@@ -12,7 +12,7 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.dome_process import DomeProcess
-from services.api.jobs import Jobs, require_server_path
+from services.api.jobs import Jobs
 from services.api.light_limits import LightLimits
 from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError, UnknownDomeError
@@ -131,7 +131,7 @@ class Dome:
             raise SettingsError(f"'dome': this server works the dome at {self._address} and no other; leave it out.")
         if self._address is not None:
             self._limits.require(rig.model_copy(update={"dome": self._address}))
-        require_server_path("mouth", rig.mouth)
+        self._jobs.server_paths.require("mouth", rig.mouth)
         with self._driven_by_hand():
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)
 

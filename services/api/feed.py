@@ -152,7 +152,7 @@ class EventFeed:
                 try:
                     chapter = await self._read(turn, job_id, reached[job_id])
                 except UnknownJobError:
-                    yield _end_of(job_id, None)
+                    yield end_of(job_id, None)
                     del reached[job_id]
                     continue
                 except sql.exc.SQLAlchemyError:
@@ -160,7 +160,7 @@ class EventFeed:
                 if chapter.text:
                     yield chapter.text
                 if chapter.ended is not None:
-                    yield _end_of(job_id, chapter.ended)
+                    yield end_of(job_id, chapter.ended)
                     del reached[job_id]
                     continue
                 reached[job_id] = chapter.last_id
@@ -204,5 +204,6 @@ def _read(repository: Repository, job_id: str, after: int) -> Chapter:
     return Chapter(told, events[-1].id if events else after, state if has_ended else None, is_full)
 
 
-def _end_of(job_id: str, state: JobState | None) -> bytes:
+def end_of(job_id: str, state: JobState | None) -> bytes:
+    """What a stream of several jobs tells of one that has ended, with no state of one that is not there."""
     return format_sse_event(event="end", data_str=json.dumps({"job": job_id, "state": state}))

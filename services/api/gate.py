@@ -18,11 +18,12 @@ from services.api.access import Access
 from services.api.audit import AuditLog, Deed
 from services.api.clerks import Clerks
 from services.api.guard import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
+from services.api.ownership import Ownership
 from services.api.problems import MEDIA_TYPE, Problem, database_lost, response_of
 from services.api.rates import Rates, network_of
 from services.api.requests import method_of
 from services.api.shield import SAFE_METHODS
-from services.api.tokens import public_id
+from services.api.tokens import Caller, public_id
 from services.core.errors import PlatformError, RateError, ScopeError, UnauthenticatedError
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class Gate:
     def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks, dark_auditors: Clerks) -> None:
         self._app, self._owner, self._access, self._rates = app, owner, access, rates
         self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
+        self._ownership = Ownership(access.tokens.engine)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -83,7 +85,21 @@ class Gate:
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
             return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
         request.scope["caller"], request.scope["deed"] = caller, deed
-        return None
+        return await self._hidden(request, found.route, found.ids, caller, deed)
+
+    async def _hidden(self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, deed: Deed) -> Response | None:
+        """The answer to a request that names something of others: the same as if it were not there, and before anything else of it is looked at."""
+        named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
+        if named is None:
+            return None
+        thing, name = named
+        if (owner := thing.known_owner(name)) is None:
+            owner = await self._access.lookers.ask(thing.find_owner, self._ownership.engine, name)
+        if caller.viewer.may_see(owner):
+            return None
+        if _is_audited(request.scope, route):
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.NOT_FOUND)
+        return response_of(thing.absent(name), request.scope["path"])
 
     async def _stranger_refusal(self, request: HTTPConnection, deed: Deed) -> Response | None:
         """The answer to somebody with a setup link who may not even try it: each try counts as a request without a valid token."""
@@ -110,9 +126,8 @@ class Gate:
 
     async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
         scope = request.scope
-        declared = route.needs if route is not None else None
-        is_audited = scope["method"] not in SAFE_METHODS or (declared is not None and declared.audited)
-        auditors = self._dark_auditors if declared is not None and declared.darkens else self._auditors
+        is_audited = _is_audited(scope, route)
+        auditors = self._dark_auditors if route is not None and route.needs is not None and route.needs.darkens else self._auditors
         known_at, is_over = time.monotonic(), False
 
         async def send_audited(message: Message) -> None:
@@ -153,6 +168,10 @@ class Gate:
         except UnauthenticatedError:
             return False
         return True
+
+
+def _is_audited(scope: Scope, route: GuardedRoute | None) -> bool:
+    return scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
 
 
 def _is_public(scope: Scope, found: Found) -> bool:

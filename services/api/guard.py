@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from fastapi import Request, params
+from fastapi import Depends, Request, params
 from fastapi.routing import iter_route_contexts
 from fastapi.security import HTTPBearer
 from starlette.routing import Mount
 
+from services.api.owners import Viewer
 from services.api.tokens import Caller, Scope
 from services.core.errors import ScopeError
 
@@ -58,6 +59,15 @@ def require(caller: Caller | None, scope: Scope) -> None:
     if caller is None or scope not in caller.scopes:
         who = "a caller without a token" if caller is None else f"token {caller.name}"
         raise ScopeError(f"This needs scope '{scope}', which {who} does not have; use a token with that scope.")
+
+
+async def _viewer(request: Request) -> Viewer:
+    caller: Caller = request.scope["caller"]
+    return caller.viewer
+
+
+Asker = Annotated[Viewer, Depends(_viewer)]
+"""Parameter of a handler whose answer depends on who asks. What a path names by ``job_id`` or ``capture`` the gate has looked after already."""
 
 
 @dataclass(frozen=True)

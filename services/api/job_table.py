@@ -10,6 +10,8 @@ from pydantic import Field
 
 from services.api.database import metadata
 from services.api.lifecycle import JobState
+from services.api.owners import DEFAULT_GROUP, Viewer
+from services.core.errors import UnknownJobError
 from services.core.geometry import Record
 
 job_table = sql.Table(
@@ -27,6 +29,8 @@ job_table = sql.Table(
     sql.Column("kind", sql.Text),
     sql.Column("source", sql.Text),
     sql.Column("name", sql.Text),
+    sql.Column("owner", sql.Text, nullable=False, server_default=DEFAULT_GROUP),
+    sql.Index("job_of_owner", "owner", "number"),
     sqlite_autoincrement=True,
 )
 
@@ -39,7 +43,18 @@ deletion_table = sql.Table(
     sql.Column("files", sql.Integer, nullable=False),
     sql.Column("bytes", sql.BigInteger, nullable=False),
     sql.Column("digest", sql.Text, nullable=False),
+    sql.Column("owner", sql.Text, nullable=False, server_default=DEFAULT_GROUP),
 )
+
+
+def unknown_job(job_id: str) -> UnknownJobError:
+    """What is told of a job that is not there, or is somebody else's."""
+    return UnknownJobError(f"There is no job {job_id}; list the jobs to see their ids.")
+
+
+def unknown_deletion(job_id: str) -> UnknownJobError:
+    """What is told of a receipt that is not there, or is somebody else's."""
+    return UnknownJobError(f"No job {job_id} was deleted; check its id.")
 
 
 class JobFilter(Record):
@@ -50,6 +65,12 @@ class JobFilter(Record):
     created_after_s: float | None = Field(default=None, description="Unix time")
     created_before_s: float | None = Field(default=None, description="Unix time")
     source: str | None = Field(default=None, description="text in the path of the capture or of the rig's mouth, in any case")
+    owner: str | None = Field(default=None, description="whose jobs; null: everybody's")
+    by_name: bool = Field(default=False, description="whether source is looked for in the path's last part alone")
+
+    def seen_by(self, viewer: Viewer) -> JobFilter:
+        """The same, of what somebody may see."""
+        return self.model_copy(update={"owner": None if viewer.sees_all else viewer.owner, "by_name": not viewer.uses_paths})
 
     def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
         """What a row of the job table must fulfil."""
@@ -62,4 +83,9 @@ class JobFilter(Record):
         if self.created_before_s is not None:
             yield job_table.c.created_s < self.created_before_s
         if self.source is not None:
-            yield job_table.c.source.icontains(self.source, autoescape=True)
+            path = job_table.c.source
+            above = sql.func.rtrim(path, sql.func.replace(path, "/", ""))
+            searched = sql.func.replace(path, above, "") if self.by_name else path
+            yield searched.icontains(self.source, autoescape=True)
+        if self.owner is not None:
+            yield job_table.c.owner == self.owner

@@ -21,9 +21,11 @@ from services.api.job_table import JobFilter
 from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.light_limits import LightLimits
 from services.api.machine_class import machine_class
+from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.pipeline import request_cancel, stages_of
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
+from services.api.server_paths import ServerPaths
 from services.api.time_ranges import TimeRange, TimeRanges
 from services.core.errors import JobStateError, SettingsError, StoreError, UnknownJobError
 from services.core.geometry import Record
@@ -66,7 +68,7 @@ class Jobs:
             require_own_folder(self.repository.engine, self._data)
         self.captures = Captures(self.repository.engine, self._data, settings.uploads)
         self.calibrations = Calibrations(self._data)
-        self._light_limits = LightLimits(settings.dome)
+        self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks)
         places, running = settings.jobs_at_once, lambda: self._admission.sharing
@@ -104,30 +106,32 @@ class Jobs:
         """A job's options with the files of what the server stores for it."""
         return self.calibrations.locate(self.captures.locate(spec))
 
-    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None, name: str | None = None) -> Creation:
+    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
         """Queue a job, under a label where it is given one.
 
         Raises:
-            SettingsError: a path is relative or absent, or an uploaded capture is not committed. JobTooLargeError: the machine could never run it.
+            SettingsError: a path is relative, absent or may not be named, or an uploaded capture is not committed or somebody else's.
+            JobTooLargeError: the machine could never run it.
             ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another job.
         """
-        if key is not None and (earlier := self.repository.submitted(spec, key)) is not None:
+        if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
             return Creation(earlier, is_new=False)
         if spec.channels == ():
             raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
         if spec.capture is not None and not is_uploaded(spec.capture):
-            require_server_path("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
+            self.server_paths.require("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
         if spec.rig is not None:
             self._light_limits.require(spec.rig)
         if spec.rig is not None and not spec.is_demo and not is_uploaded(spec.rig.mouth):
-            require_server_path("rig.mouth", spec.rig.mouth, "upload it with dentine submit --upload, or try the demonstration with dentine demo")
+            remedy = "upload it with dentine submit --upload, or try the demonstration with dentine demo"
+            self.server_paths.require("rig.mouth", spec.rig.mouth, remedy)
         if spec.calibration is not None and is_stored(spec.calibration):
-            self.calibrations.require(spec.calibration)
+            self.calibrations.require(spec.calibration, viewer)
         elif spec.calibration is not None:
-            require_server_path("calibration", spec.calibration)
+            self.server_paths.require("calibration", spec.calibration)
         self._admission.refuse_too_large(self.locate(spec))  # before other submissions have to wait, as it walks through the capture
-        with self.captures.keeping(spec):
-            creation = self.repository.create(spec, key, request_id, name)
+        with self.captures.keeping(spec, viewer):
+            creation = self.repository.create(spec, key, request_id, name, viewer)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
         return creation
@@ -239,28 +243,6 @@ class Jobs:
                 continue  # deleted meanwhile
             except (StoreError, OSError) as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
-
-
-def require_server_path(option: str, path: Path, remedy: str = "check the path") -> None:
-    """Refuse a path that means nothing on the server; ``remedy`` says what to do about one that is absent.
-
-    Raises:
-        SettingsError: it is relative or absent.
-    """
-    if not path.is_absolute():
-        raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
-    if not _is_there(path):
-        raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
-
-
-def _is_there(path: Path) -> bool:
-    # Not what has no name in Unicode, as it could not be stored.
-    try:
-        str(path).encode()
-        path.stat()
-    except (OSError, ValueError):
-        return False
-    return True
 
 
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:

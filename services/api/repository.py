@@ -19,12 +19,14 @@ from pydantic import Field
 
 from services.api.database import Query, open_database, writing
 from services.api.events import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
-from services.api.job_table import JobFilter, deletion_table, job_table
+from services.api.job_table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
+from services.api.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.api.past_runs import PastRuns, past_run_table
+from services.api.server_paths import without_folders
 from services.api.webhook_outbox import collect_changes
-from services.core.errors import DentineError, FencedError, JobStateError, UnknownJobError
+from services.core.errors import DentineError, FencedError, JobStateError
 from services.core.geometry import Record
 from services.core.records import JobName, JobSpec
 from services.core.stage import StageName
@@ -60,6 +62,11 @@ class Job(Record):
     failure: Failure | None
     request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
     name: JobName | None = Field(default=None, description="label that a person gave it")
+    owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
+
+    def seen_by(self, viewer: Viewer) -> Job:
+        """The same as somebody may see it: without the folders on the server, for one who may not use them."""
+        return self if viewer.uses_paths else self.model_copy(update={"spec": without_folders(self.spec)})
 
 
 class Deletion(Record):
@@ -127,19 +134,20 @@ class Repository:
         """Close every connection."""
         self.engine.dispose()
 
-    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None, name: str | None = None) -> Creation:
-        """Insert a job as QUEUED, or find the one that was submitted with this idempotency key.
+    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
+        """Insert a job as QUEUED, or find the one that its owner submitted with this idempotency key.
 
         Raises:
             JobStateError: the key was used for other options.
         """
         options = spec.model_dump_json()
         with writing(self.engine) as connection:
-            if key is not None and (earlier := connection.execute(_WITH_KEY.statement, {"of_key": key}).first()):
+            own_key = viewer.key(key)
+            if key is not None and (earlier := connection.execute(_WITH_KEY.statement, {"of_key": own_key}).first()):
                 return Creation(self._same(earlier, spec, key), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
-            row = {"id": job_id, "key": key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
-            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture), "name": name}
+            row = {"id": job_id, "key": own_key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
+            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture), "name": name, "owner": viewer.owner}
             connection.execute(_INSERT, row)
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
@@ -155,13 +163,13 @@ class Repository:
             connection.execute(job_table.update().where(job_table.c.id == job_id).values(name=name))
             return self._find(connection, job_id)
 
-    def submitted(self, spec: JobSpec, key: str) -> Job | None:
-        """The job that was submitted with this idempotency key, if there is one.
+    def submitted(self, spec: JobSpec, key: str, viewer: Viewer = LOCAL_VIEWER) -> Job | None:
+        """The job that its owner submitted with this idempotency key, if there is one.
 
         Raises:
             JobStateError: the key was used for other options.
         """
-        rows = _WITH_KEY.rows(self.engine, of_key=key)
+        rows = _WITH_KEY.rows(self.engine, of_key=viewer.key(key))
         return self._same(rows[0], spec, key) if rows else None
 
     def get(self, job_id: str) -> Job:
@@ -171,6 +179,11 @@ class Repository:
             UnknownJobError: there is none with this id.
         """
         return self._only(_ONE.rows(self.engine, of=job_id), job_id)
+
+    def seen(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
+        """Those of the jobs that are there and that somebody may see."""
+        found = (_ONE.rows(self.engine, of=job_id) for job_id in job_ids)
+        return {job.id for job in self._jobs(rows[0] for rows in found if rows) if viewer.may_see(job.owner)}
 
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
@@ -268,7 +281,7 @@ class Repository:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
             collect_changes(connection, self._clock())  # as the events go with the job
             receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
-            connection.execute(deletion_table.insert().values(receipt.model_dump()))
+            connection.execute(deletion_table.insert().values(receipt.model_dump() | {"owner": job.owner}))
             for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):
                 connection.execute(column.table.delete().where(column == job_id))
             return receipt
@@ -282,8 +295,8 @@ class Repository:
         with self.engine.connect() as connection:
             row = connection.execute(sql.select(deletion_table).where(deletion_table.c.job == job_id)).mappings().first()
         if row is None:
-            raise UnknownJobError(f"No job {job_id} was deleted; check its id.")
-        return Deletion(**row)
+            raise unknown_deletion(job_id)
+        return Deletion(**{name: row[name] for name in Deletion.model_fields})
 
     def ended_before(self, time_s: float) -> list[str]:
         """Jobs that ended before a time, oldest first, and those whose deletion was begun."""
@@ -317,7 +330,7 @@ class Repository:
 
     def _only(self, rows: Sequence[Sequence[Any]], job_id: str) -> Job:
         if not rows:
-            raise UnknownJobError(f"There is no job {job_id}; list the jobs to see their ids.")
+            raise unknown_job(job_id)
         return self._job(rows[0])
 
     def _same(self, row: Sequence[Any], spec: JobSpec, key: str) -> Job:
@@ -333,7 +346,7 @@ class Repository:
         return self._known(*row)
 
     def _read(self, *row: Any) -> Job:
-        job_id, number, state, created_s, changed_s, spec, failure, request_id, name = row
+        job_id, number, state, created_s, changed_s, spec, failure, request_id, name, owner = row
         return Job(
             id=job_id,
             number=number,
@@ -344,6 +357,7 @@ class Repository:
             failure=Failure.model_validate_json(failure) if failure else None,
             request_id=request_id,
             name=name,
+            owner=owner,
         )
 
     def _apply(self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -12,11 +13,12 @@ from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_ar
 from services.api.bodies import Sent
 from services.api.clerks import Clerks
 from services.api.database import MOST_ID
-from services.api.feed import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream
-from services.api.guard import needs, require
+from services.api.feed import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
+from services.api.guard import Asker, needs, require
 from services.api.job_table import JobFilter
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
+from services.api.owners import Viewer
 from services.api.problems import refusals
 from services.api.repository import Deletion, Job
 from services.api.time_ranges import TimeRange
@@ -77,13 +79,14 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
     schema = json.dumps(JobSpec.model_json_schema())
 
     @in_json
-    def tell(job: Job, remaining: TimeRange | None) -> JobDetail:
-        fields = {name: getattr(job, name) for name in Job.model_fields}
+    def tell(job: Job, remaining: TimeRange | None, asker: Viewer) -> JobDetail:
+        shown = job.seen_by(asker)
+        fields = {name: getattr(shown, name) for name in Job.model_fields}
         return JobDetail(**fields, stages=jobs.progress(job), waits_for=jobs.waits_for(job), remaining=remaining)
 
-    def find(job_id: str) -> Job | Response:
+    def find(job_id: str, asker: Viewer) -> Job | Response:
         job = jobs.repository.get(job_id)
-        return tell(job, None) if job.state.is_final else job
+        return tell(job, None, asker) if job.state.is_final else job
 
     async def look(job: Job) -> TimeRange | None:
         try:
@@ -93,14 +96,16 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
             return TimeRange(reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again.")
 
     @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
-    def submit(wanted: Sent[Submission], request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Job:
+    def submit(
+        wanted: Sent[Submission], asker: Asker, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None
+    ) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200.
 
         A job with a rig needs scope operate-dome too, unless its dome is simulated.
         """
         if wanted.rig is not None and not wanted.rig.is_simulated:
             require(request.scope.get("caller"), Scope.OPERATE_DOME)
-        creation = jobs.submit(wanted.spec(), idempotency_key, request.state.request_id, wanted.name)
+        creation = jobs.submit(wanted.spec(), idempotency_key, request.state.request_id, wanted.name, asker)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
         return creation.job
@@ -109,6 +114,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
     @readers.answering
     @in_json
     def page(
+        asker: Asker,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None,
         state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
@@ -119,14 +125,14 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
     ) -> JobPage:
         """List jobs, newest first."""
         only = JobFilter(states=state, kind=kind, created_after_s=created_after_s, created_before_s=created_before_s, source=capture)
-        found = jobs.repository.page(limit + 1, before, only=only)
-        return JobPage(jobs=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
+        found = jobs.repository.page(limit + 1, before, only=only.seen_by(asker))
+        return JobPage(jobs=[job.seen_by(asker) for job in found[:limit]], next_before=found[limit - 1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", response_model=JobDetail, tags=["jobs"], dependencies=[needs("read")])
-    async def get(job_id: str) -> Response:
+    async def get(job_id: str, asker: Asker) -> Response:
         """One job with its stages."""
-        found = await readers.ask(find, job_id)
-        return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found))
+        found = await readers.ask(find, job_id, asker)
+        return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found), asker)
 
     @router.patch("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
     def rename(job_id: str, label: Sent[Label]) -> Job:
@@ -167,10 +173,18 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         return await feed.answer(job_id, last_event_id or 0)
 
     @router.get("/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
-    async def events_of_several(job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MOST_STREAMED, description=_PLACE)]) -> Response:
+    async def events_of_several(asker: Asker, job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MOST_STREAMED, description=_PLACE)]) -> Response:
         """The events of several jobs in one stream, as a browser has few connections; event 'end' names the job and its final state, null for an absent one."""
-        places = (place.partition(":") for place in job)
-        return EventStream(feed.follow_several({job_id: int(after or 0) for job_id, _, after in places}), headers=UNBUFFERED)
+        places = {job_id: int(after or 0) for job_id, _, after in (place.partition(":") for place in job)}
+        seen = await readers.ask(jobs.repository.seen, places, asker)
+
+        async def follow() -> AsyncIterator[bytes]:
+            for job_id in sorted(set(places) - seen):
+                yield end_of(job_id, None)
+            async for chapter in feed.follow_several({job_id: places[job_id] for job_id in seen}):
+                yield chapter
+
+        return EventStream(follow(), headers=UNBUFFERED)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
     @openers.answering

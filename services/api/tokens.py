@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple, Self
 
 import sqlalchemy as sql
@@ -26,6 +27,8 @@ from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
 from services.api.audit import Deed
 from services.api.database import Query, metadata, writing
+from services.api.ended_sessions import EndedSessions
+from services.api.owners import LOCAL_VIEWER, Viewer, owner_of_token
 from services.core.errors import InputError, UnauthenticatedError, UnknownTokenError
 from services.core.geometry import Record
 
@@ -51,6 +54,7 @@ token_table = sql.Table(
     sql.Column("expires_s", sql.Float),
     sql.Column("revoked_s", sql.Float),
     sql.Column("last_used_s", sql.Float),
+    sql.Column("group", sql.Text),
 )
 
 _ONE = Query(sql.select(token_table).where(token_table.c.id == sql.bindparam("of")))
@@ -80,6 +84,7 @@ class Token(Record):
     expires_s: float | None = Field(description="Unix time; null: never")
     revoked_s: float | None = Field(description="Unix time; null: not revoked")
     last_used_s: float | None = Field(description="Unix time, noted at most once an hour; null: never")
+    group: str | None = Field(default=None, description="owns what its tokens make, and they see it; null: the token stands alone")
 
 
 class IssuedToken(Token):
@@ -101,6 +106,13 @@ class Caller:
     token: Token | None = None
     by_session: bool = False
 
+    @cached_property
+    def viewer(self) -> Viewer:
+        """What it may see."""
+        if self.token is None:
+            return LOCAL_VIEWER
+        return Viewer(self.token.group or owner_of_token(self.token.id), sees_all=Scope.ADMIN in self.scopes, uses_paths=Scope.SUBMIT in self.scopes)
+
     @classmethod
     def of(cls, token: Token, *, by_session: bool = False) -> Caller:
         """The caller that a valid token stands for."""
@@ -112,7 +124,7 @@ LOCAL = Caller("local", frozenset(Scope))
 
 
 class _Credential(NamedTuple):
-    """A token's hash, or the id of a session's token: an id is public, so one must never pass for the other."""
+    """A token's hash, or a session's, else the id of its token: an id is public, so one must never pass for the other."""
 
     sha256: str | None
     session_of: str | None
@@ -139,31 +151,38 @@ class Tokens:
     """
 
     def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time, ticks: Callable[[], float] = time.monotonic) -> None:
-        self._engine, self._clock, self._ticks = engine, clock, ticks
+        self.engine, self._clock, self._ticks = engine, clock, ticks
+        self.ended_sessions = EndedSessions(engine, clock)
         self._trusted: dict[_Credential, _Trust] = {}
         self._revocations = 0
 
-    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed) -> IssuedToken:
+    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed, group: str | None = None) -> IssuedToken:
         """Make a token; the result is the only place where its secret is.
 
+        Args:
+            group: owns what it makes; None: nobody but the token itself and administrators see that.
+
         Raises:
-            InputError: the name is malformed or belongs to a living token, or there is no scope.
+            InputError: the name is malformed or belongs to a living token, the group's is malformed, or there is no scope.
         """
         if not re.fullmatch(NAME, name) or name == LOCAL.name or re.fullmatch(ID, name):
             what = f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like an id"
             raise InputError(f"Token name {name!r} does not serve; {what}.")
+        if group is not None and not re.fullmatch(NAME, group):
+            raise InputError(f"Group {group!r} of token {name} does not serve; use up to 64 letters, digits, points and hyphens.")
         if not (wanted := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
         now = self._clock()
-        with writing(self._engine) as connection:
+        with writing(self.engine) as connection:
             namesake = sql.select(token_table).where(token_table.c.name == name, token_table.c.revoked_s.is_(None))
             if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
                 raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
-            return insert_token(connection, name, wanted, now, None if expires_days is None else now + expires_days * DAY_S, deed)
+            expires_s = None if expires_days is None else now + expires_days * DAY_S
+            return insert_token(connection, name, wanted, now, expires_s, deed, group)
 
     def list(self) -> list[Token]:
         """Every token, newest first, revoked and expired ones too."""
-        with self._engine.connect() as connection:
+        with self.engine.connect() as connection:
             return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
 
     def revoke(self, token_id: str, deed: Deed) -> Token:
@@ -173,7 +192,7 @@ class Tokens:
             UnknownTokenError: there is none.
         """
         now = self._clock()
-        with writing(self._engine) as connection:
+        with writing(self.engine) as connection:
             is_meant = sql.or_(token_table.c.id == token_id, sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)))
             id_first = sql.case((token_table.c.id == token_id, 0), else_=1)
             found = connection.execute(sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())).mappings().first()
@@ -206,16 +225,26 @@ class Tokens:
         self._note_use(row)
         return self._trust(_Credential.of(presented), row, revocations)
 
-    def living(self, token_id: str) -> Token:
+    def end_session(self, sha256: str, expires_s: float) -> None:
+        """End a session now: at this server with the next request, at others within ``TRUSTED_S``."""
+        self.ended_sessions.add(sha256, expires_s)
+        self._revocations += 1
+
+    def living(self, token_id: str, session: str | None = None) -> Token:
         """The token with this id, for a session that it has opened.
 
+        Args:
+            session: SHA-256 of its cookie.
+
         Raises:
-            UnauthenticatedError: it has expired or was revoked since.
+            UnauthenticatedError: the token has expired or was revoked since, or the session was ended.
         """
         revocations, row = self._revocations, self._find(token_id)
+        if session is not None and self.ended_sessions.has(session):
+            raise UnauthenticatedError("This session was ended; sign in again with a token.")
         if row is None or not _is_living(row, self._clock()):
             raise UnauthenticatedError("The token of this session has expired or was revoked; sign in with another one.")
-        return self._trust(_Credential.of(session_of=token_id), row, revocations)
+        return self._trust(_Credential.of(session_of=session or token_id), row, revocations)
 
     def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
         token = Token(**_fields(row))
@@ -226,22 +255,24 @@ class Tokens:
         return token
 
     def _find(self, token_id: str) -> Any:
-        rows = _ONE.rows(self._engine, of=token_id)
+        rows = _ONE.rows(self.engine, of=token_id)
         return dict(zip(token_table.c.keys(), rows[0], strict=True)) if rows else None
 
     def _note_use(self, row: Any) -> None:
         now = self._clock()
         if row["last_used_s"] is None or now - row["last_used_s"] >= LAST_USE_STEP_S:
-            with suppress(sql.exc.OperationalError), writing(self._engine) as connection:  # a full disk must not refuse a reader
+            with suppress(sql.exc.OperationalError), writing(self.engine) as connection:  # a full disk must not refuse a reader
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
 
 
-def insert_token(connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, deed: Deed) -> IssuedToken:
+def insert_token(
+    connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, deed: Deed, group: str | None = None
+) -> IssuedToken:
     """Add a token, and the audit's row of it, inside the caller's transaction."""
     token_id = secrets.token_hex(6)
     secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
     row = {"id": token_id, "name": name, "scopes": " ".join(scopes), "sha256": _hash(secret.get_secret_value()), "created_s": now_s}
-    row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None}
+    row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None, "group": group}
     connection.execute(token_table.insert().values(row))
     deed.ids["token_id"] = token_id
     deed.write(connection, 201)

@@ -11,7 +11,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from services.api import tus
 from services.api.database import MOST_ID
-from services.api.guard import needs
+from services.api.guard import Asker, needs
 from services.api.problems import refusals
 from services.api.receiving import SilenceError, receive
 from services.api.uploads import Upload, Uploads, upload_path
@@ -56,12 +56,12 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         return Response(status_code=204, headers=headers | {"Tus-Checksum-Algorithm": ",".join(tus.DIGEST_BYTES)})
 
     @router.post("", status_code=201, dependencies=[*versioned, needs("submit")], response_class=Response)
-    def create(upload_length: Annotated[int, Header(ge=0, le=2**53)], upload_metadata: Annotated[str, Header(max_length=2000)]) -> Response:
+    def create(asker: Asker, upload_length: Annotated[int, Header(ge=0, le=2**53)], upload_metadata: Annotated[str, Header(max_length=2000)]) -> Response:
         """Start to send one file of an open capture; Upload-Metadata names 'capture' and 'path'. Starting again changes nothing."""
         metadata = tus.parse_metadata(upload_metadata)
         if missing := {"capture", "path"} - set(metadata):
             raise UploadError(f"Upload-Metadata lacks {min(missing)!r}; name the capture's id and the file's path in it.")
-        upload = uploads.create(metadata["capture"], metadata["path"], upload_length)
+        upload = uploads.create(metadata["capture"], metadata["path"], upload_length, asker)
         return Response(status_code=201, headers={"Location": upload_path(upload.row.capture, upload.row.number)} | told(upload))
 
     @router.head("/{capture}/{number}", dependencies=[*versioned, needs("submit")], response_class=Response)

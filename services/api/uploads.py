@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from services.api.blobs import Blobs, PartialFile
 from services.api.capture_records import CaptureState
-from services.api.capture_table import CaptureTable, FileRow
+from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
+from services.api.owners import LOCAL_VIEWER, Viewer
 from services.core.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
 from services.core.settings import UploadLimits
 
@@ -40,12 +41,14 @@ class Uploads:
         self.limits, self.claims = limits, claims
         self._table, self._blobs, self._now_s = table, blobs, now_s
 
-    def create(self, capture: str, path: str, size_bytes: int) -> Upload:
-        """Ask to send one file; asking again changes nothing.
+    def create(self, capture: str, path: str, size_bytes: int, viewer: Viewer = LOCAL_VIEWER) -> Upload:
+        """Ask to send one file of a capture that whoever asks may see; asking again changes nothing.
 
         Raises:
             UnknownCaptureError: no such capture or file. CorruptUploadError: its size is another. ExpiredError, CaptureStateError: the capture is not open.
         """
+        if not viewer.may_see(self._table.get(capture).owner):
+            raise unknown_capture(capture)
         self.require_open(capture)
         row = self._table.file_at(capture, path)
         if row.file.bytes != size_bytes:
@@ -94,11 +97,11 @@ class Uploads:
             CorruptUploadError: its SHA-256 is another; what was received is discarded.
         """
         file = row.file
-        if not self._blobs.holds(file.sha256, file.bytes) and not self._blobs.adopt(row.capture, row.number, file.sha256):
+        if not self.is_known(row) and not self._blobs.adopt(row.capture, row.number, file.sha256):
             self._table.change_file(row.capture, row.number, received_bytes=0, is_corrupt=True)
             raise CorruptUploadError(f"File {file.path!r} was received whole, but its SHA-256 is not the manifest's; it was discarded, so send it again.")
+        self._table.mark_known(file.sha256, row.capture)
         self._blobs.discard_partial(row.capture, row.number)
-        self._table.mark_known(file.sha256)
 
     def terminate(self, capture: str, number: int) -> None:
         """Discard what was received of a file, and its upload.
@@ -108,14 +111,20 @@ class Uploads:
         """
         self.require_open(capture)
         with self.claims.claim(capture, number):
-            file = self.find(capture, number).row.file
+            row = self.find(capture, number).row
             self._blobs.discard_partial(capture, number)
-            known_bytes = file.bytes if self._blobs.holds(file.sha256, file.bytes) else 0
-            self._table.change_file(capture, number, is_created=False, received_bytes=known_bytes)
+            self._table.change_file(capture, number, is_created=False, received_bytes=row.file.bytes if self.is_known(row) else 0)
+
+    def is_known(self, row: FileRow) -> bool:
+        """Whether the whole content is here and verified, and its owner has sent it.
+
+        A content that others have sent must be sent again: who knows its SHA-256 alone shall neither get it nor learn that it is here.
+        """
+        return row.is_known and self._blobs.holds(row.file.sha256, row.file.bytes)
 
     def received_bytes(self, row: FileRow) -> int:
         """As recorded, but never more than the disk holds."""
-        if self._blobs.holds(row.file.sha256, row.file.bytes):
+        if self.is_known(row):
             return row.file.bytes
         return min(row.received_bytes, self._blobs.received_bytes(row.capture, row.number))
 

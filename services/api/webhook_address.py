@@ -20,6 +20,10 @@ _HOST = re.compile(r"[A-Za-z0-9_.:-]+")
 _ASKERS = ThreadPoolExecutor(16, "names")
 """Ask name servers, as many at once as there are receivers; nothing else waits for one that does not answer."""
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
+_EXAMPLES = ipaddress.IPv6Network("3fff::/20")
+"""For documentation (RFC 9637); Python 3.12 takes it for public."""
+_ISATAP = frozenset({0x0000_5EFE, 0x0200_5EFE})
+"""Of the last 64 bits the first 32, which say that an IPv4 address follows to which packets are tunnelled (RFC 5214)."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,7 @@ def is_public(address: IpAddress) -> bool:
             within = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
         if within is not None:
             return is_public(within)
-        if address.is_site_local:
+        if address.is_site_local or address in _EXAMPLES or int(address) >> 32 & 0xFFFFFFFF in _ISATAP:
             return False
     return address.is_global and not address.is_multicast and not address.is_reserved
 

@@ -3,7 +3,7 @@
 from fastapi import APIRouter
 
 from services.api.answers import in_json
-from services.api.guard import needs
+from services.api.guard import Asker, needs
 from services.api.problems import refusals
 from services.api.repository import Repository
 from services.api.worker_states import WorkerList, list_workers
@@ -16,8 +16,8 @@ def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:
 
     @router.get("/workers", dependencies=[needs("read")])
     @in_json
-    def every() -> WorkerList:
-        """The workers, what each is doing, and how many jobs they got done; 503 where their scheduler does not answer."""
-        return list_workers(workers, repository)
+    def every(asker: Asker) -> WorkerList:
+        """The workers, what each does of the caller's jobs, and how many jobs they got done; 503 where their scheduler does not answer."""
+        return list_workers(workers, repository, asker)
 
     return router

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, get_args
 
 import sqlalchemy as sql
@@ -13,6 +13,7 @@ from pydantic import Field
 from services.api.database import Query
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
+from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.repository import Repository
 from services.api.workers import NOT_STARTED, TOLD, Workers
 from services.core.geometry import Record
@@ -28,12 +29,15 @@ _SUCCEEDED = Query(
     )
 )
 
+_IS_AT_WORK = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.CANCELLING.value)
+_OWN_AT_WORK = Query(sql.select(job_table.c.id).where(job_table.c.owner == sql.bindparam("of_owner"), _IS_AT_WORK))
+
 
 class WorkerTask(Record):
     """A stage that a worker runs."""
 
     stage: StageName
-    job: str = Field(description="id")
+    job: str | None = Field(description="id; null where it is a job of others")
 
 
 class WorkerState(Record):
@@ -60,27 +64,36 @@ class WorkerList(Record):
     succeeded_last_day: int = Field(description="jobs in 24 h")
 
 
-def list_workers(workers: Workers, repository: Repository) -> WorkerList:
-    """Ask the scheduler and the database.
+def list_workers(workers: Workers, repository: Repository, viewer: Viewer = LOCAL_VIEWER) -> WorkerList:
+    """Ask the scheduler and the database; jobs that somebody may not see have no id.
 
     Raises:
         SchedulerLostError: the scheduler does not answer.
     """
     seen = workers.look()
-    found = () if seen is None else tuple(sorted(_states(seen.workers, seen.processing), key=lambda one: one.name))
+    found = () if seen is None else tuple(sorted(_states(seen.workers, seen.processing, _seen_by(viewer, repository)), key=lambda one: one.name))
     now_s = time.time()
     in_day, in_hour = _SUCCEEDED.rows(repository.engine, hour_ago_s=now_s - HOUR_S, day_ago_s=now_s - DAY_S)[0]
     return WorkerList(workers=found, sentence=_sentence(found, is_started=seen is not None), succeeded_last_hour=in_hour, succeeded_last_day=in_day)
 
 
-def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, Iterable[Any]]) -> Iterable[WorkerState]:
+def _seen_by(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
+    if viewer.sees_all:
+        return lambda _: True
+    own = {str(job) for (job,) in _OWN_AT_WORK.rows(repository.engine, of_owner=viewer.owner)}
+    return own.__contains__
+
+
+def _states(
+    workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, Iterable[Any]], is_seen: Callable[[str], bool] = lambda _: True
+) -> Iterable[WorkerState]:
     for address, worker in workers.items():
         keys = (_TASK.fullmatch(str(key)) for key in processing.get(address, ()))
         yield WorkerState(
             name=str(worker["name"]),
             host=str(worker["host"]),
             threads=worker["nthreads"],
-            tasks=_tasks(key for key in keys if key is not None),
+            tasks=_tasks((key for key in keys if key is not None), is_seen),
             memory_bytes=worker["metrics"].get("memory", 0),
             memory_limit_bytes=worker["memory_limit"] or None,
             has_dome=bool(worker["resources"].get(DOME)),
@@ -90,9 +103,10 @@ def _states(workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, I
         )
 
 
-def _tasks(keys: Iterable[re.Match[str]]) -> tuple[WorkerTask, ...]:
+def _tasks(keys: Iterable[re.Match[str]], is_seen: Callable[[str], bool]) -> tuple[WorkerTask, ...]:
     """Each stage once, of however many parts of it the worker has."""
-    return tuple(WorkerTask.model_validate({"stage": stage, "job": job}) for stage, job in dict.fromkeys((key[1], key[2]) for key in keys))
+    found = dict.fromkeys((key[1], key[2]) for key in keys)
+    return tuple(WorkerTask.model_validate({"stage": stage, "job": job if is_seen(job) else None}) for stage, job in found)
 
 
 def _sentence(found: tuple[WorkerState, ...], *, is_started: bool) -> str:

@@ -40,6 +40,13 @@ class UploadLimits(Record):
     keep_free_bytes: int = Field(default=2**30, ge=0, description="free disk that open captures, fully received, must leave")
 
 
+class ConnectionLimits(Record):
+    """How many connections a server keeps, and how long each may wait for a request."""
+
+    most: int = Field(default=1000, ge=8, description="connections at once; beyond them those without a request make room, longest waiting first")
+    header_s: float = Field(default=10.0, gt=0, description="a connection is closed if the head of a request is not whole by then")
+
+
 class DomeSettings(Record):
     """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less, never for more."""
 
@@ -80,11 +87,17 @@ class ServerSettings(Record):
     public_url: str | None = Field(
         default=None, pattern=r"^https?://[^\s#?]+$", description="address of the page as people reach it, such as https://teeth.example.org"
     )
+    job_roots: str = Field(
+        default="",
+        description="absolute folders on the server below which jobs may name captures, mouths and calibrations, separated by commas;"
+        " default: none where callers need tokens, any on an open server",
+    )
     names: str = Field(default="", description="further host names that clients use for this server, separated by commas")
     trusted_proxies: str = Field(default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas")
     session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
     body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
     rates: RateSettings = RateSettings()
+    connections: ConnectionLimits = ConnectionLimits()
     dome: DomeSettings = DomeSettings()
     uploads: UploadLimits = UploadLimits()
 

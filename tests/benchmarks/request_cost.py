@@ -54,7 +54,7 @@ def main() -> None:
 async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
     library = fill(work, work / "capture", jobs=1000, fitted=10)
     headers = {"Authorization": f"Bearer {make_token(work, 'cost', Scope.SUBMIT)}"} if options.tokens else {}
-    settings = ServerSettings(data=work, access="tokens" if options.tokens else "open")
+    settings = ServerSettings(data=work, access="tokens" if options.tokens else "open", job_roots="/")
     mix = Mix(library, random.Random(options.seed), "cost")
     drawn = (mix.draw() for _ in count())
     asks = list(islice((ask for ask in drawn if options.only in {None, ask.kind}), options.requests))

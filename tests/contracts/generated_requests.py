@@ -266,9 +266,9 @@ def served(folder: Path, database: str | None) -> Iterator[tuple[httpx.Client, A
     tokens: dict[str, str | None] = {scope: make_token(data, f"of-{scope}", scope, database=database) for scope in (Scope.ADMIN, Scope.READ)}
     tokens |= {"wrong": f"dentine_{'0' * 12}_{'x' * 43}", "nobody": None}
     with (folder / "server.log").open("w") as log:
-        more = {} if database is None else {"database": database}
-        dome = {"address": "simulated", "watchdog_s": 60.0}
-        with toy_server(data, log, "tests.contracts.stages", access="tokens", private_webhooks=True, dome=dome, **more) as (client, process):
+        more: dict[str, Any] = {} if database is None else {"database": database}
+        more |= {"access": "tokens", "job_roots": str(folder), "private_webhooks": True, "dome": {"address": "simulated", "watchdog_s": 60.0}}
+        with toy_server(data, log, "tests.contracts.stages", **more) as (client, process):
             client.headers["Authorization"] = f"Bearer {tokens['admin']}"
             yield client, process, tokens
 

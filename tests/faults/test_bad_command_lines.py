@@ -137,7 +137,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "cancel": ("--server",),
     "bench": ("--json", "--case", "--quick"),
     "simulate slab": ("--sigma", "--alpha", "--width", "--layers", "--g", "--ior", "--exit-cosines", "--ring-edges", "--rel-error", "--max-seconds"),
-    "token create": ("--scope", "--expires-days", "--data"),
+    "token create": ("--scope", "--expires-days", "--group", "--data"),
     "token revoke": ("--data",),
     "dome-sim": ("--port", "--lights", "--watchdog-s", "--host"),
     "worker": ("--nthreads",),

@@ -49,7 +49,7 @@ class Served:
 @contextmanager
 def serving(data: Path, token: str | None = None, **settings: Any) -> Iterator[Served]:
     """The shipped server with toy stages on a data folder; ``token`` is sent with every request."""
-    access = {} if token is None else {"access": "tokens"}
+    access = {} if token is None else {"access": "tokens", "job_roots": "/"}
     command = [sys.executable, "-m", "tests.load.server", json.dumps({"data": str(data), "port": 0} | access | settings)]
     with _running(command, data, {} if token is None else {"Authorization": f"Bearer {token}"}) as served:
         yield served

@@ -12,9 +12,11 @@ import httpx
 import pytest
 
 from services.api.app import create_app
+from services.api.tokens import Scope
 from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.store import open_stage, read_record
+from tests.support.guarded_server import make_token
 from tests.support.live_server import serving
 
 ARCHIVE = Path(__file__).parents[1] / "data" / "0.1" / "data.tar.xz"
@@ -76,3 +78,13 @@ def test_the_store_of_a_finished_job_is_whole(data: Path) -> None:
     assert open_stage(folder, "fit", FitReport)[1].steps == 6
     assert open_stage(folder, "asset", AssetManifest)[1].files
     assert json.loads((folder / "errors.json").read_text())
+
+
+def test_what_it_stored_belongs_to_the_default_group(data: Path) -> None:
+    members, others = (make_token(data, name, Scope.SUBMIT, group=group) for name, group in (("member", "default"), ("other", None)))
+    with serving(create_app(ServerSettings(data=data, access="tokens"), lambda *_: None)) as client:
+        paths = ("/v1/jobs", "/v1/captures", "/v1/calibrations", f"/v1/jobs/{SUCCEEDED}", f"/v1/captures/{CAPTURE}", "/v1/calibrations/first")
+        seen, hidden = ([client.get(path, headers={"Authorization": f"Bearer {token}"}) for path in paths] for token in (members, others))
+        assert all(answer.status_code == 200 and "owner" in answer.text for answer in seen), [answer.text for answer in seen]
+        assert [answer.status_code for answer in hidden] == [200] * 3 + [404] * 3
+        assert (hidden[0].json()["jobs"], hidden[1].json()["captures"], hidden[2].json()) == ([], [], [])

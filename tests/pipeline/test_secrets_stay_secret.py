@@ -30,7 +30,7 @@ def break_down(*_):
     raise ZeroDivisionError("a route that breaks")
 
 Jobs.retry = break_down
-serve(ServerSettings(port=0, data=Path(sys.argv[1]), access="tokens"), run)
+serve(ServerSettings(port=0, data=Path(sys.argv[1]), access="tokens", job_roots="/"), run)
 """
 
 
@@ -63,7 +63,7 @@ def test_secrets_are_nowhere_in_what_the_server_writes_and_says(failing_server: 
     admin, reader = (make_token(tmp_path / "data", f"of-{scope}", scope) for scope in (Scope.ADMIN, Scope.READ))
     guess = "dentine_0123456789ab_a-guess-that-nobody-may-read-again"
 
-    made = ask("POST", "/v1/tokens", admin, json={"name": "made", "scopes": ["read"]})
+    made = ask("POST", "/v1/tokens", admin, json={"name": "made", "scopes": ["read"], "group": "default"})
     answers.clear()  # the one answer that shows a secret
     fresh = made.json()["token"]
     signed_in = client.post("/v1/session", headers={"Authorization": f"Bearer {reader}"})

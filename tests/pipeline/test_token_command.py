@@ -26,6 +26,10 @@ def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) ->
     assert token.startswith("dentine_")
     job = tmp_path / "job.toml"
     job.write_text('capture = "/"\n')
+    alone = dentine("token", "create", "reader", "--scope", "read", *data)
+    assert "is in no group, so it sees no jobs" in alone.stderr
+    member = dentine("token", "create", "member", "--scope", "read", "--group", "surgery", "--json", *data)
+    assert (member.stderr, json.loads(member.stdout)["group"]) == ("", "surgery")
     with guarded(tmp_path / "data") as server:
         address = ("--server", str(server.client.base_url))
         assert dentine("submit", str(job), "--watch", *address, DENTINE__CLIENT__TOKEN=token).returncode == 0
@@ -53,6 +57,7 @@ def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) ->
     [
         (["create", "x", "--scope", "write"], "Scope 'write' does not exist; known are read, submit, operate-dome, admin"),
         (["create", "a b", "--scope", "read"], "Token name 'a b'"),
+        (["create", "a", "--scope", "read", "--group", "a/b"], "Group 'a/b' of token a"),
         (["revoke", "nobody"], "There is no token nobody"),
     ],
 )

@@ -15,6 +15,7 @@ from services.api.app import create_app
 from services.api.audit import Deed
 from services.api.database import open_database
 from services.api.migrations import upgrade
+from services.api.owners import DEFAULT_GROUP
 from services.api.tokens import Scope, Tokens
 from services.core.settings import ServerSettings
 from tests.support.live_server import serving
@@ -24,12 +25,12 @@ def make_deed() -> Deed:
     return Deed("test", "command line", "local")
 
 
-def make_token(data: Path, name: str, *scopes: Scope, database: str | None = None) -> str:
-    """A new token on a data folder, as ``dentine token create`` makes it."""
+def make_token(data: Path, name: str, *scopes: Scope, database: str | None = None, group: str | None = DEFAULT_GROUP) -> str:
+    """A new token on a data folder, as ``dentine token create --group`` makes it."""
     engine = open_database(database or ServerSettings(data=data).database_url)
     try:
         upgrade(engine)
-        return Tokens(engine).create(name, scopes, None, make_deed()).token.get_secret_value()
+        return Tokens(engine).create(name, scopes, None, make_deed(), group).token.get_secret_value()
     finally:
         engine.dispose()
 
@@ -57,8 +58,8 @@ def run_nothing(*_: object) -> None:
 
 @contextmanager
 def guarded(data: Path, run: Any = run_nothing, **settings: Any) -> Iterator[Guarded]:
-    """Serve a data folder with tokens for the time of the block."""
+    """Serve a data folder with tokens for the time of the block; jobs may name any folder."""
     tokens = {scope: make_token(data, f"of-{scope}", scope) for scope in Scope}
-    app = create_app(ServerSettings(data=data, access="tokens", **settings), run)
+    app = create_app(ServerSettings(data=data, access="tokens", **{"job_roots": "/", **settings}), run)
     with serving(app) as client:
         yield Guarded(app, client, tokens, data)

@@ -271,10 +271,10 @@ def test_a_session_stands_for_its_token_until_it_is_over(table: Tokens, clock: C
     issuer = Sessions(b"k" * 32, 60.0, clock)
     token = table.authenticate(issue(table))
     cookie, lifetime_s = issuer.issue(token)
-    assert (issuer.token_id(cookie), lifetime_s) == (token.id, 60)
+    assert (issuer.read(cookie).token_id, lifetime_s) == (token.id, 60)
     clock.now_s += 60
     with pytest.raises(UnauthenticatedError, match="This session is over"):
-        issuer.token_id(cookie)
+        issuer.read(cookie)
 
 
 def test_a_session_never_outlives_its_token(table: Tokens, clock: Clock) -> None:
@@ -290,9 +290,9 @@ def test_a_changed_session_is_refused(table: Tokens, clock: Clock) -> None:
     later = f"{claim[:-10]}{int(NOON_S) + 9999}.{signature}"
     for wrong in (later, cookie[:-1], claim, "", ".", "é", f"{claim}.é", cookie.replace("dentine_", "dentine_0", 1)):
         with pytest.raises(UnauthenticatedError):
-            issuer.token_id(wrong)
+            issuer.read(wrong)
     with pytest.raises(UnauthenticatedError):
-        Sessions(b"l" * 32, 60.0, clock).token_id(cookie)
+        Sessions(b"l" * 32, 60.0, clock).read(cookie)
 
 
 def test_signatures_are_compared_by_compare_digest(table: Tokens, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,7 +301,7 @@ def test_signatures_are_compared_by_compare_digest(table: Tokens, clock: Clock, 
     monkeypatch.setattr(hmac, "compare_digest", lambda *_: False)
     assert sessions.hmac is hmac
     with pytest.raises(UnauthenticatedError):
-        issuer.token_id(cookie)
+        issuer.read(cookie)
 
 
 def test_the_signing_key_is_kept_and_is_its_owners_alone(tmp_path: Path) -> None:

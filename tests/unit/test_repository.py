@@ -12,7 +12,7 @@ import sqlalchemy as sql
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from services.api import audit, capture_table, data_folder, setup_links, tokens, webhook_tables
+from services.api import audit, capture_table, data_folder, ended_sessions, setup_links, tokens, webhook_tables
 from services.api.database import Query, metadata, open_database, patiently, sqlite_url, writing
 from services.api.events import event_table
 from services.api.job_table import JobFilter, job_table
@@ -227,7 +227,7 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
     known = (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table, data_folder.data_folder_table)
-    for table in (*known, setup_links.setup_link_table):
+    for table in (*known, setup_links.setup_link_table, ended_sessions.ended_session_table):
         assert table.metadata is metadata
     with repository.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []

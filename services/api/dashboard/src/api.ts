@@ -110,7 +110,7 @@ export interface Worker {
   name: string;
   host: string;
   /** Stages that it runs, wholly or in part, or will run next. */
-  tasks: { stage: string; job: string }[];
+  tasks: { stage: string; job: string | null }[];
   /** Whether captures, and whether all other stages, may run there. */
   has_dome: boolean;
   runs_stages: boolean;

@@ -1,0 +1,80 @@
+"""Which folders of the server a job may name: those below the roots that the settings allow, and none where callers need tokens and no root is set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.core.errors import SettingsError
+from services.core.records import JobSpec
+from services.core.settings import ServerSettings
+
+SETTING = "DENTINE__SERVER__JOB_ROOTS"
+
+
+class ServerPaths:
+    """The paths that a server's jobs may name.
+
+    Args:
+        roots: folders below which they lie; None allows any path.
+        data: the server's own folder, in which nothing may be named: it holds what belongs to others.
+
+    Raises:
+        SettingsError: a root is not absolute.
+    """
+
+    def __init__(self, roots: tuple[Path, ...] | None, data: Path) -> None:
+        if relative := next((root for root in roots or () if not root.is_absolute()), None):
+            raise SettingsError(f"Setting {SETTING}: {relative} is relative; give absolute folders, separated by commas.")
+        self._roots = None if roots is None else tuple(root.resolve() for root in roots)
+        self._data = data.resolve()
+
+    @classmethod
+    def of(cls, settings: ServerSettings) -> ServerPaths:
+        """Those that the settings allow."""
+        named = tuple(Path(one.strip()) for one in settings.job_roots.split(",") if one.strip())
+        return cls(None if settings.access == "open" and not named else named, settings.data)
+
+    def require(self, option: str, path: Path, remedy: str = "check the path") -> None:
+        """Refuse a path that means nothing on the server, or may not be named; ``remedy`` says what to do about one that is absent.
+
+        What may not be named is refused in the same words whether it is there or not.
+
+        Raises:
+            SettingsError: it is relative, lies below no root, or is absent.
+        """
+        if not path.is_absolute():
+            raise SettingsError(f"Option '{option}': {path} is relative; give the absolute path on the server.")
+        resolved = _resolved(path)
+        if self._roots is not None and (resolved is None or not self._is_allowed(resolved)):
+            what = f"Option '{option}': this server takes no folder of its own there"
+            raise SettingsError(f"{what}; upload it, with dentine submit --upload or in the page, or have {SETTING} name its root.")
+        if resolved is None or not _is_there(path):
+            raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
+
+    def _is_allowed(self, path: Path) -> bool:
+        return not path.is_relative_to(self._data) and any(path.is_relative_to(root) for root in self._roots or ())
+
+
+def without_folders(spec: JobSpec) -> JobSpec:
+    """A job's options with the names alone of what lies in folders of the server, for whoever may not use those."""
+    changes: dict[str, object] = {name: Path(path.name) for name in ("capture", "calibration") if (path := getattr(spec, name)) and path.is_absolute()}
+    if spec.rig is not None and spec.rig.mouth.is_absolute():
+        changes["rig"] = spec.rig.model_copy(update={"mouth": Path(spec.rig.mouth.name)})
+    return spec.model_copy(update=changes) if changes else spec
+
+
+def _resolved(path: Path) -> Path | None:
+    # With all links followed; None for what cannot be a path, such as a loop of links.
+    try:
+        str(path).encode()  # what has no name in Unicode could not be stored
+        return path.resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        path.stat()
+    except (OSError, ValueError):
+        return False
+    return True
