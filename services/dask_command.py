@@ -14,6 +14,7 @@ import typer
 from services.core.dask_config import as_environment
 from services.core.errors import SettingsError
 from services.core.placement import DOME, STAGES, UNLIMITED
+from services.core.private_files import PRIVATE
 
 _ADDRESS = re.compile(r"([a-z]+://)?[^-\s][^\s]*:\d+")
 _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -81,4 +82,5 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
     certificates = Certificates.of(folder) if folder is not None else None
     secured = [scheduler_address(argument, certificates) for argument in arguments]
     command = [sys.executable, "-m", "dask", part, *secured, "--preload", "services.api.close_http", *(certificates.arguments() if certificates else ())]
+    os.umask(PRIVATE)  # which what is started here inherits: a worker writes captures of people, too
     os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

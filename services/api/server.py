@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import logging
+import os
 import signal
 import socket
+import stat
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,7 @@ from services.api.pipeline import DOORS
 from services.api.runner import RunJob
 from services.api.setup_links import SetupLinks, setup_address
 from services.core.errors import PlatformError
+from services.core.private_files import PRIVATE
 from services.core.redaction import redacted
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
@@ -40,8 +43,11 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
         SettingsError: other machines reach the server and access is open, or the database belongs to another data folder.
     """
     refuse_open_network(settings)
+    os.umask(PRIVATE)
     try:
         import uvicorn
+
+        from services.api.connections import BoundedServer
     except ModuleNotFoundError as problem:
         raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
 
@@ -64,7 +70,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
             proxy_headers=bool(proxies),
             forwarded_allow_ips=proxies,
         )
-        server = _dark_at_once(uvicorn.Server(config), app.state.darken)
+        server = _dark_at_once(BoundedServer(config, settings.connections), app.state.darken)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
         leave_alone_what_is_loaded()
@@ -126,6 +132,8 @@ def _sole_server(data: Path) -> Iterator[None]:
     """Hold the data folder's lock; the system drops it however this process ends."""
     with _telling_what_cannot_be_written(data):
         data.mkdir(parents=True, exist_ok=True)
+        with suppress(PermissionError):  # a folder of somebody else's, which he has closed or opened as he wants it
+            data.chmod(stat.S_IMODE(data.stat().st_mode) & ~PRIVATE)
         stream = (data / ".lock").open("w")
     with stream:
         try:

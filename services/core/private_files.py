@@ -6,6 +6,9 @@ import os
 import secrets
 from pathlib import Path
 
+PRIVATE = 0o077
+"""File mode creation mask of every process of the service: what it writes is for its own user alone."""
+
 
 def write_private(path: Path, content: bytes, mode: int = 0o600) -> None:
     """Write a file so that a reader sees the old or the new content, and nobody but those of ``mode`` sees any."""
