@@ -89,7 +89,7 @@ def test_a_cluster_gives_the_answer_of_one_process(undisturbed: Path, tmp_path: 
     assert answer(tmp_path) == answer(undisturbed)
 
 
-@pytest.mark.parametrize("options", [{"stains": True, "loss": "robust"}, {"solver": "adam", "adam_steps": 20}])
+@pytest.mark.parametrize("options", [{"stains": True, "loss": "robust"}, pytest.param({"solver": "adam", "adam_steps": 20}, marks=pytest.mark.slow)])
 def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(client: Client, tmp_path: Path, options: dict[str, Any]) -> None:
     # Photographs too uneven for media alone: stains and weights have something to say.
     for name in ("cluster", "here"):
@@ -179,6 +179,7 @@ def fit_jaw_once(root: Path) -> None:
     run(spec, LocalContext(root, attempt), engine=SLOW_MOUTH)
 
 
+@pytest.mark.slow
 def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path) -> None:
     # Two teeth, one of them hidden. The driver's worker dies while teeth are looked at alone, and its successor in the joint fit.
     answers = []

@@ -22,7 +22,7 @@ from tests.support.live_server import toy_server
 from tests.support.uploading import announce, contents_of, create_upload, manifest_of, offset_of, patch, upgraded, write_capture
 
 MIB = 2**20
-KILLS = 6
+KILLS = 3
 
 
 class Death(BaseException):

@@ -97,11 +97,13 @@ def standard_error(values: NDArray[np.float64]) -> float:
 @pytest.mark.parametrize(
     ("group", "boundary"),
     [
-        pytest.param(MEDIA, "matched", id="media-matched"),
+        pytest.param(MEDIA, "matched", id="media-matched", marks=pytest.mark.slow),
+        pytest.param(replace(MEDIA, samples={"enamel.g1": 1536, "dentin.alpha": 1024}), "matched", id="two-media-matched"),
         pytest.param(SHAPE, "matched", id="shape-matched"),
         pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
-        pytest.param(SHAPE, "thin", id="shape-thin"),
-        pytest.param(GRADUAL, "matched", id="gradual-matched"),
+        pytest.param(SHAPE, "thin", id="shape-thin", marks=pytest.mark.slow),
+        pytest.param(GRADUAL, "matched", id="gradual-matched", marks=pytest.mark.slow),
+        pytest.param(replace(GRADUAL, samples={"shape.0": 512, "enamel.alpha": 256}), "matched", id="two-gradual-matched"),
         pytest.param(IN_A_MOUTH, "thin", id="mouth-thin"),
     ],
 )

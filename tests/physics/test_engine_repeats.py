@@ -57,7 +57,7 @@ def test_a_scene_built_twice_gives_the_same_bits(boundary: Boundary) -> None:
     assert (first.orders.sum(axis=(1, 2)) > 0).all()
 
 
-@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("boundary", ["matched", pytest.param("thin", marks=pytest.mark.slow)])
 def test_processes_and_thread_counts_agree(boundary: Boundary) -> None:
     one, one_again, two, two_again = (picture_of_another_process(threads, boundary) for threads in (1, 1, 2, 2))
     require_same_bits(one, one_again)

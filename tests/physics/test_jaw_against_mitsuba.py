@@ -39,6 +39,7 @@ def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, blo
     return pixel_scores([ours[0], stock[0]], [ours[1], stock[1]], block)
 
 
+@pytest.mark.slow
 def test_front_teeth_in_their_gums_look_as_in_mitsuba(tmp_path: Path) -> None:
     whole = jaw_surfaces(SUBJECT)
     front = replace(whole, teeth=tuple(tooth for tooth in whole.teeth if tooth.fdi in FRONT))

@@ -35,6 +35,7 @@ WIDTH_MM = 2.0
 TISSUE = Tissue(Medium(1.5, 0.98, 0.9, 0.6, -0.3), Medium(4.0, 0.75, 0.3, 0.6, -0.3))
 
 
+@pytest.mark.slow
 def test_a_gradual_border_looks_as_in_mitsuba(tmp_path: Path) -> None:
     prepare_device()
     outer, core = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.7)
@@ -127,7 +128,7 @@ def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
         engine.images(tabulated, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
 
 
-@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     # Albedos far apart and extinctions near: nearly all of the derivative of the images' sum is what the mixture's albedo does, and without it the test fails.
     if not whole:

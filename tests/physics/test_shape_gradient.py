@@ -35,7 +35,7 @@ FORWARD = Tissue(Medium(2, 0.95, 0.93, 0.82, -0.1), Medium(4, 0.85, 1.0, 0.75), 
 """As the dark incisor of the benchmark, with thinner enamel."""
 CASES = [
     pytest.param(CLEAR, "matched", 1024, 0.03, id="clear-matched"),
-    pytest.param(CLEAR, "thin", 1024, 0.03, id="clear-thin"),
+    pytest.param(CLEAR, "thin", 1024, 0.03, id="clear-thin", marks=pytest.mark.slow),
     pytest.param(FORWARD, "matched", 16384, 0.15, id="forward-matched", marks=pytest.mark.slow),
 ]
 """With the paths per pixel that differences take, and the bias allowed."""
@@ -121,6 +121,7 @@ def test_borders_and_media_that_it_does_not_know_are_refused(tissue: Tissue, bor
         Engine(replace(recipe(), border_width_mm=border_width_mm)).shape_gradient(tissue, view, np.ones((5, len(view))), seed=0, samples=16)
 
 
+@pytest.mark.slow
 def test_in_a_mouth_one_tooth_moves() -> None:
     # The second of two teeth with dentin, beside gums and before a wall.
     inner = revolved((1.2, 1.7), FREE_MM)

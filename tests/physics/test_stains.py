@@ -68,7 +68,7 @@ def write_textured(path: Path, mesh: Mesh, uv: NDArray[np.float64]) -> None:
     path.write_text("\n".join(lines + ["f " + " ".join(f"{k}/{k}" for k in face) for face in mesh.faces + 1]) + "\n")
 
 
-@pytest.mark.parametrize("boundary", ["matched", "thin"])
+@pytest.mark.parametrize("boundary", ["matched", pytest.param("thin", marks=pytest.mark.slow)])
 def test_texels_derivatives_are_those_of_the_images(boundary: Boundary) -> None:
     engine, view = Engine(stained_recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1)
     cotangent = np.random.default_rng(5).uniform(-0.5, 1, (len(LIGHTS_MM), len(view)))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from services.core.records import JobSpec
 from services.fit.anatomy.phantom import write_phantom
 from services.fit.bench.stock_fit import StockFit
@@ -11,6 +13,7 @@ from services.fit.bench.tooth_capture import prepared_tooth
 from services.fit.optics.parameters import Medium, Tissue
 
 
+@pytest.mark.slow
 def test_stock_fit_goes_downhill(tmp_path: Path) -> None:
     # Rates are so large that twelve rounds at half the photographs' error left are many times the noise of their gradients.
     write_phantom(tmp_path / "capture", pixel_mm=1.0, cameras=1, lights=4, samples=256, subject=2)

@@ -122,7 +122,7 @@ def test_a_job_under_way_is_not_deleted(tmp_path: Path) -> None:
         (mine / "steering" / "hold-prepare-start").unlink()
 
 
-@pytest.mark.parametrize("arguments", [("jobs",), ("delete", "x"), ("download", "x"), ("watch", "x")])
+@pytest.mark.parametrize("arguments", [("jobs",), ("delete", "x"), ("download", "x"), pytest.param(("watch", "x"), marks=pytest.mark.slow)])
 def test_no_server_is_a_sentence(arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     answer = dentine(*arguments, "--server", "http://127.0.0.1:9")

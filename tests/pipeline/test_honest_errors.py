@@ -27,6 +27,7 @@ def test_a_few_fits_hold_the_truth() -> None:
     assert min(found.values()) >= 4, found
 
 
+@pytest.mark.slow
 def test_a_few_thicknesses_hold_the_truth() -> None:
     # 2 of 3 or more but for once in 138 times; of intervals half as wide once in 4.
     found = held(3, 500, with_shape=True)
