@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from services.fit.anatomy.incisor import build_incisor
+from services.fit.anatomy.rays import RayScene
 from services.fit.anatomy.reflection import fresnel, ggx_reflection, reflect
 from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.transport.platform import prepare_device
@@ -69,3 +70,18 @@ def test_gums_hide_the_root_and_scatter_diffusely() -> None:
     assert gums[0] > gums[1] > gums[2] > 0
     # A Lambertian surface cannot send more than reflectance / pi of the irradiance of 1.1 at most.
     assert gums[0] < 1.1 * 0.5 / np.pi
+
+
+def test_a_light_that_no_visible_point_faces_reflects_nothing() -> None:
+    # Such as a grazing light and a tooth of which the gums leave little to see: no shadow ray is left to trace.
+    incisor, (camera,), (light,) = build_incisor(), dome_cameras(1, 1.0, (build_incisor().outer,)), dome_lights(1, ("green",), 1)
+    behind = light.model_copy(update={"position_mm": (0.0, -1000.0, 0.0)})
+    seen = reflect(incisor.outer, None, camera, (behind,), ("green",), 1.631)
+    assert seen.enamel_pixels.any()
+    assert seen.highlight.max() < 1e-3 * reflect(incisor.outer, None, camera, (light,), ("green",), 1.631).highlight.max()
+
+
+def test_no_ray_hits_nothing() -> None:
+    hits = RayScene(build_incisor().outer).first_hits(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert hits.hit.shape == (0,)
+    assert hits.normals.shape == (0, 3)

@@ -47,7 +47,10 @@ class RayScene:
         self._scene = mi.load_dict({"type": "scene", "surface": surface})
 
     def first_hits(self, origins_mm: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
-        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3)."""
+        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); there may be none."""
+        if len(directions) == 0:  # Dr.Jit ends the process that evaluates nothing
+            none = np.zeros(0, dtype=np.int64)
+            return Hits(none.astype(bool), np.zeros((0, 3)), np.zeros((0, 3)), none, none)
         import drjit as dr
         import mitsuba as mi
 
