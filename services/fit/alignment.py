@@ -1,7 +1,8 @@
 """Whether photographs show the teeth where the meshes are: if not, how far apart they are as a camera sees it.
 
-The fitted render is slid over the photograph. Where that explains most of what the fit left unexplained, no medium, light or noise is to blame but a pose.
-Offsets along the line of sight, and turns, are not looked for.
+The fitted render is slid over the photograph (``offset``). Where that explains most of what the fit left unexplained,
+and more than noise could, no medium, light or noise is to blame but a pose. Offsets along the line of sight cannot be
+seen in this way, and turns are not looked for.
 """
 
 from __future__ import annotations
@@ -16,30 +17,32 @@ from services.core.records import MaskBit
 from services.core.store import StoredArray
 from services.fit.evaluate import Evaluation
 from services.fit.observations import Observations, ViewStack
-
-Array = NDArray[np.float64]
+from services.fit.offset import Comparison, FoundOffset, Slide, best_offset
 
 LOOKED_AT = 0.05
 """Relative image error above which a fit asks for its offset: what is explained better shows no shift that matters."""
-REACH_MM = 4.0
-"""Farthest offset that is looked for, half of a small tooth."""
 LEAST_MM = 0.5
 """Least offset that is told, if it is more than a pixel; a registration of scan and photographs is good to about 0.1 mm."""
 LEAST_GAIN = 0.55
-"""Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 2 mm gave 0.63 to 0.83, by 1 mm 0.57 to 0.64; in place 0,
-with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the scattering."""
+"""Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 1 mm gave 0.53 to
+1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the scattering."""
+LEAST_Z = 3.0
+"""Standard errors that what goes away has to reach. Noise passes at one shift with a chance of 1e-3, and is tried at some
+300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
+LEAST_SE_MM = 0.01
+"""Least ± that is told: what an offset is off by besides noise, such as by its pixels, is more."""
 LEAST_PIXELS = 16
-GRID = 8
-"""Offsets tried to each side before the best is refined."""
 
 
 @dataclass(frozen=True)
 class Offset:
-    """By how much the photographs of a camera lie beside the mesh."""
+    """By how much the photographs of a camera lie beside the mesh, across the line of sight."""
 
     camera: str
     right_mm: float
     down_mm: float
+    length_se_mm: float
+    """One standard error of ``length_mm`` by the photographs' noise."""
     gain: float
     """Share of the unexplained squared difference that goes away."""
 
@@ -52,9 +55,10 @@ class Offset:
         """What is wrong and what to do."""
         steps = [(self.right_mm, "right", "left"), (self.down_mm, "down", "up")]
         parts = [f"{abs(size):.1f} mm {name if size > 0 else other}" for size, name, other in steps if abs(size) >= 0.3 * self.length_mm]
+        apart = f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, LEAST_SE_MM):.1g} mm by the noise of both"
         return (
-            f"In camera {self.camera} images and {what} are about {self.length_mm:.1f} mm apart (the images lie {' and '.join(parts)}); "
-            "recalibrate the camera or register the mesh again."
+            f"In camera {self.camera} images and {what} are {apart} (the images lie {' and '.join(parts)}); "
+            "how far along the line of sight cannot be seen in this way; recalibrate the camera or register the mesh again."
         )
 
 
@@ -65,22 +69,13 @@ def clearest_offset(evaluation: Evaluation, observations: Observations, views: t
         evaluation: of the final answer, with the images to compare.
         tooth: position of the one tooth of a jaw to look at; None for all that was fitted.
     """
-    found = [_offset(view, images, tooth) for view, images in _compared(evaluation, observations, views, channel)]
+    found = [_offset(view, pixel_mm, images, tooth) for view, pixel_mm, images in _compared(evaluation, observations, views, channel)]
     return max((offset for offset in found if offset is not None), key=lambda offset: offset.gain, default=None)
-
-
-@dataclass(frozen=True)
-class _Compared:
-    # One photograph (H, W) as taken, NaN where it is unusable, beside its render, NaN where nothing was fitted.
-    photo: Array
-    variance: Array
-    render: Array
-    pixel_mm: float
 
 
 def _compared(
     evaluation: Evaluation, observations: Observations, views: tuple[ViewStack, ...], channel: str
-) -> list[tuple[ViewStack, list[_Compared]]]:  # fmt: skip
+) -> list[tuple[ViewStack, float, list[Comparison]]]:  # fmt: skip
     seen = np.flatnonzero(np.any([view.valid.any(axis=1) for view in views], axis=0))
     store, index = observations.folder / "prepared.zarr", observations.manifest.channels.index(channel)
     names = [camera.name for camera in observations.manifest.cameras]
@@ -97,60 +92,39 @@ def _compared(
             usable = bits[number, light][:height, :width] & ~np.uint16(MaskBit.OUTSIDE) == 0
             photo = np.where(usable, radiance[number, light][:height, :width, index].astype(np.float64), np.nan)
             noise = np.nan_to_num(variance[number, light][:height, :width, index].astype(np.float64))
-            render = np.full((height, width), np.nan)
+            render, spread = np.full((height, width), np.nan), np.zeros((height, width))
             render[pixels[:, 1], pixels[:, 0]] = values
-            images.append(_Compared(photo, noise, render, view.camera.pixel_mm(centre_mm)))
-        pairs.append((view, images))
+            spread[pixels[:, 1], pixels[:, 0]] = evaluation.spreads.get((camera, shown), 0.0)
+            images.append(Comparison(photo, noise, render, spread))
+        pairs.append((view, view.camera.pixel_mm(centre_mm), images))
     return pairs
 
 
-def _offset(view: ViewStack, images: list[_Compared], tooth: int | None) -> Offset | None:
+def _offset(view: ViewStack, pixel_mm: float, images: list[Comparison], tooth: int | None) -> Offset | None:
     chosen = view.pixels if tooth is None or view.parts is None else view.pixels[view.parts.shown == tooth]
-    if len(chosen) < LEAST_PIXELS or not images:
+    return told_offset(view.camera.name, images, chosen.astype(np.int64), pixel_mm)
+
+
+def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64], pixel_mm: float) -> Offset | None:
+    """The offset of a camera's photographs beside their renders, if it is clear and large enough to be told.
+
+    Args:
+        pixels: (N, 2) of the render that are compared.
+        pixel_mm: edge of a pixel at the tooth.
+    """
+    if len(pixels) < LEAST_PIXELS or not images:
         return None
-    pixel_mm, x, y = images[0].pixel_mm, chosen[:, 0].astype(np.int64), chosen[:, 1].astype(np.int64)
-
-    def unexplained(shift: tuple[int, int]) -> float:
-        return sum(_difference(image, x, y, shift) for image in images) / len(images)
-
-    # A grid over all offsets, then ever smaller steps around the best one, down to a pixel.
-    step = max(round(REACH_MM / pixel_mm / GRID), 1)
-    reach = round(REACH_MM / pixel_mm / step)
-    tried = {(i * step, j * step): unexplained((i * step, j * step)) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)}
-    best = min(tried, key=tried.__getitem__)
-    while step > 1:
-        step = max(step // 2, 1)
-        around = [(best[0] + i * step, best[1] + j * step) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        tried |= {shift: unexplained(shift) for shift in around if shift not in tried}
-        best = min(tried, key=tried.__getitem__)
-    if not np.isfinite(tried[best]) or tried[0, 0] <= 0:
-        return None
-    right, down = (_vertex([unexplained((best[0] + k * dx, best[1] + k * dy)) for k in (-1, 0, 1)]) for dx, dy in ((1, 0), (0, 1)))
-    offset = Offset(view.camera.name, (best[0] + right) * pixel_mm, (best[1] + down) * pixel_mm, 1 - tried[best] / tried[0, 0])
-    return offset if offset.gain >= LEAST_GAIN and offset.length_mm > max(LEAST_MM, pixel_mm) else None
+    found = best_offset(Slide(images, pixels), pixel_mm)
+    return None if found is None or not _is_clear(found, pixel_mm) else _in_mm(camera, found, pixel_mm)
 
 
-def _vertex(values: list[float]) -> float:
-    # Where a parabola through values at -1, 0 and 1 is least; 0 where it has no vertex between them.
-    before, middle, after = values
-    curvature = before - 2 * middle + after
-    if not np.isfinite(curvature) or curvature <= 0:
-        return 0.0
-    return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+def _is_clear(found: FoundOffset, pixel_mm: float) -> bool:
+    is_large = found.length_px * pixel_mm > max(LEAST_MM, pixel_mm)
+    return is_large and found.gain >= LEAST_GAIN and found.z >= LEAST_Z and np.isfinite(found.length_se_px)
 
 
-def _difference(image: _Compared, x: NDArray[np.int64], y: NDArray[np.int64], shift: tuple[int, int]) -> float:
-    # 1 - cos^2 between render and photograph seen as vectors, less the photograph's noise: their relative squared difference at the best brightness.
-    height, width = image.photo.shape
-    inside = (x + shift[0] >= 0) & (x + shift[0] < width) & (y + shift[1] >= 0) & (y + shift[1] < height)
-    there = y[inside] + shift[1], x[inside] + shift[0]
-    render, photo = image.render[y[inside], x[inside]], image.photo[there]
-    known = np.isfinite(render) & np.isfinite(photo)
-    if known.sum() < 0.7 * len(x):
-        return np.inf
-    a, b = render[known], photo[known]
-    both = float((a @ a) * (b @ b))
-    return max(1.0 - float(a @ b) ** 2 / both - float(image.variance[there][known].sum() / (b @ b)), 0.0) if both > 0 else np.inf
+def _in_mm(camera: str, found: FoundOffset, pixel_mm: float) -> Offset:
+    return Offset(camera, found.right_px * pixel_mm, found.down_px * pixel_mm, found.length_se_px * pixel_mm, found.gain)
 
 
 def offsets_told(

@@ -89,6 +89,8 @@ class Evaluation:
     """By camera name and light index: pixels (N, 2) and the mean of the two renders (N,)."""
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = field(default_factory=dict)
     """Of a jaw: sums on fitted and on held-out images by what the pixels show (``blocks.PixelParts``)."""
+    spreads: dict[tuple[str, int], Array] = field(default_factory=dict)
+    """Of the images in ``renders``, half of what the two renders differ by (N,): one standard error of their mean, from two values."""
 
 
 def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = ()) -> Evaluation:
@@ -99,6 +101,7 @@ def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, s
     fitted, held_out = ErrorSums(), ErrorSums()
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = {}
     pieces: dict[tuple[str, int], list[tuple[NDArray[np.int32], Array]]] = {}
+    spreads: dict[tuple[str, int], list[Array]] = {}
     for block in found:
         fitted, held_out = fitted + block.fitted, held_out + block.held_out
         for part, (own_fitted, own_held_out) in block.parts.items():
@@ -106,8 +109,9 @@ def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, s
             parts[part] = known_fitted + own_fitted, known_held_out + own_held_out
         for image, values in block.renders.items():
             pieces.setdefault(image, []).append((block.pixels, values))
+            spreads.setdefault(image, []).append(block.spreads[image])
     renders = {image: (np.concatenate([p for p, _ in some]), np.concatenate([v for _, v in some])) for image, some in pieces.items()}
-    return Evaluation(fitted, held_out, renders, parts)
+    return Evaluation(fitted, held_out, renders, parts, {image: np.concatenate(some) for image, some in spreads.items()})
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,7 @@ class BlockErrors:
     held_out: ErrorSums
     pixels: NDArray[np.int32]
     renders: dict[tuple[str, int], Array]
+    spreads: dict[tuple[str, int], Array]
     parts: dict[int, tuple[ErrorSums, ErrorSums]]
     trace: TraceRow
 
@@ -136,5 +141,7 @@ def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], sho
     fitted, held_out = sums(np.ones(len(block.view), dtype=bool))
     parts = {} if block.parts is None else {int(part): sums(block.parts.shown == part) for part in np.unique(block.parts.shown)}
     camera = block.view.camera.name
-    renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in shown if name == camera}
-    return BlockErrors(fitted, held_out, block.view.pixels, renders, parts, trace_row("evaluate", task, start))
+    seen = [(name, light) for name, light in shown if name == camera]
+    renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in seen}
+    spreads = {(name, light): 0.5 * np.abs(first[light] - second[light]) for name, light in seen}
+    return BlockErrors(fitted, held_out, block.view.pixels, renders, spreads, parts, trace_row("evaluate", task, start))

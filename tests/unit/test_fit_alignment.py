@@ -29,7 +29,7 @@ def ball(right_px: float = 0.0, down_px: float = 0.0, exponent: float = 1.0, flo
 
 
 def compare(
-    root: Path, photo: NDArray[np.float64], render: NDArray[np.float64], noise: float = 0.02, neighbour: float = 0.0, tooth: int | None = None
+    root: Path, photo: NDArray[np.float64], render: NDArray[np.float64], noise: float = 0.02, neighbour: float = 0.0, tooth: int | None = None, seed: int = 3
 ) -> tuple[Offset | None, list[str]]:
     """Offset and sentences for one camera and one light.
 
@@ -41,7 +41,7 @@ def compare(
     k = ((1000.0, 0.0, SIZE / 2), (0.0, 1000.0, SIZE / 2), (0.0, 0.0, 1.0))
     camera = Camera(name="c0", size=(SIZE, SIZE), K=k, camera_from_world=pose)
     inside = ball() > 0
-    photo = np.where(photo > 0, photo, neighbour) + noise * np.random.default_rng(3).standard_normal(photo.shape)
+    photo = np.where(photo > 0, photo, neighbour) + noise * np.random.default_rng(seed).standard_normal(photo.shape)
     arrays = {"radiance": photo[..., None], "variance": np.full((SIZE, SIZE, 1), noise**2), "valid": np.where(inside, 0, MaskBit.OUTSIDE)}
     for name, values in arrays.items():
         stored = create_array(
@@ -107,6 +107,19 @@ def test_one_tooth_of_two_that_lies_elsewhere_is_told_from_the_other(tmp_path: P
 )
 def test_other_faults_are_not_called_an_offset(tmp_path: Path, photo: NDArray[np.float64], render: NDArray[np.float64]) -> None:
     assert compare(tmp_path, photo, render) == (None, [])
+
+
+def test_a_dim_photograph_in_place_is_not_said_to_lie_elsewhere(tmp_path: Path) -> None:
+    # Beside the tooth is noise alone, which its own variance explains as well as the render explains the tooth.
+    for seed in range(12):
+        assert compare(tmp_path / str(seed), 0.06 * ball(), ball(exponent=0.7), noise=0.05, seed=seed) == (None, [])
+
+
+def test_a_sentence_gives_the_error_and_says_what_cannot_be_seen(tmp_path: Path) -> None:
+    _, (sentence,) = compare(tmp_path, ball(2.0 / PIXEL_MM), ball(), noise=0.1)
+    error_mm = float(sentence.split("± ")[1].split(" mm")[0])
+    assert 0 < error_mm < 0.5 * PIXEL_MM
+    assert "how far along the line of sight cannot be seen" in sentence
 
 
 def test_what_noise_alone_leaves_unexplained_has_no_offset(tmp_path: Path) -> None:
