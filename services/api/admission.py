@@ -138,6 +138,7 @@ class Admission:
         self._paused: dict[str, tuple[float, str]] = {}
         self._reasons: dict[str, str] = {}
         self._running: dict[str, _Running] = {}
+        self._stalled: dict[str, str] = {}
         self._lacking: dict[bool, str | None] = {}
         self._first_in_line = ""
         self._sharing_s, self._summed_to_s = 0.0, clock()
@@ -220,6 +221,16 @@ class Admission:
         with self._lock:
             self._sum_sharing()
             del self._running[job_id]
+            self._stalled.pop(job_id, None)
+
+    def look_for_stalled(self) -> None:
+        """Find the running jobs whose next task no worker can take; ``reason`` then says why, until a later look finds one that can."""
+        with self._lock:
+            captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
+        lacking = {kind: self._lacks(kind) for kind in set(captures.values())}
+        with self._lock:
+            still = {job_id: lacking[kind] for job_id, kind in captures.items() if job_id in self._running}
+            self._stalled = {job_id: f"Waits for workers: {why}" for job_id, why in still.items() if why is not None}
 
     def pause(self, job_id: str, problem: DentineError) -> None:
         """Let a job wait that could not go on."""
@@ -228,9 +239,9 @@ class Admission:
             self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
 
     def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
-        """Why a queued job does not start; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
+        """Why a queued job does not start, or a running one does not go on; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
         with self._lock:
-            reason = self._reasons.get(job_id)
+            reason = self._stalled.get(job_id) or self._reasons.get(job_id)
             return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
 
     def _obstacle(self, job_id: str, spec: JobSpec, *, is_to_capture: bool) -> str:

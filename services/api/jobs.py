@@ -205,7 +205,9 @@ class Jobs:
         return cancelled
 
     def waits_for(self, job: Job) -> str | None:
-        """Why a queued job does not start, None if nothing keeps it."""
+        """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
+        if job.state is JobState.RUNNING:
+            return self._admission.reason(job.id)
         if job.state is not JobState.QUEUED:
             return None
         return self._admission.reason(job.id) or (None if self.is_running() else "This server does not run jobs; restart it and read its log.")

@@ -162,6 +162,7 @@ class Runner:
         while not self._closing.wait(ROUND_S):
             try:
                 self._renew_leases()
+                self._admission.look_for_stalled()
             except Exception:
                 log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
             self._wake.set()

@@ -21,7 +21,9 @@ class World:
 
     def __init__(self) -> None:
         self.machine, self.now_s = Machine(free_disk_bytes=50 * GIB, disk_bytes=100 * GIB, memory_bytes=16 * GIB), 0.0
-        self.admission = Admission(lambda: self.machine, lambda: self.now_s)
+        self.lacking: dict[bool, str] = {}
+        """By whether it is to capture or to run other stages, why no worker can."""
+        self.admission = Admission(lambda: self.machine, lambda: self.now_s, lacks=self.lacking.get)
 
     def free(self, size: int) -> None:
         self.machine = Machine(size, self.machine.disk_bytes, self.machine.memory_bytes)
@@ -115,3 +117,25 @@ def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> No
     world.machine = Machine(0, LEAST_DISK_BYTES, 16 * GIB)
     with pytest.raises(JobTooLargeError, match=r"of disk and there are 0\.1 GiB in all"):
         world.admission.refuse_too_large(spec)
+
+
+def test_a_running_job_whose_workers_went_away_says_so_until_one_comes(spec: JobSpec) -> None:
+    world = World()
+    world.admission.start("fit", 1, spec)
+    world.admission.look_for_stalled()
+    assert world.admission.reason("fit") is None
+    world.lacking[False] = "The scheduler has no workers; start some with dentine worker."
+    world.admission.look_for_stalled()
+    assert world.admission.reason("fit") == "Waits for workers: The scheduler has no workers; start some with dentine worker."
+    world.lacking.clear()
+    world.admission.look_for_stalled()
+    assert world.admission.reason("fit") is None
+
+
+def test_a_job_that_ended_waits_for_no_workers(spec: JobSpec) -> None:
+    world = World()
+    world.lacking[False] = "None."
+    world.admission.start("fit", 1, spec)
+    world.admission.look_for_stalled()
+    world.admission.end("fit")
+    assert world.admission.reason("fit") is None
