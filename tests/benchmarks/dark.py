@@ -1,6 +1,7 @@
 """How long the dome stays lit after a cancel, an ALL OFF and a signal that strike in mid-exposure.
 
 python -m tests.benchmarks.dark --json dark.json --times 300
+python -m tests.benchmarks.dark --json dark.json --times 300 --under upload half-open
 
 A real capture lights a simulated dome over Modbus while an observer reads the registers of what is emitted, again and again, over a
 connection of its own. Each time is from just before the request or the signal was sent to the answer of the first reading that saw no
@@ -10,9 +11,13 @@ light, with none lit after it. Exposures last 2 s and are struck in their first 
 ==========  ==================================================================================================================
 cancel      POST /v1/jobs/<id>/cancel
 all-off     POST /v1/dome/off, for the dome of the server
+page        ALL OFF in the dome's page, beside eight pages that follow the job in the same browser
 signal      SIGTERM to ``dentine capture``
 serve       SIGTERM to ``dentine serve``, with an event stream open
 ==========  ==================================================================================================================
+
+Loads of the server, each from a process of its own (``dark_loads``): ``upload`` sends captures all the time, ``half-open`` holds 1,500 connections
+that have not finished their first line's headers. The way ``signal`` has no server.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ import argparse
 import json
 import os
 import random
+import shutil
 import signal
 import statistics
 import subprocess
@@ -29,7 +35,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +44,12 @@ import httpx
 from services.capture.dome_modbus import DomeObserver
 from services.capture.simulator import simulated_dome
 from services.core.store import write_atomic
+from tests.benchmarks.dark_loads import LOADS, allow_many_connections, loaded
+from tests.browser.chromium import ARGUMENTS
 from tests.support.live_server import running_server
 from tests.support.mouth import write_mouth
 
-LIGHTS = 6
+LIGHTS, TABS = 6, 8
 EXPOSURE_S = 2.0
 STEADY_S = 0.3
 """Lit for so long without a break, it is an exposure and none of the preflight's glimpses, on all but a very busy machine."""
@@ -49,6 +57,8 @@ STRIKE_WITHIN_S = 0.5
 PATIENCE_S = 120.0
 QUIET_S = 0.3
 """Dark for so long, nobody lights the dome any more."""
+LOOK_EVERY_S = 0.003
+"""Between two readings, so that looking takes little of the machine that is looked at."""
 
 
 class Observer:
@@ -69,6 +79,7 @@ class Observer:
                 self._lit_since_s = self._lit_since_s if self._lit_since_s is not None else asked_s
             elif self._lit_since_s is not None:
                 self._lit_since_s, self._dark_since_s = None, time.monotonic()
+            self._ending.wait(LOOK_EVERY_S)
 
     def await_exposure(self) -> None:
         """Wait until a light has been on for a while, then for a random time."""
@@ -93,8 +104,8 @@ class Observer:
 class Bench:
     """A dome, its observer, and a mouth for the cameras."""
 
-    def __init__(self, folder: Path, host: str, port: int, observer: Observer) -> None:
-        self.folder, self.observer, self._address = folder, observer, f"{host}:{port}"
+    def __init__(self, folder: Path, host: str, port: int, observer: Observer, loads: tuple[str, ...]) -> None:
+        self.folder, self.observer, self._address, self._loads = folder, observer, f"{host}:{port}", loads
         write_mouth(folder / "mouth", LIGHTS)
         self._count = 0
 
@@ -111,11 +122,18 @@ class Bench:
 
     @contextmanager
     def server(self) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-        """``dentine serve`` with this dome."""
+        """``dentine serve`` with this dome, and its loads."""
         environment = os.environ | {"DENTINE__SERVER__DOME__ADDRESS": self._address}
         command = [sys.executable, "-m", "services", "serve", "--port", "0", "--data", str(self.new_folder())]
-        with (self.folder / "server.log").open("a") as log, running_server(command, log, environment=environment) as running:
+        with (self.folder / "server.log").open("a") as log, running_server(command, log, environment=environment) as running, ExitStack() as loads:
+            for load in self._loads:
+                loads.enter_context(loaded(load, str(running[0].base_url), log))
             yield running
+
+    def submit(self, client: httpx.Client) -> str:
+        """A job that captures."""
+        job: str = client.post("/v1/jobs", json={"rig": self.rig, "workers": 1}).raise_for_status().json()["id"]
+        return job
 
     def strike(self, how: Callable[[], object]) -> float:
         """Seconds from the strike in mid-exposure until it is dark."""
@@ -129,8 +147,27 @@ def strike_by_request(bench: Bench, path: str) -> Iterator[float]:
     """Cancel, or press ALL OFF, in one capture after the other of one server."""
     with bench.server() as (client, _):
         while True:
-            job = client.post("/v1/jobs", json={"rig": bench.rig, "workers": 1}).raise_for_status().json()["id"]
+            job = bench.submit(client)
             yield bench.strike(lambda job=job: client.post(path.format(job=job)).raise_for_status())  # type: ignore[misc]
+            client.get(f"/v1/jobs/{job}/events")
+
+
+def strike_by_page(bench: Bench) -> Iterator[float]:
+    """Press ALL OFF in the dome's page while eight pages of the same browser follow the job that captures."""
+    from playwright.sync_api import sync_playwright
+
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    with bench.server() as (client, _), sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS)) as browser:
+        context = browser.new_context(base_url=str(client.base_url))
+        dome, *tabs = (context.new_page() for _ in range(1 + TABS))
+        dome.goto("/#/dome")
+        for tab in tabs:
+            tab.goto("/#/new")
+        while True:
+            job = bench.submit(client)
+            for tab in tabs:
+                tab.evaluate("job => { location.hash = `#/${job}`; }", job)
+            yield bench.strike(lambda: dome.evaluate("document.querySelector('.all-off').click()"))
             client.get(f"/v1/jobs/{job}/events")
 
 
@@ -148,7 +185,7 @@ def strike_server(bench: Bench) -> Iterator[float]:
     """Send SIGTERM to one ``dentine serve`` after the other while a page follows its job."""
     while True:
         with bench.server() as (client, process):
-            job = client.post("/v1/jobs", json={"rig": bench.rig, "workers": 1}).raise_for_status().json()["id"]
+            job = bench.submit(client)
             with client.stream("GET", f"/v1/jobs/{job}/events"):
                 taken_s = bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
             process.wait(PATIENCE_S)
@@ -158,6 +195,7 @@ def strike_server(bench: Bench) -> Iterator[float]:
 WAYS: dict[str, Callable[[Bench], Iterator[float]]] = {
     "cancel": lambda bench: strike_by_request(bench, "/v1/jobs/{job}/cancel"),
     "all-off": lambda bench: strike_by_request(bench, "/v1/dome/off"),
+    "page": strike_by_page,
     "signal": strike_capture,
     "serve": strike_server,
 }
@@ -177,20 +215,23 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=300)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--under", nargs="*", choices=LOADS, default=[], help="loads of the server, all at once")
     wanted = parser.parse_args()
+    allow_many_connections()
     told: dict[str, Any] = json.loads(wanted.json.read_text()) if wanted.json.exists() else {}
     with tempfile.TemporaryDirectory() as folder, simulated_dome(LIGHTS, 2.0) as (host, port):
         observer = Observer(host, port)
         try:
             for way in wanted.ways:
-                seconds: list[float] = told.get(way, {}).get("seconds", [])
-                strikes = WAYS[way](Bench(Path(folder) / way, host, port, observer))
+                name = f"{way} under {' and '.join(wanted.under)}" if wanted.under else way
+                seconds: list[float] = told.get(name, {}).get("seconds", [])
+                strikes = WAYS[way](Bench(Path(folder) / way, host, port, observer, tuple(wanted.under)))
                 while len(seconds) < wanted.times:
                     seconds.append(round(next(strikes), 4))
-                    told[way] = {"n": len(seconds), "worst_s": max(seconds), "median_s": statistics.median(seconds), "seconds": seconds}
+                    told[name] = {"n": len(seconds), "worst_s": max(seconds), "median_s": statistics.median(seconds), "seconds": seconds}
                     write_atomic(wanted.json, json.dumps(told, indent=1).encode())
                 strikes.close()  # type: ignore[attr-defined]
-                print(f"{way}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s", flush=True)
+                print(f"{name}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s", flush=True)
         finally:
             observer.close()
 
