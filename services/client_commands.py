@@ -15,6 +15,7 @@ from services.core.errors import InputError, JobCancelledError
 
 if TYPE_CHECKING:
     from services.api.client import Client
+    from services.core.records import Verdict
     from services.core.settings import Settings
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -111,7 +112,7 @@ def _add_demonstration(app: typer.Typer, connect: Callable[[str | None], Client]
 def _add_care(app: typer.Typer, connect: Callable[[str | None], Client]) -> None:
     @app.command()
     def watch(job_id: JobId, server: Server = None, as_json: Json = False) -> None:
-        """Watch a job until it ends; the exit status is the job's."""
+        """Watch a job until it ends; the exit status is the job's, or 9 where its fit did not converge."""
         with connect(server) as client:
             watch_job(client, job_id, as_json=as_json)
 
@@ -168,7 +169,7 @@ def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
     """Show a job until it ends.
 
     Raises:
-        JobCancelledError: it was. typer.Exit: it failed; the status is the job's own.
+        JobCancelledError: it was. typer.Exit: it failed, with the status of its own, or its fit did not converge.
     """
     from services.api.progress import ProgressView
 
@@ -176,12 +177,37 @@ def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
         for event in client.events(job_id):
             view(event)
     job = client.get(job_id)
-    print(json.dumps(job) if as_json else job["state"])
+    print(json.dumps(job) if as_json else shown_state(job))
     if job["state"] == "CANCELLED":
         raise JobCancelledError(f"Job {job_id} was cancelled; dentine retry {job_id} resumes it.")
     if failure := job["failure"]:
         print(f"dentine: {failure['message']}", file=sys.stderr)
         raise typer.Exit(failure["exit_status"])
+    if (verdict := job["verdict"]) is not None:
+        from services.core.records import Verdict
+
+        require_converged(Verdict.model_validate(verdict))
+
+
+def require_converged(verdict: Verdict) -> None:
+    """Say on standard error how well a fit went.
+
+    Raises:
+        typer.Exit: it did not converge.
+    """
+    from services.core.verdict import NOT_CONVERGED_STATUS
+
+    print(verdict.headline, file=sys.stderr)
+    if not verdict.converged:
+        if verdict.advice:
+            print(verdict.advice, file=sys.stderr)
+        raise typer.Exit(NOT_CONVERGED_STATUS)
+
+
+def shown_state(job: dict[str, Any]) -> str:
+    """A job's state, and of one that succeeded whether its fit did: the same word that the page shows."""
+    verdict = job["verdict"]
+    return "NOT CONVERGED" if verdict is not None and not verdict["converged"] else str(job["state"])
 
 
 def _list(client: Client, limit: int, only: dict[str, Any]) -> list[dict[str, Any]]:
@@ -198,4 +224,4 @@ def _list(client: Client, limit: int, only: dict[str, Any]) -> list[dict[str, An
 def _line(job: dict[str, Any]) -> str:
     submitted = datetime.fromtimestamp(job["created_s"], UTC).strftime("%Y-%m-%d %H:%M UTC")
     source = job["spec"]["rig"]["mouth"] if job["spec"]["rig"] else job["spec"]["capture"]
-    return f"{job['id']}  {job['state']:<10}  {submitted}  {job['name'] or '-'}  {source}"
+    return f"{job['id']}  {shown_state(job):<13}  {submitted}  {job['name'] or '-'}  {source}"

@@ -12,13 +12,18 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from services.core.records import JobSpec
+    from services.core.records import AssetManifest, JobSpec
 
 
 def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool) -> None:
-    """Run a job and print where its results are and how well it fits; the first Ctrl-C cancels it in order."""
+    """Run a job and print where its results are and how well it fits; the first Ctrl-C cancels it in order.
+
+    Raises:
+        typer.Exit: the fit did not converge.
+    """
     from services.api.pipeline import run_job
     from services.api.progress import ProgressView
+    from services.client_commands import require_converged
 
     require_apart(spec, out)
     with cancelling_on_signals(out), ProgressView() as view:
@@ -26,19 +31,28 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     if not view.events:
         print("Every stage was published already; nothing ran.", file=sys.stderr)
     report = out / "report.html"
-    if not asset.converged:
-        print(f"The fit did not converge. {asset.advice}", file=sys.stderr)
     if as_json:
         result = {
             "converged": asset.converged,
             "held_out_error": asset.held_out_error,
+            "verdict": None if asset.verdict is None else asset.verdict.model_dump(mode="json"),
             "report": str(report),
             "parameters": str(out / "parameters.json"),
             "files": list(asset.files),
         }
         print(json.dumps(result))
     else:
-        print(f"held-out error: {100 * asset.held_out_error:.2f} %\nreport: {report}")
+        print(f"{_errors(asset)}\nreport: {report}")
+    if asset.verdict is not None:
+        require_converged(asset.verdict)
+
+
+def _errors(asset: AssetManifest) -> str:
+    if (verdict := asset.verdict) is None:  # exported by an earlier version
+        return f"held-out error: {100 * asset.held_out_error:.2f} %"
+    from services.core.verdict import percent
+
+    return f"{verdict.error_of} error: {percent(verdict.error)}"
 
 
 def require_apart(spec: JobSpec, out: Path) -> None:

@@ -25,10 +25,11 @@ from services.api.migrations import upgrade
 from services.api.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.api.past_runs import PastRuns, past_run_table
 from services.api.server_paths import without_folders
+from services.api.verdicts import Verdicts
 from services.api.webhook_outbox import collect_changes
 from services.core.errors import DentineError, FencedError, JobStateError
 from services.core.geometry import Record
-from services.core.records import JobName, JobSpec
+from services.core.records import JobName, JobSpec, Verdict
 from services.core.stage import StageName
 
 KNOWN_JOBS = 1024
@@ -63,6 +64,9 @@ class Job(Record):
     request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
     name: JobName | None = Field(default=None, description="label that a person gave it")
     owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
+    verdict: Verdict | None = Field(
+        default=None, description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it"
+    )
 
     def seen_by(self, viewer: Viewer) -> Job:
         """The same as somebody may see it: without the folders on the server, for one who may not use them."""
@@ -97,7 +101,8 @@ class Lease:
 
 
 _IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)
-_JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields))  # built once, as what follows: building a query takes longer than asking it
+# Built once, as what follows: building a query takes longer than asking it.
+_JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields if name in job_table.c))
 _ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
 _WITH_KEY = Query(_JOBS.where(job_table.c.key == sql.bindparam("of_key")))
 _NEWEST_EVENTS = Query(
@@ -128,6 +133,7 @@ class Repository:
         upgrade(self.engine)
         self.past_runs = PastRuns(self.engine)
         self._spec_of = lru_cache(KNOWN_JOBS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
+        self._verdicts = Verdicts(self.engine)
         self._known = lru_cache(KNOWN_JOBS)(self._read)
 
     def close(self) -> None:
@@ -161,7 +167,8 @@ class Repository:
         """
         with writing(self.engine) as connection:
             connection.execute(job_table.update().where(job_table.c.id == job_id).values(name=name))
-            return self._find(connection, job_id)
+            renamed = self._find(connection, job_id)
+        return self._verdicts.judged([renamed])[0]
 
     def submitted(self, spec: JobSpec, key: str, viewer: Viewer = LOCAL_VIEWER) -> Job | None:
         """The job that its owner submitted with this idempotency key, if there is one.
@@ -178,7 +185,7 @@ class Repository:
         Raises:
             UnknownJobError: there is none with this id.
         """
-        return self._only(_ONE.rows(self.engine, of=job_id), job_id)
+        return self._verdicts.judged([self._only(_ONE.rows(self.engine, of=job_id), job_id)])[0]
 
     def seen(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
         """Those of the jobs that are there and that somebody may see."""
@@ -188,7 +195,7 @@ class Repository:
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
         values = {"most": limit} | ({} if before is None else {"before": before})
-        return self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values))
+        return self._verdicts.judged(self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values)))
 
     def unfinished(self) -> list[Job]:
         """Jobs that run or wait, those that have waited longest first."""
@@ -243,6 +250,13 @@ class Repository:
         """
         with writing(self.engine) as connection:
             return self._apply(connection, job_id, trigger, failure)
+
+    def tell(self, job_id: str, message: str) -> None:
+        """Append a sentence to the events of a job that waits, if it still does."""
+        is_waiting = sql.select(job_table.c.id).where(job_table.c.id == job_id, job_table.c.state == JobState.QUEUED)
+        with writing(self.engine) as connection:
+            if connection.scalar(is_waiting) is not None:
+                insert_event(connection, job_id, 0, kind="log", message=message)
 
     def lose(self) -> list[str]:
         """Tell every job under way that no process works on it any more."""

@@ -59,6 +59,7 @@ class Runner:
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
         self._running: dict[str, tuple[Lease, threading.Thread]] = {}
+        self._told_obstacles: dict[str, str | None] = {}
         parts = {"jobs": self._start_jobs, "leases": self._look_after, "rounds": self._make_rounds}
         self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
 
@@ -128,12 +129,15 @@ class Runner:
         # In turn; those that wait for disk or workers let others pass.
         queued = sorted(self._repository.queued(), key=turn)
         self._admission.begin_round(job.id for job in queued)
+        self._told_obstacles = {job.id: told for job in queued if (told := self._told_obstacles.get(job.id)) is not None}
         for job in queued:
             if self._closing.is_set():
                 return
             spec, is_to_capture = self._locate(job.spec), first_stage(job.spec, self._folder(job.id)) == "capture"
             if self._admission.holds(job.id, spec, is_to_capture=is_to_capture):
+                self._tell_obstacle(job.id)
                 continue
+            self._told_obstacles.pop(job.id, None)
             try:
                 lease = self._repository.lease(job.id, self._holder, LEASE_S)
             except JobStateError:
@@ -143,6 +147,16 @@ class Runner:
             with self._lock:
                 self._running[job.id] = lease, thread
             thread.start()
+
+    def _tell_obstacle(self, job_id: str) -> None:
+        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers change all the time. That others
+        # are before it is nothing to act on.
+        reason = self._admission.reason(job_id, besides_turn=True)
+        kind = None if reason is None else reason.partition(":")[0]
+        if kind != self._told_obstacles.get(job_id):
+            self._told_obstacles[job_id] = kind
+            if reason is not None:
+                self._repository.tell(job_id, reason)
 
     def _run_in_thread(self, lease: Lease) -> None:
         job = lease.job

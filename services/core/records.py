@@ -272,6 +272,8 @@ class FitReport(Record):
     parameters: dict[str, dict[str, Estimate]] = Field(description="per channel: name -> estimate, derived quantities included")
     fit_error: dict[str, float] = Field(description="per channel: relative image error on fitted images")
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
+    fit_error_se: dict[str, float] = Field(default={}, description="per channel: standard error of fit_error by the renders' noise")
+    held_out_error_se: dict[str, float] = Field(default={}, description="per channel: the same of held_out_error")
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
     shape_covariance: tuple[tuple[float, ...], ...] = Field(default=(), description="of the blend weights; empty where they were not fitted")
@@ -284,6 +286,28 @@ class FitReport(Record):
     seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
 
 
+class Figure(Record):
+    """A relative image error with what rendering leaves open of it."""
+
+    value: float = Field(description="relative image error, 0.05 for 5 %")
+    se: float | None = Field(description="one standard error by the renders' noise; null where it is not known")
+
+
+class Verdict(Record):
+    """How well a fit went, in the numbers that its report leads with."""
+
+    headline: str = Field(description="one sentence, the worst first")
+    converged: bool = Field(description="whether the numbers are those of a fit that ended where it should")
+    is_above_limit: bool = Field(description="whether an image error, fitted or held out, of some channel is above the limit")
+    limit: float = Field(description="relative image error above which no fit is called converged")
+    error_of: Literal["held-out", "fitted"] = Field(description="which images the errors are of; fitted ones where none was held out")
+    error: Figure = Field(description="mean over the channels")
+    channels: dict[str, Figure] = Field(description="by channel")
+    enamel_thickness: Estimate | None = Field(description="of a single tooth, mean over what the first camera sees; null without dentin and of a jaw")
+    steps: int
+    advice: str = Field(description="what to do where it did not converge, or for a better answer; may be empty")
+
+
 class AssetManifest(Record):
     """Published by the export stage."""
 
@@ -291,4 +315,5 @@ class AssetManifest(Record):
     held_out_error: float = Field(description="mean over channels")
     converged: bool = Field(default=True, description="whether the fit behind it did")
     advice: str = Field(default="", description="what to do where it did not")
+    verdict: Verdict | None = Field(default=None, description="how well the fit went; null where an earlier version exported it")
     centre_mm: Vector3 = (0.0, 0.0, 0.0)

@@ -15,7 +15,8 @@ from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
-from services.fit.evaluate import Evaluation
+from services.core.verdict import MAX_ERROR
+from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.executors import Executor, executor
 from services.fit.journal import Journal
 from services.fit.numerics import numerics_name
@@ -26,8 +27,6 @@ from services.fit.seeds import Seeds
 from services.fit.stages import ChannelFit, StepReport, history_key
 
 CHECKPOINT = "fit-checkpoint"
-UNEXPLAINED = 0.15
-"""Relative error on the fitted or on the held-out images above which a fit is not called converged, however its solver ended."""
 PREVIEW_EVERY = 3
 """A preview after the first step and after every so many."""
 
@@ -112,11 +111,16 @@ def worst_error(fit: ChannelFit[Any]) -> float:
     return max(fit.fit_error, fit.held_out_error or 0.0)
 
 
+def standard_errors(sums: Mapping[str, ErrorSums]) -> dict[str, float]:
+    """By channel, what the renders leave open of an image error; absent where there was nothing to compare with."""
+    return {channel: se for channel, own in sums.items() if (se := own.error_se) is not None}
+
+
 def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
     """Whether a fit of these channels counts as converged, and what to do about it."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
     off = {c: worst_error(fit) for c, fit in fits.items()}
-    unexplained = [c for c, error in off.items() if error > UNEXPLAINED]
+    unexplained = [c for c, error in off.items() if error > MAX_ERROR]
     advice += [f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples." for c in unexplained]
     return not unexplained and all(fit.solution.result.converged for fit in fits.values()), advice
 

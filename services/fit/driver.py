@@ -16,7 +16,7 @@ from services.fit.alignment import offsets_told
 from services.fit.anatomy.frame import ToothFrame
 from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.anatomy.thickness import ThicknessMap, thickness_map
-from services.fit.attempt import Attempt, judge, worst_error
+from services.fit.attempt import Attempt, judge, standard_errors, worst_error
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
 from services.fit.identifiability import NOTHING, correlation, told
@@ -121,6 +121,8 @@ class FitDriver:
             parameters=tables,
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
+            fit_error_se=standard_errors({c: one.fitted for c, one in evaluations.items()}),
+            held_out_error_se=standard_errors({c: one.held_out for c, one in evaluations.items()}),
             steps=sum(fit.steps for fit in fits.values()),
             shape=shape,
             shape_covariance=covariance,

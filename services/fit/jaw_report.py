@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.core.records import Estimate, FitReport, ToothReport
+from services.core.verdict import MAX_ERROR
 from services.fit.alignment import offsets_told
 from services.fit.anatomy.thickness import thickness_map
-from services.fit.attempt import UNEXPLAINED, judge, worst_error
+from services.fit.attempt import judge, standard_errors, worst_error
 from services.fit.driver import shape_covariance
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.identifiability import told
@@ -56,6 +57,8 @@ def report(fits: Mapping[str, JawFit], shaped_by: str, dentins: Sequence[DentinS
         parameters={c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()},
         fit_error={c: jaw.fit.fit_error for c, jaw in fits.items()},
         held_out_error={c: jaw.fit.held_out_error for c, jaw in fits.items() if jaw.fit.held_out_error is not None},
+        fit_error_se=standard_errors({c: one.fitted for c, one in _evaluations(fits).items()}),
+        held_out_error_se=standard_errors({c: one.held_out for c, one in _evaluations(fits).items()}),
         steps=sum(jaw.fit.steps for jaw in fits.values()),
         seconds=seconds,
         teeth=teeth,
@@ -80,7 +83,7 @@ def _tooth(k: int, fits: Mapping[str, JawFit], first: JawFit, dentin: DentinShap
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)
     sentence = start.sentence
-    if start.state == "fitted" and worst > UNEXPLAINED:
+    if start.state == "fitted" and worst > MAX_ERROR:
         sentence = f"Tooth {start.fdi} is still {100 * worst:.0f} % off in its images; check its mesh and its masks."
         if is_placed:
             errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}

@@ -113,6 +113,11 @@ class JawSchedule(Stages[Mouth]):
         shapes = {f"{k}.shape.{mode}": c for k, tooth in enumerate(tissue.teeth) for mode, c in enumerate(tooth.shape)}
         return shapes | ({} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance})
 
+    def _told_name(self, name: str) -> str:
+        # Inside the fit a tooth goes by its place in the list, for people by its FDI number.
+        place, _, own = name.partition(".")
+        return f"{self.teeth[int(place)].fdi}.{own}" if place.isdigit() else name
+
     def _domain(self, mouth: Mouth) -> Domain:
         common = Mouth((self._typical(mouth),))
         coordinates = []

@@ -14,7 +14,7 @@ from services.core.store import write_atomic
 from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.anatomy.thickness import ThicknessMap
 from services.fit.evaluate import Evaluation
-from services.fit.export.pictures import Picture, enlarge, png_bytes, signed_map, tone_map, white_level
+from services.fit.export.pictures import RESIDUAL_OF_WHITE, Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
 from services.fit.export.stains import stain_image
 from services.fit.observations import ViewStack
@@ -79,11 +79,11 @@ def write_preview(root: Path, step: StepReport, evaluation: Evaluation, manifest
         drawn = {
             "render": tone_map(picture.render, white),
             "photo": tone_map(picture.photo, white),
-            "residual": signed_map(picture.residual, 0.25 * white, picture.valid),
+            "residual": signed_map(picture.residual, RESIDUAL_OF_WHITE * white, picture.valid),
         }
         event: dict[str, object] = {
             "camera": picture.camera, "light": picture.light, "held_out": picture.held_out,
-            "channel": step.channel, "step": step.step, "residual_limit": 0.25 * white,
+            "channel": step.channel, "step": step.step, "residual_limit": RESIDUAL_OF_WHITE * white, "residual_of_white": RESIDUAL_OF_WHITE,
         }  # fmt: skip
         for kind, image in drawn.items():
             path = Path(PREVIEWS) / f"{step.channel}-{step.step:03d}-{picture.camera}-{picture.light}-{kind}.png"

@@ -15,6 +15,7 @@ from services.core.installed import require_packages
 from services.core.records import AssetManifest, FitReport, FolderCapture, JobSpec, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, read_record, write_atomic, write_record
+from services.core.verdict import VERDICT, verdict_of
 
 if TYPE_CHECKING:
     from services.core.geometry import Tooth
@@ -96,16 +97,9 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
     report = driver.run(time.time()).model_copy(update={"notes": notes})
     writer.publish(report)
-    context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=summary(report)))
+    verdict = verdict_of(report)
+    context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=verdict.headline, data={VERDICT: verdict.model_dump(mode="json")}))
     return report
-
-
-def summary(report: FitReport) -> str:
-    """One sentence on how the fit went."""
-    errors = report.held_out_error or report.fit_error
-    kind = "held-out" if report.held_out_error else "fit"
-    parts = ", ".join(f"{channel} {100 * error:.1f} %" for channel, error in errors.items())
-    return f"{'Converged' if report.converged else 'Stopped'} after {report.steps} steps; {kind} error {parts}."
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
@@ -160,11 +154,13 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
     write_atomic(context.root / "errors.json", _json(errors_json(report)))
 
-    held_out = list((report.held_out_error or report.fit_error).values())
     corners = [corner for tooth in teeth for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))]
     centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
     place = float(centre[0]), float(centre[1]), float(centre[2])
-    manifest = AssetManifest(files=files, held_out_error=sum(held_out) / len(held_out), converged=report.converged, advice=report.advice, centre_mm=place)
+    verdict = verdict_of(report)
+    manifest = AssetManifest(
+        files=files, held_out_error=verdict.error.value, converged=verdict.converged, advice=report.advice, verdict=verdict, centre_mm=place
+    )
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
     context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))

@@ -141,6 +141,10 @@ class Stages(ABC, Generic[Optics]):
     def _others(self, tissue: Optics) -> dict[str, float]:
         """What they list beside media."""
 
+    def _told_name(self, name: str) -> str:
+        """How reports of steps call a parameter."""
+        return name
+
     @abstractmethod
     def _held(self, domain: Domain) -> Held:
         """Mean cosines that this domain holds, as the closing measurement takes them."""
@@ -263,6 +267,7 @@ class Stages(ABC, Generic[Optics]):
         fitted, held_out = evaluation.fitted, evaluation.held_out
         leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         values = {f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves} | self._others(tissue)
+        values = {self._told_name(name): value for name, value in values.items()}
         loss = fitted.loss or 0.0
         self.report(
             StepReport(

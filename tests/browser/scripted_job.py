@@ -12,8 +12,9 @@ from playwright.sync_api import Page
 
 from services.api.events import EventAddress
 from services.core.errors import DentineError
-from services.core.records import Estimate, JobSpec
+from services.core.records import Estimate, JobSpec, Verdict
 from services.core.stage import StageEvent
+from services.core.verdict import VERDICT
 
 STEPS = 6
 
@@ -24,6 +25,7 @@ class ScriptedJob:
     def __init__(self) -> None:
         self.steps = threading.Semaphore(0)
         self.problem: DentineError | None = None
+        self.verdict: Verdict | None = None
 
     def __call__(self, _spec: JobSpec, folder: Path, events: EventAddress) -> None:
         with events.open() as log:
@@ -35,7 +37,9 @@ class ScriptedJob:
                 if self.problem is not None:
                     raise self.problem
                 self._report(log, fit, step, folder)
-            log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged after 6 steps."))
+            data = {} if self.verdict is None else {VERDICT: self.verdict.model_dump(mode="json")}
+            message = "Converged after 6 steps." if self.verdict is None else self.verdict.headline
+            log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message=message, data=data))
             export = log.begin_stage("export")
             table = {
                 "enamel.sigma": Estimate(value=4.0321, se=0.0512, unit="1/mm", determined=True),
@@ -60,7 +64,8 @@ class ScriptedJob:
         (folder / "previews").mkdir(exist_ok=True)
         for kind, path in paths.items():
             _write_picture(folder / path, kind, step)
-        log.append(attempt, StageEvent(stage="fit", kind="preview", data={"camera": "c0", "light": "l3", "channel": "green", "step": step, **paths}))
+        data = {"camera": "c0", "light": "l3", "channel": "green", "step": step, "residual_of_white": 0.25, **paths}
+        log.append(attempt, StageEvent(stage="fit", kind="preview", data=data))
 
 
 def _json(table: dict[str, Estimate]) -> str:

@@ -73,7 +73,7 @@ def test_a_job_is_named_listed_downloaded_and_deleted_by_the_base_install(tmp_pa
     assert made.returncode == 0, made.stderr
     job = made.stdout.split()[0]
     listed = dentine("jobs", *address, command=bare)
-    assert re.fullmatch(rf"{job}  SUCCEEDED   \d{{4}}-\d\d-\d\d \d\d:\d\d UTC  Anna, upper left  captures/\w+\n", listed.stdout)
+    assert re.fullmatch(rf"{job}  SUCCEEDED      \d{{4}}-\d\d-\d\d \d\d:\d\d UTC  Anna, upper left  captures/\w+\n", listed.stdout)
     (told,) = json.loads(dentine("jobs", "--state", "succeeded", "--capture", "captures/", "--json", *address, command=bare).stdout)
     assert (told["id"], told["name"]) == (job, "Anna, upper left")
     assert dentine("jobs", "--state", "failed", *address, command=bare).stdout == "There is no such job.\n"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.fit.attempt import UNEXPLAINED
+from services.core.verdict import MAX_ERROR
 from services.fit.figures.__main__ import main
 
 
@@ -20,8 +20,8 @@ def test_a_figure_is_made_from_nothing_and_its_fit_used_again(tmp_path: Path) ->
     caption = (tmp_path / "fig13.txt").read_text()
     fitted, unseen = (float(number) for number in re.findall(r"([\d.]+) % on", caption))
     # A fit that is called converged explains its images this well.
-    assert 0 < fitted < 100 * UNEXPLAINED
-    assert 0 < unseen < 100 * UNEXPLAINED
+    assert 0 < fitted < 100 * MAX_ERROR
+    assert 0 < unseen < 100 * MAX_ERROR
     with Image.open(tmp_path / "fig13.png") as image:
         assert np.asarray(image).std() > 30
     reports = {path: path.stat().st_mtime_ns for path in tmp_path.glob("work/*/job/fit/*.json")}

@@ -24,6 +24,7 @@ from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
+from services.core.verdict import VERDICT, verdict_of
 from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.export.mitsuba_scene import nested_scene
 from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
@@ -107,8 +108,8 @@ def write_asset(
     _write_json(folder / "rig.json", rig)
     _write_json(folder / "parameters.json", parameters_json(report))
     _write_json(folder / "errors.json", errors_json(report))
-    if not report.converged:
-        write_atomic(folder / NOT_CONVERGED, f"The fit did not converge. {report.advice}\n".encode())
+    if not (verdict := verdict_of(report)).converged:
+        write_atomic(folder / NOT_CONVERGED, f"The fit did not converge. {verdict.headline} {report.advice}\n".encode())
     for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
         write_atomic(folder / name, (SHIPPED / name).read_bytes())
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
@@ -148,11 +149,15 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
 
 def errors_json(report: FitReport) -> dict[str, Any]:
     """Relative image errors per channel, and whether they are those of a converged fit."""
+    verdict = verdict_of(report)
     errors = {
         "unit": "1",
         "fit_error": report.fit_error,
+        "fit_error_se": report.fit_error_se,
         "held_out_error": report.held_out_error,
-        "converged": report.converged,
+        "held_out_error_se": report.held_out_error_se,
+        "converged": verdict.converged,
+        VERDICT: verdict.model_dump(mode="json"),
         "advice": report.advice,
         "notes": report.notes,
         "told": report.told,

@@ -11,14 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Correlation, Estimate, FitReport, ToothReport
+from services.core.records import Correlation, Estimate, Figure, FitReport, ToothReport
 from services.core.store import write_atomic
+from services.core.verdict import mean_figure, percent, verdict_of
 from services.fit.anatomy.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
-from services.fit.export.pictures import DIVERGING, SEQUENTIAL, ColourStops, Picture, data_uri, enlarge, scalar_map, signed_map, tone_map, white_level
+from services.fit.export.pictures import (
+    DIVERGING,
+    RESIDUAL_OF_WHITE,
+    SEQUENTIAL,
+    ColourStops,
+    Picture,
+    data_uri,
+    enlarge,
+    scalar_map,
+    signed_map,
+    tone_map,
+    white_level,
+)
 
-RESIDUAL_OF_WHITE = 0.25
-"""Residuals are drawn from minus to plus this fraction of the picture's white."""
 PART_LABELS = {"enamel": "Enamel", "dentin": "Dentin", "shape": "Dentin shape", "gums": "Gums", "cavity": "Wall of the mouth"}
 LEAF_LABELS = {
     "sigma": "extinction σ",
@@ -70,19 +81,23 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
     """
     from jinja2 import Environment, StrictUndefined
 
+    verdict = verdict_of(report)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((Path(__file__).parent / "report.html.j2").read_text(encoding="utf-8"))
     boundary = context.get("boundary", "")
     page = template.render(
         title=context.get("title", "Fit"),
-        converged=report.converged,
+        verdict=verdict,
+        headline=verdict.headline,
+        error=percent(verdict.error),
         advice=report.advice,
         notes=report.notes,
         told=report.told,
         next_capture=report.next_capture,
         correlations=_correlations(report.correlations),
-        held_out=_error_rows(report.held_out_error),
-        fitted=_error_rows(report.fit_error),
+        held_out=_error_rows(report.held_out_error, report.held_out_error_se),
+        fitted=_error_rows(report.fit_error, report.fit_error_se),
+        mean_thickness="" if report.enamel_thickness is None else _spread(report.enamel_thickness),
         steps=report.steps,
         seconds=_duration(report.seconds),
         triptychs=[_triptych(picture) for picture in sorted(pictures.pictures, key=lambda p: (p.camera, p.held_out))],
@@ -103,11 +118,17 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
     write_atomic(path, page.encode())
 
 
-def _error_rows(errors: dict[str, float]) -> dict[str, Any] | None:
+def _error_rows(errors: dict[str, float], ses: dict[str, float]) -> dict[str, Any] | None:
     if not errors:
         return None
-    mean = sum(errors.values()) / len(errors)
-    return {"mean": _percent(mean), "channels": [(channel, _percent(error)) for channel, error in errors.items()]}
+    channels = [(channel, percent(Figure(value=error, se=ses.get(channel)))) for channel, error in errors.items()]
+    return {"mean": percent(mean_figure(errors, ses)), "channels": channels}
+
+
+def _spread(estimate: Estimate) -> str:
+    if estimate.se is None:
+        return f"{estimate.value:.2f} {estimate.unit}"
+    return f"{estimate.value:.2f} ± {estimate.se:.2f} {estimate.unit}"
 
 
 def _percent(fraction: float) -> str:
@@ -260,8 +281,7 @@ def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
     if found is None:
         return None
     high = max(0.5, math.ceil(2 * float(np.nanpercentile(found.image_mm, 99))) / 2)
-    spread = "" if found.mean.se is None else f" ± {found.mean.se:.2f}"
-    maps = [("Distance from the outer surface to dentin", found.image_mm, high, f"{found.mean.value:.2f}{spread} mm")]
+    maps = [("Distance from the outer surface to dentin", found.image_mm, high, _spread(found.mean))]
     if found.errors_mm is not None:
         most = max(0.05, math.ceil(20 * float(np.nanpercentile(found.errors_mm, 99))) / 20)
         maps.append(("Its standard error", found.errors_mm, most, f"{np.nanmean(found.errors_mm):.2f} mm"))

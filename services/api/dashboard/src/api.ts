@@ -9,6 +9,28 @@ const DOME_PATIENCE_MS = 3000;
 
 export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
 
+/** A relative image error, 0.05 for 5 %, and one standard error. */
+export interface Figure {
+  value: number;
+  se: number | null;
+}
+
+/** How well a fit went: the report's own judgement and numbers. */
+export interface Verdict {
+  /** One sentence, the worst first. */
+  headline: string;
+  converged: boolean;
+  is_above_limit: boolean;
+  limit: number;
+  error_of: "held-out" | "fitted";
+  /** Mean over the channels. */
+  error: Figure;
+  channels: Record<string, Figure>;
+  enamel_thickness: Estimate | null;
+  steps: number;
+  advice: string;
+}
+
 export interface Job {
   id: string;
   number: number;
@@ -19,6 +41,8 @@ export interface Job {
   failure: { code: string; message: string; stage: string | null } | null;
   /** Label that a person gave it. */
   name: string | null;
+  /** Of a job that succeeded; null where an earlier version fitted it. */
+  verdict: Verdict | null;
 }
 
 export interface Stage {

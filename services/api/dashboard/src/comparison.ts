@@ -2,6 +2,7 @@
 
 import { artifactUrl, type JobEvent } from "./api";
 import { element } from "./element";
+import { significant } from "./format";
 import { showPicture } from "./lanes";
 
 interface Preview {
@@ -13,6 +14,9 @@ interface Preview {
   render: string;
   photo: string;
   residual: string;
+  /** Ends of the residual's colours, in words. */
+  least: string;
+  most: string;
 }
 
 const text = (value: unknown): string => (typeof value === "string" ? value : "");
@@ -28,6 +32,8 @@ export class Comparison {
   private readonly render = element("img", { alt: "", class: "over" });
   private readonly line = element("div", { class: "line" });
   private readonly residual = element("img", { alt: "" });
+  private readonly least = element("span");
+  private readonly most = element("span");
   private followsLatest = true;
 
   constructor(private readonly job: string) {
@@ -41,7 +47,8 @@ export class Comparison {
   }
 
   add(event: JobEvent): void {
-    const { camera, light, channel, step, render, photo, residual, held_out: heldOut } = event.data;
+    const { camera, light, channel, step, render, photo, residual, held_out: heldOut, residual_of_white: ofWhite, residual_limit: limit } = event.data;
+    const share = typeof ofWhite === "number" ? `${100 * ofWhite} % of white` : typeof limit === "number" ? `${significant(limit)} of radiance` : "";
     const preview: Preview = {
       camera: text(camera),
       light: text(light),
@@ -51,6 +58,8 @@ export class Comparison {
       render: text(render),
       photo: text(photo),
       residual: text(residual),
+      least: share && `−${share}`,
+      most: share && `+${share}`,
     };
     const key = [preview.channel, preview.camera, preview.light].filter(Boolean).join(" · ");
     if (!this.views.size) this.build();
@@ -73,11 +82,12 @@ export class Comparison {
       this.split,
     );
     const stack = element("div", { class: "stack" }, this.photo, this.render, this.line);
+    const scale = element("p", { class: "scale" }, this.least, element("i", { role: "img", "aria-label": "Colours of the residual, from blue over white to orange" }), this.most);
     const pictures = element(
       "div",
       { class: "pictures" },
       element("figure", {}, stack, element("figcaption", {}, "left of the line: render; right: photograph")),
-      element("figure", {}, this.residual, element("figcaption", {}, "residual: render less photograph")),
+      element("figure", {}, this.residual, scale, element("figcaption", {}, "residual: render less photograph; blue where the render is darker, orange where it is brighter")),
     );
     this.root.replaceChildren(controls, pictures);
     this.place();
@@ -91,6 +101,8 @@ export class Comparison {
     if (!shown) return;
     const name = `camera ${shown.camera}, light ${shown.light}, step ${shown.step}`;
     this.stepText.textContent = String(shown.step);
+    this.least.textContent = shown.least;
+    this.most.textContent = shown.most;
     for (const [image, path, kind] of [
       [this.render, shown.render, "Render"],
       [this.photo, shown.photo, "Photograph"],

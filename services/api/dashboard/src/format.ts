@@ -1,6 +1,6 @@
 /** Numbers for people: an uncertain number shows as many digits as its standard error allows. */
 
-import type { Estimate, TimeRange } from "./api";
+import type { Estimate, Figure, Job, TimeRange } from "./api";
 
 const UNITS: Record<string, string> = { "1": "", "1/mm": "mm⁻¹", "per mm": "mm⁻¹", "mm^-1": "mm⁻¹" };
 
@@ -21,6 +21,20 @@ export function valueOf(estimate: Estimate): string {
 
 export function significant(value: number): string {
   return Number(value.toPrecision(4)).toString();
+}
+
+/** What a badge says of a job, and how it is coloured: that a fit did not converge is no success to whoever looks. */
+export function badgeOf(job: Job): { text: string; state: string } {
+  if (job.state === "SUCCEEDED" && job.verdict && !job.verdict.converged) return { text: "not converged", state: "NOT-CONVERGED" };
+  return { text: job.state.toLowerCase(), state: job.state };
+}
+
+/** As the report writes it: two digits of the standard error, one decimal at least. */
+export function figureOf(figure: Figure): string {
+  if (figure.se === null) return `${(100 * figure.value).toFixed(figure.value >= 0.01 ? 1 : 2)} %`;
+  const se = 100 * figure.se;
+  const decimals = se > 0 ? Math.min(Math.max(1 - Math.floor(Math.log10(se)), 1), 3) : 2;
+  return `${(100 * figure.value).toFixed(decimals)} ± ${se.toFixed(decimals)} %`;
 }
 
 export function percent(fraction: number, se: number | null = null): string {

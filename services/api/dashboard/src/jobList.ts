@@ -2,7 +2,7 @@
 
 import { type Job, listJobs, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
-import { when } from "./format";
+import { badgeOf, when } from "./format";
 
 const PAGE = 50;
 /** The server lists no more at once; what lies below is not asked for again. */
@@ -64,7 +64,7 @@ export class JobList {
 
   private draw(jobs: Job[]): void {
     this.jobs = jobs;
-    const state = JSON.stringify(jobs.map((job) => [job.id, job.state, job.name]));
+    const state = JSON.stringify(jobs.map((job) => [job.id, job.state, job.name, job.verdict?.converged]));
     this.empty.hidden = jobs.length > 0;
     if (state === this.drawn) return;
     this.drawn = state;
@@ -74,7 +74,8 @@ export class JobList {
   }
 
   private link(job: Job): HTMLAnchorElement {
-    const badge = element("span", { class: "badge", "data-state": job.state }, job.state.toLowerCase());
+    const { text, state } = badgeOf(job);
+    const badge = element("span", { class: "badge", "data-state": state }, text);
     const label = job.name ? [element("span", { class: "name" }, job.name)] : [];
     const link = element("a", { href: `#/${job.id}` }, element("strong", {}, `Job ${job.number}`), badge, ...label, element("span", { class: "soft" }, when(job.created_s)));
     this.mark(link);

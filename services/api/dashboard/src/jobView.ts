@@ -16,11 +16,12 @@ import {
 import { Comparison } from "./comparison";
 import { element } from "./element";
 import { followEvents } from "./follow";
-import { bytes, remaining, when } from "./format";
+import { badgeOf, bytes, remaining, when } from "./format";
 import { JobActions } from "./jobActions";
 import { LossChart } from "./lossChart";
 import { ParameterTable } from "./parameterTable";
 import { StageList } from "./stageList";
+import { VerdictCard } from "./verdictCard";
 
 const ASK_AGAIN_MS = 5000;
 
@@ -30,6 +31,7 @@ export class JobView {
   private readonly waits = element("p", { class: "soft", role: "status" });
   private readonly remaining = element("p", { class: "soft remaining" });
   private readonly failure = element("p", { class: "failure", role: "alert" });
+  private readonly verdict = new VerdictCard();
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly title = element("h2");
   private readonly actions: JobActions;
@@ -73,6 +75,7 @@ export class JobView {
       element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
       this.waits,
       this.failure,
+      this.verdict.root,
       this.refusal,
       this.actions.root,
       section("Stages", this.stages.root, this.remaining),
@@ -107,7 +110,8 @@ export class JobView {
     if (event.kind === "step") this.takeStep(event);
     if (event.kind === "preview") this.comparison.add(event);
     if (event.kind === "finished") void this.showFiles();
-    if (event.kind === "state") void this.refreshState();
+    // What is said of no stage is why the job waits.
+    if (event.kind === "state" || (event.kind === "log" && event.stage === null)) void this.refreshState();
   }
 
   /** Teeth that are looked at alone are shown one at a time, and no more once a step tells of all of them together. */
@@ -165,8 +169,11 @@ export class JobView {
   private showState(job: Job): void {
     this.title.textContent = job.name ? `Job ${job.number} · ${job.name}` : `Job ${job.number}`;
     this.actions.show(job);
-    this.state.textContent = job.state.toLowerCase();
-    this.state.dataset["state"] = job.state;
+    const { text, state } = badgeOf(job);
+    this.state.textContent = text;
+    this.state.dataset["state"] = state;
+    this.verdict.show(job.verdict);
+    this.chart.conclude(job.verdict);
     this.failure.hidden = job.failure === null;
     this.failure.textContent = job.failure ? `${job.failure.stage ?? "job"}: ${job.failure.message}` : "";
   }

@@ -1,9 +1,9 @@
 /** The live curve of a fit: loss and held-out error per channel over steps, on a logarithmic axis. */
 
 import uPlot from "uplot";
-import type { JobEvent } from "./api";
+import type { JobEvent, Verdict } from "./api";
 import { element } from "./element";
-import { percent, significant } from "./format";
+import { figureOf, percent, significant } from "./format";
 
 interface Point {
   loss: number | null;
@@ -21,6 +21,7 @@ export class LossChart {
   private plot: uPlot | null = null;
   private plotted = "";
   private stale = false;
+  private verdict: Verdict | null = null;
   private readonly resizes = new ResizeObserver(() => this.plot?.setSize(this.size()));
   private readonly scheme = matchMedia("(prefers-color-scheme: dark)");
   private readonly recolour = () => {
@@ -44,6 +45,12 @@ export class LossChart {
 
   clear(): void {
     this.channels.clear();
+  }
+
+  /** Say the result beside the curve, once there is one: renders on the way take few paths, and their errors are less certain. */
+  conclude(verdict: Verdict | null): void {
+    this.verdict = verdict;
+    if (this.plot) this.draw();
   }
 
   /** Take in a step of a channel; a step that a later attempt repeats replaces the earlier one. */
@@ -106,7 +113,9 @@ export class LossChart {
       const told = last.findLast((point) => point.heldOut !== null);
       return `${name}: loss ${loss ? significant(loss) : "not yet"}${told?.heldOut ? `, held-out error ${percent(told.heldOut, told.heldOutSe)}` : ""}`;
     });
-    const text = `${count} steps. ${latest.join("; ")}.`;
+    const result = this.verdict && Object.entries(this.verdict.channels).map(([name, error]) => `${name} ${figureOf(error)}`);
+    const onTheWay = `${latest.join("; ")}. Errors on the way are of renders with few paths.`;
+    const text = `${count} steps. ${result ? `Result: ${this.verdict?.error_of} error ${result.join(", ")}.` : onTheWay}`;
     this.caption.textContent = text;
     this.canvas.setAttribute("aria-label", `Loss over steps, logarithmic. ${text}`);
   }

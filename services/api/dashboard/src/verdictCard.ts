@@ -1,0 +1,35 @@
+/** How well a fit went, before all else that is shown of its job: the report's own words and numbers. */
+
+import type { Verdict } from "./api";
+import { element } from "./element";
+import { figureOf, valueOf } from "./format";
+
+export class VerdictCard {
+  readonly root = element("div", { class: "verdict" });
+  private shown = "";
+
+  constructor() {
+    this.root.hidden = true;
+  }
+
+  show(verdict: Verdict | null): void {
+    this.root.hidden = verdict === null;
+    const told = JSON.stringify(verdict);
+    if (!verdict || told === this.shown) return; // an alert that stands there already is not told again
+    this.shown = told;
+    const thickness = verdict.enamel_thickness;
+    const errors = Object.entries(verdict.channels).map(([channel, error]) => `${channel} ${figureOf(error)}`);
+    const note = verdict.error_of === "held-out" ? errors.join(", ") : `${errors.join(", ")}; every image was fitted, so nothing tests the result`;
+    const facts = [
+      fact(verdict.error_of === "held-out" ? "Error on held-out images" : "Error on fitted images", figureOf(verdict.error), note),
+      ...(thickness ? [fact("Enamel thickness", `${valueOf(thickness)} ${thickness.unit}`, "mean over what the first camera sees")] : []),
+    ];
+    const trouble = element("p", { class: "failure", role: "alert" }, element("strong", {}, verdict.headline), ` ${verdict.advice}`);
+    const advice = verdict.advice ? [element("p", { class: "soft" }, verdict.advice)] : [];
+    this.root.replaceChildren(...(verdict.converged ? [] : [trouble]), element("dl", {}, ...facts), ...(verdict.converged ? advice : []));
+  }
+}
+
+function fact(name: string, value: string, note: string): HTMLElement {
+  return element("div", {}, element("dt", {}, name), element("dd", {}, element("strong", {}, value), element("span", { class: "soft" }, note)));
+}

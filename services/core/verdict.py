@@ -1,0 +1,63 @@
+"""How well a fit went: the one judgement that the report, the page, the API and the command line show.
+
+Whether a job *succeeded* says that its stages ran to their end; whether its fit *converged* says whether to believe the numbers. The first is a stored state
+of the job's life, the second is derived here from the fit's report and is no state: a job is retried, deleted and told of by its life alone, and the states
+that version 0.1 has stored keep their meaning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Literal
+
+from services.core.records import Figure, FitReport, Verdict
+
+MAX_ERROR = 0.15
+"""Relative error on the fitted or on the held-out images of a channel above which a fit is not called converged, however its solver ended."""
+_HELD_OUT: Literal["held-out"] = "held-out"
+_FITTED: Literal["fitted"] = "fitted"
+VERDICT = "verdict"
+"""Under this name the event with which a fit finished, and ``errors.json``, hold it."""
+NOT_CONVERGED_STATUS = 9
+"""Exit status of a command whose job ran to its end and did not converge."""
+
+
+def verdict_of(report: FitReport) -> Verdict:
+    """The judgement of a fit."""
+    is_tested = bool(report.held_out_error)
+    errors, ses = (report.held_out_error, report.held_out_error_se) if is_tested else (report.fit_error, report.fit_error_se)
+    worst = max([*report.fit_error.values(), *report.held_out_error.values()], default=0.0)
+    error, error_of = mean_figure(errors, ses), _HELD_OUT if is_tested else _FITTED
+    converged, is_above_limit = report.converged and worst <= MAX_ERROR, worst > MAX_ERROR
+    told = f"{error_of} error {percent(error)}"
+    how = f"{'Converged' if converged else 'Not converged'} after {report.steps} steps: {told}."
+    return Verdict(
+        headline=f"Not converged: {told}; no fit above {100 * MAX_ERROR:g} % is believed." if is_above_limit else how,
+        converged=converged,
+        is_above_limit=is_above_limit,
+        limit=MAX_ERROR,
+        error_of=error_of,
+        error=error,
+        channels={channel: Figure(value=error, se=ses.get(channel)) for channel, error in errors.items()},
+        enamel_thickness=report.enamel_thickness,
+        steps=report.steps,
+        advice=report.advice,
+    )
+
+
+def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure:
+    """The mean of some channels' errors; channels are rendered with paths of their own, so their noise is independent."""
+    count = max(len(errors), 1)
+    is_known = bool(errors) and errors.keys() <= ses.keys()
+    se = math.sqrt(sum(ses[channel] ** 2 for channel in errors)) / count if is_known else None
+    return Figure(value=sum(errors.values()) / count, se=se)
+
+
+def percent(figure: Figure) -> str:
+    """A figure with as many digits as its standard error allows: two of them, one decimal at least."""
+    if figure.se is None:
+        return f"{100 * figure.value:.1f} %" if figure.value >= 0.01 else f"{100 * figure.value:.2f} %"
+    se = 100 * figure.se
+    decimals = min(max(1 - math.floor(math.log10(se)), 1), 3) if se > 0 else 2
+    return f"{100 * figure.value:.{decimals}f} ± {se:.{decimals}f} %"
