@@ -17,6 +17,7 @@ from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.anatomy.rig import dome_cameras
 from services.fit.closing import _with_cosine
 from services.fit.jaw_driver import jaw_dentins
+from services.fit.jaw_schedule import JawSchedule
 from services.fit.jaw_starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
 from services.fit.neighbours import Neighbours, arch_place
 from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
@@ -152,3 +153,10 @@ def test_a_molars_dentin_lies_as_its_cusps_do_whatever_the_cameras_see() -> None
     assert np.abs(found - true).mean() < 0.2
 
     assert jaw_dentins(teeth, (camera,), spec.model_copy(update={"dentin": "none"})) == [None, None]
+
+
+def test_steps_of_a_jaw_are_told_by_fdi_numbers_and_not_by_places_in_a_list() -> None:
+    schedule = object.__new__(JawSchedule)
+    schedule.teeth = [ToothStart(fdi, "fitted", "", 100, tissue(4.0)) for fdi in (21, 12)]
+    names = ("0.enamel.sigma", "1.shape.0", "gums.sigma", "cavity.reflectance")
+    assert [schedule._told_name(name) for name in names] == ["21.enamel.sigma", "12.shape.0", "gums.sigma", "cavity.reflectance"]
