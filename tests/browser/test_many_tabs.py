@@ -23,8 +23,8 @@ pytestmark = pytest.mark.browser
 
 LIGHTS = 155
 TABS = 8
-CONNECTIONS = 6
-"""That Chromium opens to one server."""
+CONNECTIONS, LANES = 6, 3
+"""That Chromium opens to one server, and that are for what pages ask (lanes.ts)."""
 HIDE = """hidden => {
   Object.defineProperty(document, "hidden", {value: hidden, configurable: true});
   document.dispatchEvent(new Event("visibilitychange"));
@@ -38,6 +38,9 @@ class Bench:
     address: str
     job: ScriptedJob
     streams: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    """Requests of pages that are under way, streams and ALL OFF left out."""
+    most_asked: int = 0
     go_on: threading.Event = field(default_factory=threading.Event)
 
 
@@ -51,15 +54,15 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         app = create_app(settings, bench.job)
 
         async def counting(scope: Any, receive: Any, send: Any) -> None:
-            path = scope.get("path", "")
-            if not path.startswith("/v1/") or not path.endswith("/events"):
-                await app(scope, receive, send)
-                return
-            bench.streams.append(scope["query_string"].decode())
+            asked, path = scope.get("query_string", b"").decode(), scope.get("path", "")
+            by_page = any(name == b"sec-fetch-mode" for name, _ in scope.get("headers", ())) and path.startswith("/v1/")
+            under_way = bench.streams if path.endswith("/events") else bench.asked if by_page and path != "/v1/dome/off" else []
+            under_way.append(asked)
+            bench.most_asked = max(bench.most_asked, len(bench.asked))
             try:
                 await app(scope, receive, send)
             finally:
-                bench.streams.remove(scope["query_string"].decode())
+                under_way.remove(asked)
 
         with serving(counting) as client:  # type: ignore[arg-type]
             bench.address = str(client.base_url)
@@ -103,6 +106,7 @@ def until(page: Page, condition: Any) -> None:
 def test_eight_job_pages_are_live_by_one_stream_and_all_off_answers(context: BrowserContext, bench: Bench) -> None:
     dome = dome_page(context)
     light_up(dome)
+    bench.most_asked = 0
     tabs = [context.new_page() for _ in range(TABS)]
     jobs = [submit(dome) for _ in tabs]
     for tab, job in zip(tabs, jobs, strict=True):
@@ -119,6 +123,7 @@ def test_eight_job_pages_are_live_by_one_stream_and_all_off_answers(context: Bro
         expect(tab.locator(".stages li", has_text="prepare").locator(".note")).to_have_text("24 images prepared.")
         expect(tab.locator(".chart figcaption")).to_contain_text(f"{STEPS} steps.")
     until(dome, lambda: not bench.streams)
+    assert 1 <= bench.most_asked <= LANES, "what pages ask together leaves connections for the stream, an upload and ALL OFF"
 
 
 def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: BrowserContext, bench: Bench) -> None:
