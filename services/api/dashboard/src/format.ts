@@ -37,6 +37,11 @@ export function figureOf(figure: Figure): string {
   return `${(100 * figure.value).toFixed(decimals)} ± ${se.toFixed(decimals)} %`;
 }
 
+/** A length as the report's head writes it: to a hundredth of a millimetre. */
+export function lengthOf(estimate: Estimate): string {
+  return `${estimate.value.toFixed(2)}${estimate.se === null ? "" : ` ± ${estimate.se.toFixed(2)}`} ${estimate.unit}`;
+}
+
 export function percent(fraction: number, se: number | null = null): string {
   return `${(100 * fraction).toFixed(1)}${se === null ? "" : ` ± ${(100 * se).toFixed(1)}`} %`;
 }

@@ -2,7 +2,7 @@
 
 import type { Verdict } from "./api";
 import { element } from "./element";
-import { figureOf, valueOf } from "./format";
+import { figureOf, lengthOf } from "./format";
 
 export class VerdictCard {
   readonly root = element("div", { class: "verdict" });
@@ -22,7 +22,7 @@ export class VerdictCard {
     const note = verdict.error_of === "held-out" ? errors.join(", ") : `${errors.join(", ")}; every image was fitted, so nothing tests the result`;
     const facts = [
       fact(verdict.error_of === "held-out" ? "Error on held-out images" : "Error on fitted images", figureOf(verdict.error), note),
-      ...(thickness ? [fact("Enamel thickness", `${valueOf(thickness)} ${thickness.unit}`, "mean over what the first camera sees")] : []),
+      ...(thickness ? [fact("Enamel thickness", lengthOf(thickness), "mean over what the first camera sees")] : []),
     ];
     const trouble = element("p", { class: "failure", role: "alert" }, element("strong", {}, verdict.headline), ` ${verdict.advice}`);
     const advice = verdict.advice ? [element("p", { class: "soft" }, verdict.advice)] : [];
