@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -27,7 +28,7 @@ THICKNESS = Estimate(value=0.703, se=0.061, unit="mm", determined=True)
 def report(error: float, *, converged: bool) -> FitReport:
     errors = {"green": error, "red": error + 0.02}
     advice = "" if converged else "red: the images are still 35 % off; check mesh, lights and boundary model, or raise the samples."
-    told = {"held_out_error": errors, "held_out_error_se": {"green": 0.0042, "red": 0.0051}, "enamel_thickness": THICKNESS}
+    told: dict[str, Any] = {"held_out_error": errors, "held_out_error_se": {"green": 0.0042, "red": 0.0051}, "enamel_thickness": THICKNESS}
     return FitReport(converged=converged, advice=advice, parameters={}, fit_error=errors, steps=2 * STEPS, seconds=1.0, **told)
 
 

@@ -13,8 +13,12 @@ from services.core.verdict import MAX_ERROR, mean_figure, percent, verdict_of
 
 
 def report(**changes: Any) -> FitReport:
-    told = {"fit_error": {"red": 0.02, "green": 0.03}, "held_out_error": {"red": 0.05, "green": 0.07}, "held_out_error_se": {"red": 0.003, "green": 0.004}}
-    return FitReport(**{"converged": True, "advice": "", "parameters": {}, "steps": 12, "seconds": 1.0} | told | changes)
+    told: dict[str, Any] = {
+        "fit_error": {"red": 0.02, "green": 0.03},
+        "held_out_error": {"red": 0.05, "green": 0.07},
+        "held_out_error_se": {"red": 0.003, "green": 0.004},
+    }
+    return FitReport(**told | {"converged": True, "advice": "", "parameters": {}, "steps": 12, "seconds": 1.0} | changes)
 
 
 def test_the_error_is_the_mean_over_channels_with_its_standard_error() -> None:
@@ -47,7 +51,9 @@ def test_a_fit_that_stopped_early_did_not_converge_however_small_its_error() -> 
 
 def test_fitted_images_stand_in_where_none_was_held_out() -> None:
     verdict = verdict_of(report(held_out_error={}, held_out_error_se={}))
-    assert (verdict.error_of, verdict.error.value, verdict.error.se) == ("fitted", pytest.approx(0.025), None)
+    assert verdict.error_of == "fitted"
+    assert verdict.error.value == pytest.approx(0.025)
+    assert verdict.error.se is None
     assert verdict.headline == "Converged after 12 steps: fitted error 2.5 %."
 
 
@@ -56,7 +62,8 @@ def test_a_report_of_an_earlier_version_is_judged_without_standard_errors() -> N
     stored = json.loads(report(enamel_thickness=thickness).model_dump_json())
     earlier = {name: value for name, value in stored.items() if not name.endswith("_se")}
     verdict = verdict_of(FitReport.model_validate_json(json.dumps(earlier)))
-    assert (verdict.error.value, verdict.error.se) == (pytest.approx(0.06), None)
+    assert verdict.error.value == pytest.approx(0.06)
+    assert verdict.error.se is None
     assert verdict.enamel_thickness == thickness
 
 
