@@ -13,6 +13,7 @@ from services.core.errors import CaptureInputError, DentineError, JobCancelledEr
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
+from services.core.verdict import VERDICT, verdict_of
 from services.fit.identifiability import NOTHING
 from services.fit.numerics import NUMERICS, numerics_name
 from services.fit.stage import export, run
@@ -194,11 +195,19 @@ def test_a_checkpoint_of_other_numerics_is_not_continued(tmp_path: Path, monkeyp
 
 def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
     write_prepared(tmp_path)
-    report = fit(tmp_path, max_steps=1)
+    events: list[StageEvent] = []
+    report = fit(tmp_path, events=events, max_steps=1)
     assert not report.converged
     assert "max_steps" in report.advice
     manifest = export(spec_for(tmp_path, max_steps=1), LocalContext(tmp_path))
     assert (manifest.converged, manifest.advice) == (False, report.advice)
+    # One judgement, with what the renders leave open of its errors, in all that is stored and told.
+    verdict = verdict_of(report)
+    assert manifest.verdict == verdict
+    assert (events[-1].message, events[-1].data[VERDICT]) == (verdict.headline, verdict.model_dump(mode="json"))
+    assert json.loads((tmp_path / "errors.json").read_text())[VERDICT] == verdict.model_dump(mode="json")
+    assert set(report.held_out_error_se) == set(report.held_out_error) == set(verdict.channels)
+    assert min(report.held_out_error_se.values()) > 0
     assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
     page = (tmp_path / "report.html").read_text()
     assert page.index("did not converge") < page.index("Error on held-out images")
