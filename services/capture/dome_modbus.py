@@ -17,7 +17,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Self
 
@@ -32,6 +32,8 @@ from services.core.dome import DomeStatus
 from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError, RigUnreachableError
 
 REPLY_TIMEOUT_S = 0.5
+IDENTITY_TIMEOUT_S = 0.1
+"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and one that is late may be lit."""
 HANG_MARGIN_S = 2.0
 DARK_ATTEMPTS = 3
 
@@ -46,13 +48,13 @@ def all_off(host: str, port: int) -> DomeStatus:
     Raises:
         RigError: darkness could not be confirmed.
     """
-    link = ModbusLink(host, port, REPLY_TIMEOUT_S)
+    link, asker = ModbusLink(host, port, REPLY_TIMEOUT_S), ModbusLink(host, port, IDENTITY_TIMEOUT_S)
     problem: Exception | None = None
     try:
         for _ in range(DARK_ATTEMPTS):
             try:
-                with suppress(NoReplyError, RefusedError, WrongReplyError):
-                    _require_dome(link, repeated=False)
+                with suppress(NoReplyError, RefusedError, WrongReplyError), closing(asker):
+                    _require_dome(asker, repeated=False)
                 link.write(reg.ALL_OFF, [1])
                 link.write(reg.KEEPALIVE, [1, reg.STOPPED_MS])
                 status = _read_status(link)

@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from services.api.app import create_app
 from services.api.events import EventAddress
 from services.api.problems import status_of
 from services.api.tokens import Scope
+from services.capture import registers as reg
 from services.capture import stage
 from services.capture.console import Console
 from services.capture.dome import ExposureBudget
@@ -393,3 +395,18 @@ def test_of_two_all_offs_at_once_the_later_one_holds(shared_dome: Address, obser
         assert answer(number=6, do="light", light=0, level=0.1, on_s=1).code == "rig-stopped"
         assert lit(observer) == ()
         assert answer(number=8, do="light", light=0, level=0.1, on_s=1).code is None
+
+
+def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
+    late_s = 3.0
+    monkeypatch.setattr("services.capture.dome_modbus.REPLY_TIMEOUT_S", 4 * late_s)
+    # As the process does it, each command in a thread of its own.
+    with console(shared_dome) as answer, ThreadPoolExecutor(2) as threads:
+        assert threads.submit(answer, do="light", light=0, level=0.1, on_s=20).result().code is None
+        order_fault(*shared_dome, FaultKind.DELAY, round(1000 * late_s), on=reg.IDENTITY)
+        asked_s = time.monotonic()
+        off = threads.submit(answer, number=2, do="off")
+        wait_until(lambda: not observer.outputs().any())
+        assert time.monotonic() < asked_s + late_s, "it was dark only once the dome had said that it is one"
+        assert off.result().code is None
+        assert observer.status().stopped
