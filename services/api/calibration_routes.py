@@ -40,7 +40,6 @@ def build_calibrations_router(calibrations: Calibrations, captures: Captures) ->
     @router.get("/captures/{capture}/calibration", dependencies=[needs("read")])
     def of_capture(capture: str) -> Calibration:
         """The calibration that a committed capture brings along."""
-        description = captures.description(capture)
-        return Calibration(**{part: getattr(description, part) for part in Calibration.model_fields})
+        return captures.calibration(capture)
 
     return router

@@ -19,14 +19,14 @@ from pathlib import Path, PurePosixPath
 import sqlalchemy as sql
 
 from services.api.blobs import Blobs, Write, sync_folders
-from services.api.capture_contents import content_fault
 from services.api.capture_paths import TEXTS, require_paths
 from services.api.capture_records import CaptureDetail, CaptureFile, CapturePage, CaptureState, FileFault, UploadManifest
 from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
+from services.api.descriptions import CaptureReader, ReadHere
 from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.uploads import Uploads, upload_path
-from services.core.calibration import read_description
+from services.core.calibration import Calibration
 from services.core.errors import (
     CaptureStateError,
     CorruptUploadError,
@@ -36,7 +36,7 @@ from services.core.errors import (
     TooLargeError,
     UnknownCaptureError,
 )
-from services.core.records import FolderCapture, JobSpec
+from services.core.records import JobSpec
 from services.core.settings import UploadLimits
 
 FOLDER = "captures"
@@ -67,7 +67,9 @@ class Captures:
         now_s: Callable[[], float] = time.time,
         free_bytes: Callable[[], int] | None = None,
         write: Write = os.write,
+        reader: CaptureReader | None = None,
     ) -> None:
+        self._reader: CaptureReader = reader or ReadHere()
         self._limits, self._data, self._now_s = limits, data, now_s
         self._table, self._blobs, self._claims = CaptureTable(engine), Blobs(data, write), Claims()
         self.uploads = Uploads(self._table, self._blobs, self._claims, limits, now_s)
@@ -106,7 +108,7 @@ class Captures:
         missing = sum(file.bytes - file.received_bytes for file in files)
         return CaptureDetail(**found.model_dump(), path=f"{FOLDER}/{capture}", missing_bytes=missing, files=files)
 
-    def description(self, capture: str) -> FolderCapture:
+    def calibration(self, capture: str) -> Calibration:
         """What a committed capture says of its cameras and lights.
 
         Raises:
@@ -114,7 +116,7 @@ class Captures:
         """
         if (state := self._table.get(capture).state) is not CaptureState.COMMITTED:
             raise CaptureStateError(f"Capture {capture} is {state}; commit it first with POST /v1/captures/{capture}/commit.")
-        return read_description(self._data / FOLDER / capture)
+        return self._reader.describe(self._data / FOLDER / capture).calibration
 
     def page(self, limit: int, before: int | None = None, viewer: Viewer = LOCAL_VIEWER) -> CapturePage:
         """Newest captures first, of those that somebody may see."""
@@ -134,10 +136,9 @@ class Captures:
         if faults := [fault for row in rows if (fault := self._arrival_fault(row)) is not None]:
             return faults
         names = frozenset(row.file.path for row in rows)
-        for row in rows:
-            detail = content_fault(self._blobs.path(row.file.sha256), row.file.path, self._limits, names)
-            if detail is not None:
-                faults.append(FileFault(path=row.file.path, kind="refused", detail=detail))
+        files = [(self._blobs.path(row.file.sha256), row.file.path) for row in rows]
+        details = dict(self._reader.content_faults(files, self._limits, names))
+        faults = [FileFault(path=row.file.path, kind="refused", detail=details[row.file.path]) for row in rows if row.file.path in details]
         if not faults:
             with self._guard:
                 self.uploads.require_open(capture, or_committed=True)

@@ -9,12 +9,11 @@ from pathlib import Path
 
 from pydantic import Field
 
-from services.core.errors import StoreError
+from services.api.descriptions import Describe, describe, description_file
+from services.core.errors import DentineError
 from services.core.geometry import Record
-from services.core.records import CaptureManifest, FolderCapture, JobSpec
-from services.core.store import MANIFEST, open_stage
+from services.core.records import JobSpec
 
-LARGEST_DESCRIPTION_BYTES = 64 * 2**20
 DEMO_VALUES = 16_896
 """Of the demonstration: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
 _METHOD = ("kind", "boundary", "dentin", "loss", "solver", "prior", "stains", "lobes", "advise", "workers", "device")
@@ -34,16 +33,17 @@ class JobSize(Record):
         return math.log(self.pixels), math.log(self.samples), math.log(self.steps)
 
 
-def size_of(spec: JobSpec) -> JobSize | None:
+def size_of(spec: JobSpec, describe: Describe = describe) -> JobSize | None:
     """Size of a job from the description of its capture; None where that cannot be read."""
     if spec.is_demo:
         return _sized(spec, DEMO_VALUES)
     try:
-        path = _description(spec)
-        if path is None:
+        folder = spec.rig.mouth if spec.rig is not None else spec.capture
+        path = description_file(folder) if folder is not None else None
+        if path is None or folder is None:
             return None
-        images_px, channels = _images(path, path.stat().st_mtime_ns)
-    except (OSError, ValueError, KeyError, StoreError):
+        images_px, channels = _images(describe, folder, (path, path.stat().st_mtime_ns))
+    except (OSError, DentineError):
         return None
     return _sized(spec, images_px * (channels if spec.channels is None else len(spec.channels)))
 
@@ -58,19 +58,8 @@ def method_of(spec: JobSpec) -> str:
     return json.dumps(spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": spec.rig is not None}, sort_keys=True)
 
 
-def _description(spec: JobSpec) -> Path | None:
-    folder = spec.rig.mouth if spec.rig is not None else spec.capture
-    places = [] if folder is None else [folder / "capture.json", folder / MANIFEST, folder / "capture" / MANIFEST]
-    return next((path for path in places if path.is_file() and path.stat().st_size <= LARGEST_DESCRIPTION_BYTES), None)
-
-
 @lru_cache(maxsize=256)
-def _images(path: Path, _changed_ns: int) -> tuple[int, int]:
-    """Pixels of all images together, and channels."""
-    if path.name == MANIFEST:
-        description = open_stage(path.parent.parent, path.parent.name, CaptureManifest, verify=False)[1].description
-    else:
-        description = FolderCapture.model_validate_json(path.read_bytes())
-    pixels = {camera.name: camera.size[0] * camera.size[1] for camera in description.cameras}
-    seen = [image.camera for image in description.images] or [name for name in pixels for _ in description.lights]
-    return sum(pixels[name] for name in seen), len(description.channels)
+def _images(describe: Describe, folder: Path, _version: tuple[Path, int]) -> tuple[int, int]:
+    """Pixels of all images together, and channels; known of a description whose file and time of change are the same."""
+    found = describe(folder)
+    return found.image_px, len(found.calibration.channels)

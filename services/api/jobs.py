@@ -23,6 +23,7 @@ from services.api.light_limits import LightLimits
 from services.api.machine_class import machine_class
 from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.pipeline import request_cancel, stages_of
+from services.api.reading import ReadApart
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
 from services.api.server_paths import ServerPaths
@@ -66,13 +67,14 @@ class Jobs:
         self.repository = Repository(keep_password_apart(settings.database_url, self._data))
         if settings.database is not None:
             require_own_folder(self.repository.engine, self._data)
-        self.captures = Captures(self.repository.engine, self._data, settings.uploads)
+        self.reader = ReadApart()
+        self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
         self.calibrations = Calibrations(self._data)
         self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
         self._admission = Admission(lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks)
         places, running = settings.jobs_at_once, lambda: self._admission.sharing
-        self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running)
+        self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running, self.reader.describe)
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
             return run(self._light_limits.lowered(spec), folder, events)
@@ -92,6 +94,7 @@ class Jobs:
     def close(self) -> None:
         """Stop the running jobs cooperatively; they stay queued and resume when the server starts again."""
         self._runner.close()
+        self.reader.close()
         self.repository.close()
 
     def take_turn(self, job_id: str) -> None:

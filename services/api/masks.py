@@ -13,11 +13,11 @@ from services.api.jobs import Jobs
 from services.api.lifecycle import JobState
 from services.api.mask_images import picture_of, require_mask
 from services.api.repository import Job
-from services.core.calibration import read_description
+from services.core.calibration import Calibration
 from services.core.errors import JobStateError, UnknownMaskError
 from services.core.geometry import Camera, Record
 from services.core.masks import ALL_LIGHTS, LONGEST_NAME, is_stale, mask_path, read_masks
-from services.core.records import FolderCapture, PreparedManifest
+from services.core.records import PreparedManifest
 from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
 _AT_WORK = frozenset({JobState.RUNNING, JobState.CANCELLING, JobState.DELETING})
@@ -104,7 +104,7 @@ class Masks:
         return picture_of(valid[cameras.index(camera), lights.index(light), :height, :width].astype(np.uint8))
 
     def _camera(self, job: Job, camera: str, light: str) -> Camera:
-        description = self._description(job)
+        description = self._calibration(job)
         found = next((one for one in description.cameras if one.name == camera), None)
         lights = [one.name for one in description.lights]
         if found is None or light not in {*lights, ALL_LIGHTS}:
@@ -114,12 +114,12 @@ class Masks:
             raise UnknownMaskError(f"The names of camera {camera} and light {light} are too long for a mask; shorten them in the capture.")
         return found
 
-    def _description(self, job: Job) -> FolderCapture:
+    def _calibration(self, job: Job) -> Calibration:
         spec, root = self._jobs.locate(job.spec), self._jobs.folder(job.id)
         if spec.capture is not None:
-            return read_description(spec.capture)
+            return self._jobs.reader.describe(spec.capture).calibration
         assert spec.rig is not None
-        return read_description(root if is_published(root, "capture") else spec.rig.mouth)
+        return self._jobs.reader.describe(root if is_published(root, "capture") else spec.rig.mouth).calibration
 
     def _require_rest(self, job: Job) -> None:
         if (state := self._jobs.repository.get(job.id).state) in _AT_WORK:

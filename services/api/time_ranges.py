@@ -13,6 +13,7 @@ from typing import Self
 from pydantic import Field
 
 from services.api.admission import turn
+from services.api.descriptions import Describe, describe
 from services.api.events import Begun, EventLog, JobEvent
 from services.api.forecast import LEAST, Observation, foresee
 from services.api.job_size import method_of, size_of
@@ -122,6 +123,7 @@ class TimeRanges:
         machine: class of the machine that runs jobs; None where that is not known before they do.
         places: most jobs that run side by side.
         running: how many share the workers now.
+        describe: reads what a capture says of itself.
     """
 
     def __init__(
@@ -132,13 +134,14 @@ class TimeRanges:
         machine: str | None,
         places: int = 1,
         running: Callable[[], int] = lambda: 1,
+        describe: Describe = describe,
     ) -> None:
         self._repository, self._locate, self._waits_for, self._machine = repository, locate, waits_for, machine
-        self._places, self._running = places, running
+        self._places, self._running, self._describe = places, running, describe
 
     def learn(self, job: Job, beside: float = 1.0) -> None:
         """Remember how a job went that has succeeded, and how many on average ran while it did."""
-        if (size := size_of(self._locate(job.spec))) is not None:
+        if (size := size_of(self._locate(job.spec), self._describe)) is not None:
             self._repository.past_runs.record(job.id, method_of(job.spec), size, beside)
 
     def of(self, job: Job) -> TimeRange | None:
@@ -167,7 +170,7 @@ class TimeRanges:
         position = _position(job, stages.latest, self._repository.events_of(job.id))
         if position is None:
             return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
-        size = size_of(self._locate(job.spec))
+        size = size_of(self._locate(job.spec), self._describe)
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
         machine = (stages.started.data.get("machine") if stages.started is not None else self._machine) or past.newest_machine

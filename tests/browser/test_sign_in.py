@@ -15,6 +15,7 @@ from services.api.tokens import Scope
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec
 from tests.browser.contrast import contrast_failures
+from tests.browser.pages import looked_at
 from tests.support.guarded_server import Guarded, guarded
 
 pytestmark = pytest.mark.browser
@@ -83,12 +84,28 @@ def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: P
     assert page.context.cookies() == []
 
 
-def test_a_reader_is_told_why_a_retry_is_refused(page: Page, server: Guarded) -> None:
-    server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED})
+@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
+def test_a_reader_is_shown_nothing_that_he_may_not_press(page: Page, server: Guarded, request: pytest.FixtureRequest) -> None:
+    failed = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED}).json()["id"]
     page.goto("/")
     sign_in(page, server.tokens[Scope.READ])
-    page.get_by_role("button", name="Retry").click()
-    expect(page.get_by_role("alert").last).to_have_text("This needs scope 'submit', which token of-read does not have; use a token with that scope.")
+    page.goto(f"/#/{failed}")
+    expect(page.locator(".job .badge")).to_have_text("failed")
+    expect(page.get_by_role("link", name="Download all (zip)")).to_be_visible()
+    for name in ("Retry", "Cancel", "Name…", "Delete…"):
+        expect(page.get_by_role("button", name=name)).to_have_count(0)
+    for name in ("New job", "Dome"):
+        expect(page.get_by_role("link", name=name)).to_have_count(0)
+    looked_at(page, f"reader-{request.node.callspec.params['page']}")
+    for address, lacking in (("#/new", "submit"), ("#/rig", "submit"), ("#/submit", "submit"), ("#/dome", "operate-dome")):
+        page.goto(f"/{address}")
+        expect(page.get_by_role("alert")).to_contain_text(f"the scope {lacking}.")
+        expect(page.locator("main button, main input")).to_have_count(0)
+    page.goto(f"/#/{failed}")
+    expect(page.locator(".job .badge")).to_have_text("failed")
+    page.get_by_role("button", name="Sign out").click()
+    sign_in(page, server.tokens[Scope.SUBMIT])
+    expect(page.get_by_role("button", name="Retry")).to_be_visible()
 
 
 def test_a_revoked_token_brings_the_form_back(page: Page, server: Guarded) -> None:

@@ -5,7 +5,7 @@ import { DomeView } from "./domeView";
 import { element, find } from "./element";
 import { JobList } from "./jobList";
 import { JobView } from "./jobView";
-import { NEW, NewJobView, RIG } from "./newJobView";
+import { NEW, NewJobView, RIG, SUBMIT } from "./newJobView";
 import { RigView } from "./rigView";
 import { SetupView, tokenCard } from "./setupView";
 import { SignIn } from "./signIn";
@@ -41,6 +41,12 @@ let isSignedOut = false;
 /** Whether the next refresh opens the address: nothing was opened yet, or what was failed in a way that may pass. */
 let isViewDue = true;
 let isAccountDue = true;
+/** Settled once it is known what the token may do, or that this cannot be known now. */
+let accountShown: Promise<void> = Promise.resolve();
+/** How often an address was opened, so that an older opening gives way to a newer one. */
+let openings = 0;
+/** Null until the server has told. */
+let session: Session | null = null;
 /** Whether the server asks nobody for a token. */
 let isOpenServer = false;
 let unkept: HTMLElement | null = null;
@@ -62,7 +68,7 @@ async function refreshList(): Promise<void> {
   try {
     const newest = await list.refresh();
     listTrouble = "";
-    if (isAccountDue) void showAccount();
+    if (isAccountDue) accountShown = showAccount();
     if (isViewDue && !isOfPage(location.hash)) history.replaceState(null, "", newest ? `#/${newest}` : NEW);
     if (isViewDue) void open();
   } catch (problem) {
@@ -81,7 +87,16 @@ async function open(): Promise<void> {
   mark(newLink, location.hash === NEW);
   if (!isViewDue) show();
   isViewDue = false;
-  const opened = viewOf(location.hash, id);
+  const hash = location.hash;
+  const turn = ++openings;
+  await accountShown;
+  if (turn !== openings || isSignedOut) return;
+  const lacking = lackingFor(hash);
+  if (lacking) {
+    showProblem(lacking);
+    return;
+  }
+  const opened = viewOf(hash, id);
   if (!opened) {
     showProblem(`No job has the address ${location.hash}; choose one from the list.`);
     return;
@@ -99,6 +114,19 @@ async function open(): Promise<void> {
   }
 }
 
+/** Whether the token may do something; while that is not known, the server's answer tells. */
+function may(scope: string): boolean {
+  return session === null || session.is_open || session.scopes.includes("admin") || session.scopes.includes(scope);
+}
+
+/** Why nothing of an address is shown, as its every button would be refused; empty if some may be pressed. */
+function lackingFor(hash: string): string {
+  if (hash === DOME && !may("operate-dome")) return "This token may not work the dome; sign in with one that has the scope operate-dome.";
+  const submits = hash === NEW || hash === RIG || hash.startsWith(`${SUBMIT}/`) || hash === SUBMIT;
+  if (submits && !may("submit")) return "This token may look at jobs and submit none; choose a job from the list, or sign in with one that has the scope submit.";
+  return "";
+}
+
 /** What an address names; null if nothing. */
 function viewOf(hash: string, id: string): View | null {
   if (hash === DOME) return new DomeView(showViewConnection, () => isOpenServer);
@@ -106,7 +134,7 @@ function viewOf(hash: string, id: string): View | null {
   if (hash === RIG) return new RigView();
   const source = hash.match(/^#\/submit(?:\/(\w+))?$/);
   if (source) return new SubmitView(source[1] ?? "");
-  return id ? new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection) : null;
+  return id ? new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection, may("submit")) : null;
 }
 
 function mark(link: HTMLAnchorElement, isHere: boolean): void {
@@ -155,7 +183,6 @@ function hideAll(): void {
 
 async function showAccount(): Promise<void> {
   isAccountDue = false;
-  let session: Session;
   try {
     session = await getSession();
   } catch (problem) {
@@ -163,7 +190,6 @@ async function showAccount(): Promise<void> {
     isAccountDue = mayPass(problem);
     return;
   }
-  const may = (scope: string) => session.is_open || session.scopes.includes("admin") || session.scopes.includes(scope);
   isOpenServer = session.is_open;
   domeLink.hidden = !may("operate-dome");
   newLink.hidden = !may("submit");
@@ -199,9 +225,10 @@ async function start(): Promise<void> {
   isSignedOut = false;
   isViewDue = true;
   isAccountDue = true;
+  session = null;
   jobs.hidden = false;
   workers.hidden = false;
-  newLink.hidden = false;
+  newLink.hidden = true;
   show();
   await refreshList();
   if (isSignedOut) return;

@@ -26,6 +26,8 @@ export class JobActions {
   constructor(
     private readonly id: string,
     private readonly then: Consequences,
+    /** Whether the page's token may change anything; else only the download is shown. */
+    private readonly mayChange: boolean,
   ) {
     this.download.href = archiveUrl(id);
     this.act.addEventListener("click", () => void this.cancelOrRetry());
@@ -36,9 +38,10 @@ export class JobActions {
   show(job: Job): void {
     this.job = job;
     const hasEnded = ENDED.includes(job.state);
-    this.act.hidden = job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
+    this.rename.hidden = !this.mayChange;
+    this.act.hidden = !this.mayChange || job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
     this.act.textContent = hasEnded ? "Retry" : "Cancel";
-    this.remove.hidden = !hasEnded;
+    this.remove.hidden = !this.mayChange || !hasEnded;
     this.download.hidden = !hasEnded;
   }
 

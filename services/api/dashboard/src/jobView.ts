@@ -54,6 +54,7 @@ export class JobView {
     private readonly onChange: () => void,
     onDeleted: () => void,
     private readonly onConnection: (open: boolean) => void,
+    mayChange: boolean,
   ) {
     this.comparison = new Comparison(id);
     this.failure.hidden = true;
@@ -61,7 +62,8 @@ export class JobView {
     this.filesRefusal.hidden = true;
     this.report.hidden = true;
     this.report.href = artifactUrl(id, "report.html");
-    this.actions = new JobActions(id, { changed: (job, again) => this.changed(job, again), deleted: onDeleted, refused: (problem) => this.refuse(problem) });
+    const then = { changed: (job: Job, again: boolean) => this.changed(job, again), deleted: onDeleted, refused: (problem: unknown) => this.refuse(problem) };
+    this.actions = new JobActions(id, then, mayChange);
   }
 
   /** Fill the view and follow the job until `stop`. */
