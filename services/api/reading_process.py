@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import resource
 import sys
 from pathlib import Path
@@ -22,13 +21,10 @@ from services.core.settings import UploadLimits
 
 GROWN_BYTES = 64 * 2**20
 """Whoever has taken so much more than at its start ends after its answer, as the memory of what was parsed stays with the process."""
-NICE = 5
-"""Its priority: a commit may wait, ALL OFF may not."""
 
 
 def main(most_bytes: int) -> None:
     """Answer requests until the pipe is closed."""
-    os.nice(NICE)
     _bound(most_bytes)
     start_bytes = _peak_bytes()
     for line in sys.stdin.buffer:

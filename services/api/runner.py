@@ -16,6 +16,7 @@ from services.api.lifecycle import JobState, Trigger
 from services.api.logs import log_context
 from services.api.pipeline import first_stage, request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
+from services.api.server_paths import told_without_folders
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 from services.core.stage import StageName
@@ -226,6 +227,9 @@ class Runner:
             logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
+        if failure is not None:
+            told = told_without_folders(failure.message, self._locate(job.spec), self._folder("").parent)
+            failure = failure.model_copy(update={"message": told})
         self._settle(lease, trigger, failure)
 
     def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:

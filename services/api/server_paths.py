@@ -63,6 +63,21 @@ def without_folders(spec: JobSpec) -> JobSpec:
     return spec.model_copy(update=changes) if changes else spec
 
 
+def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
+    """A sentence about a job without the folders on the server that its files lie in: those who read it need not be those who may name them.
+
+    Args:
+        located: the job's options with the files of what the server stores.
+        data: the server's own folder, in which ``captures/ID`` and ``jobs/ID`` are as everybody calls them.
+    """
+    named = (located.capture, located.calibration, located.rig.mouth if located.rig is not None else None)
+    folders = [path.parent for path in named if path is not None and path.is_absolute() and not path.is_relative_to(data)]
+    for folder in sorted({data, *folders}, key=lambda one: len(str(one)), reverse=True):
+        if folder != folder.parent:
+            text = text.replace(f"{folder}/", "")
+    return text
+
+
 def _resolved(path: Path) -> Path | None:
     # With all links followed; None for what cannot be a path, such as a loop of links.
     try:

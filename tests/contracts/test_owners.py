@@ -13,6 +13,8 @@ import pytest
 
 from services.api.guard import LIVENESS, SETUP, guarded_routes
 from services.api.tokens import Scope
+from services.core.errors import CaptureInputError
+from services.core.records import JobSpec
 from services.core.settings import RateSettings
 from tests.support.guarded_server import Guarded, guarded, make_token
 from tests.support.uploading import TUS, announce, contents_of, manifest_of, send, upload_capture, write_capture
@@ -44,7 +46,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     data, folder = tmp_path_factory.mktemp("data"), write_capture(tmp_path_factory.mktemp("capture"))
     tokens = {(whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group) for whose, group in GROUPS.items() for scope in Scope}
     with guarded(data, run_to_report, rates=RateSettings(refusals_per_minute=10_000)) as server:
-        with httpx.Client(base_url=server.client.base_url, headers={"Authorization": f"Bearer {tokens['own', Scope.SUBMIT]}"}) as own:
+        with httpx.Client(base_url=server.client.base_url, headers={"Authorization": f"Bearer {tokens['own', Scope.SUBMIT]}"}, timeout=60) as own:
             capture = upload_capture(own, contents_of(folder))
             jobs = [own.post("/v1/jobs", json={"capture": f"captures/{capture}", "seed": seed}).json()["id"] for seed in (1, 2)]
             for job in jobs:
@@ -116,7 +118,9 @@ def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     made = {}
     for whose in GROUPS:
-        with httpx.Client(base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"}) as client:
+        with httpx.Client(
+            base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"}, timeout=60
+        ) as client:
             capture = upload_capture(client, contents)
             job = client.post("/v1/jobs", json={"capture": f"captures/{capture}"}, headers={"Idempotency-Key": "one"})
             assert job.status_code == 201, job.text
@@ -161,7 +165,7 @@ def _base64(text: str) -> str:
 def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_here(fresh: House, tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     own, other = (
-        httpx.Client(base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"})
+        httpx.Client(base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"}, timeout=60)
         for whose in ("own", "other")
     )
     with own, other:
@@ -187,7 +191,11 @@ def test_folders_of_the_server_are_for_those_who_may_name_them(tmp_path: Path) -
     for folder in (root, beside):
         write_capture(folder / "mouth")
     (root / "way-out").symlink_to(beside)
-    with guarded(data, run_to_report, job_roots=f"{root}, {tmp_path / 'data' / 'jobs'}") as server:
+
+    def run(spec: JobSpec, folder: Path, _events: object) -> None:
+        raise CaptureInputError(f"{spec.capture}/capture.json: units: wrong, see {folder}/report.html.")
+
+    with guarded(data, run, job_roots=f"{root}, {tmp_path / 'data' / 'jobs'}") as server:
         taken = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": str(root / "mouth")})
         assert taken.status_code == 201, taken.text
         names = (beside / "mouth", beside / "absent", root / ".." / "beside" / "mouth", root / "way-out" / "mouth", data / "jobs", "/etc/passwd\0")
@@ -206,6 +214,10 @@ def test_folders_of_the_server_are_for_those_who_may_name_them(tmp_path: Path) -
             assert (listed, server.ask("GET", f"/v1/jobs/{job}", scope).json()["spec"]["capture"]) == (shown, shown)
             found = {text: len(server.ask("GET", "/v1/jobs", scope, params={"capture": text}).json()["jobs"]) for text in ("MOUTH", "captures-root")}
             assert found == {"MOUTH": 1, "captures-root": int(scope is not Scope.READ)}
+        events = server.ask("GET", f"/v1/jobs/{job}/events", Scope.READ).text
+        failure = server.ask("GET", f"/v1/jobs/{job}", Scope.READ).json()["failure"]["message"]
+        assert failure == f"mouth/capture.json: units: wrong, see jobs/{job}/report.html."
+        assert str(tmp_path) not in events
 
 
 def test_without_roots_a_server_with_tokens_takes_no_folder(tmp_path: Path) -> None:
