@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo bom deploy-test deploy-check manifests gallery figures test test-all faults contracts roles bare-test lint bench dashboard setup
+.PHONY: demo bom deploy-test deploy-check manifests gallery figures test test-all faults contracts attacks roles bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 
@@ -28,6 +28,10 @@ contracts: ## ten thousand requests generated from the API's description, on SQL
 	@deploy/setup.sh
 	@$(BIN)/python -m tests.contracts.generated_requests --json contracts-sqlite.json
 	@$(BIN)/python -m tests.contracts.generated_requests --database postgres --json contracts-postgres.json
+
+attacks: ## every attack that is tried on the service, and their table in services/api/ATTACKS.md, some minutes
+	@deploy/setup.sh
+	@$(BIN)/python -m tests.contracts.attack_list --json attacks.json
 
 roles: ## every part of the service in a virtual environment of its own, and a small job through them, some minutes; installs from the package index
 	@deploy/setup.sh

@@ -79,7 +79,9 @@ class Jobs:
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
             return run(self._light_limits.lowered(spec), folder, events)
 
-        self._runner = Runner(self.repository, self.folder, self.locate, run_within_limits, self._admission, self._tidy, self._time_ranges.learn)
+        self._runner = Runner(
+            self.repository, self.folder, self.locate, run_within_limits, self._admission, self._tidy, self._time_ranges.learn, self.server_paths.tell
+        )
         self._is_alone = settings.database is None
         self._deleting = threading.Lock()
 

@@ -33,26 +33,25 @@ MAX_ANSWER_BYTES = 4 * 2**20
 BATCH = 256
 """Files of which only headers are read that are asked for at once."""
 _PARSED = frozenset({".json"})
-_KEPT_ENVIRONMENT = ("PATH", "PYTHONPATH", "PYTHONHOME", "LANG", "LC_ALL", "TMPDIR")
-"""Nothing of the server's own goes along, such as a token or a database's password."""
 
 
-class CostlyFileError(CaptureInputError):
-    """A file could not be read within the bounds."""
+class CostlyFileError(Exception):
+    """A file could not be read within the bounds; the message is a sentence."""
 
 
 class ReadingProcess:
     """One of them, asked by one thread at a time."""
 
     def __init__(self) -> None:
-        kept = {name: value for name in _KEPT_ENVIRONMENT if (value := os.environ.get(name)) is not None}
+        # Nothing of the server's environment goes along, such as a token or a database's password.
+        environment = {"PATH": os.defpath, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1", "OPENBLAS_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "services.api.reading_process", str(MAX_BYTES)]
         self._process = subprocess.Popen(  # noqa: S603
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=kept | {"OPENBLAS_NUM_THREADS": "1"},
+            env=environment,
             start_new_session=True,
         )
         self.close = weakref.finalize(self, _end, self._process)
@@ -105,7 +104,7 @@ class ReadApart:
             try:
                 answer = self._ask({"files": asked, "limits": limits.model_dump(), "names": sorted(names) if is_parsed else []}, name)
             except CostlyFileError as problem:
-                yield name, problem.message
+                yield name, str(problem)
                 return
             yield from ((name, fault) for (_, name), fault in zip(batch, answer["faults"], strict=True) if fault is not None)
 
@@ -113,9 +112,12 @@ class ReadApart:
         """What a capture says of itself; see ``descriptions``.
 
         Raises:
-            CostlyFileError: it could not be told within the bounds. CaptureInputError, CorruptStoreError: it cannot be read.
+            CaptureInputError, CorruptStoreError: it cannot be read, or not within the bounds.
         """
-        return Described.model_validate(self._ask({"capture": str(capture)}, str(capture))["described"])
+        try:
+            return Described.model_validate(self._ask({"capture": str(capture)}, str(capture))["described"])
+        except CostlyFileError as problem:
+            raise CaptureInputError(str(problem)) from problem
 
     def close(self) -> None:
         """End all that read nothing; the others end with what they read."""

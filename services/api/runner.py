@@ -16,7 +16,6 @@ from services.api.lifecycle import JobState, Trigger
 from services.api.logs import log_context
 from services.api.pipeline import first_stage, request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
-from services.api.server_paths import told_without_folders
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, JobStateError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 from services.core.stage import StageName
@@ -43,6 +42,7 @@ class Runner:
         locate: a job's options with the folder of an uploaded capture.
         on_round: called every so often.
         on_success: called with a job that has succeeded, and how many on average ran while it did.
+        tell: why a job failed, as those who look at jobs may read it.
     """
 
     def __init__(
@@ -54,7 +54,9 @@ class Runner:
         admission: Admission,
         on_round: Callable[[], None],
         on_success: Callable[[Job, float], None],
+        tell: Callable[[str, JobSpec], str] = lambda sentence, _: sentence,
     ) -> None:
+        self._tell = tell
         self._repository, self._folder, self._locate, self._run, self._admission = repository, folder, locate, run, admission
         self._on_round, self._on_success = on_round, on_success
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
@@ -228,8 +230,7 @@ class Runner:
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
             trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
         if failure is not None:
-            told = told_without_folders(failure.message, self._locate(job.spec), self._folder("").parent)
-            failure = failure.model_copy(update={"message": told})
+            failure = failure.model_copy(update={"message": self._tell(failure.message, self._locate(job.spec))})
         self._settle(lease, trigger, failure)
 
     def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:

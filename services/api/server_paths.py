@@ -51,6 +51,10 @@ class ServerPaths:
         if resolved is None or not _is_there(path):
             raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
 
+    def tell(self, sentence: str, located: JobSpec) -> str:
+        """Why a job failed, without the server's folders where some of those who read it may not name them."""
+        return sentence if self._roots is None else told_without_folders(sentence, located, self._data)
+
     def _is_allowed(self, path: Path) -> bool:
         return not path.is_relative_to(self._data) and any(path.is_relative_to(root) for root in self._roots or ())
 

@@ -82,6 +82,7 @@ def told(answer: httpx.Response, ids: Mapping[str, str], receipt: str) -> tuple[
     return answer.status_code, text, headers
 
 
+@pytest.mark.attack("routes × scopes", "every route × every scope × whose job, receipt or capture")
 def test_every_route_with_every_scope_for_every_owner(house: House) -> None:
     table = operations(house)
     assert len(table) > 20
@@ -114,6 +115,7 @@ def fresh(tmp_path: Path) -> Iterator[House]:
         yield House(server, tokens, {}, "")
 
 
+@pytest.mark.attack("routes × scopes", "lists, event streams, and jobs on what others own")
 def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     made = {}
@@ -162,6 +164,7 @@ def _base64(text: str) -> str:
     return base64.b64encode(text.encode()).decode()
 
 
+@pytest.mark.attack("uploads", "another's content by its SHA-256 alone")
 def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_here(fresh: House, tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     own, other = (
@@ -186,6 +189,7 @@ def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_h
         assert (again["state"], again["missing_bytes"]) == ("committed", 0)  # whose content was not taken away
 
 
+@pytest.mark.attack("traversal", "a job on a folder outside the roots, by '..', by a link, or in the data folder")
 def test_folders_of_the_server_are_for_those_who_may_name_them(tmp_path: Path) -> None:
     root, beside, data = tmp_path / "captures-root", tmp_path / "beside", tmp_path / "data"
     for folder in (root, beside):
@@ -220,6 +224,7 @@ def test_folders_of_the_server_are_for_those_who_may_name_them(tmp_path: Path) -
         assert str(tmp_path) not in events
 
 
+@pytest.mark.attack("traversal", "a job on any folder of a server that names no root")
 def test_without_roots_a_server_with_tokens_takes_no_folder(tmp_path: Path) -> None:
     write_capture(tmp_path / "mouth")
     with guarded(tmp_path / "data", job_roots="") as server:
@@ -227,6 +232,7 @@ def test_without_roots_a_server_with_tokens_takes_no_folder(tmp_path: Path) -> N
         assert (refused.status_code, "JOB_ROOTS" in refused.json()["detail"]) == (422, True)
 
 
+@pytest.mark.attack("tokens", "a copied cookie after signing out")
 def test_a_session_that_was_signed_out_opens_nothing(tmp_path: Path) -> None:
     with guarded(tmp_path) as server:
         cookie, other = ({"Cookie": server.ask("POST", "/v1/session", Scope.READ).headers["set-cookie"].split(";")[0]} for _ in range(2))
@@ -239,6 +245,7 @@ def test_a_session_that_was_signed_out_opens_nothing(tmp_path: Path) -> None:
         assert server.ask("GET", "/v1/jobs", Scope.READ).status_code == 200
 
 
+@pytest.mark.attack("cross-site", "a report inside another page")
 def test_a_report_is_shown_inside_no_other_page(house: House) -> None:
     answer = house.ask("GET", f"/v1/jobs/{house.ids['job_id']}/artifacts/report.html", "other", Scope.ADMIN)
     assert answer.status_code in {200, 404}  # the table above may have deleted the job

@@ -44,6 +44,7 @@ def listening() -> set[int]:
     return {one.laddr.port for process in those for one in process.net_connections("tcp") if one.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.attack("Dask and files as another user", "every port of the workers, as another user")
 def test_whoever_shows_no_certificate_is_refused_on_every_port() -> None:
     before = listening()
     with Workers() as workers, workers.serving(2) as client:
@@ -69,6 +70,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
         os.umask(before)
 
 
+@pytest.mark.attack("Dask and files as another user", "files of the service and its workers")
 def test_what_the_service_and_its_workers_write_is_for_its_user_alone(served: tuple[httpx.Client, Path], tmp_path: Path) -> None:
     client, data = served
     capture = upload_capture(client, contents_of(write_capture(tmp_path / "capture")))
@@ -80,6 +82,7 @@ def test_what_the_service_and_its_workers_write_is_for_its_user_alone(served: tu
     assert [str(path) for path in written if stat.S_IMODE(path.lstat().st_mode) & 0o077] == []
 
 
+@pytest.mark.attack("Dask and files as another user", "files of workers of their own")
 def test_what_is_started_for_dask_inherits_a_private_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     masks: list[int] = []
     before = os.umask(0o022)
@@ -106,6 +109,7 @@ def half_open(address: httpx.URL, count: int) -> list[socket.socket]:
     return opened
 
 
+@pytest.mark.attack("exhaustion", "more half-open connections than there are places")
 def test_half_open_connections_keep_nobody_from_all_off(served: tuple[httpx.Client, Path]) -> None:
     client, _ = served
     opened = half_open(client.base_url, 3 * PLACES)
@@ -128,6 +132,7 @@ def is_closed(connection: socket.socket) -> bool:
         return True
 
 
+@pytest.mark.attack("exhaustion", "a head that never ends")
 def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(served: tuple[httpx.Client, Path]) -> None:
     client, _ = served
     began = time.monotonic()
@@ -147,6 +152,7 @@ def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(se
     assert answer.startswith((b"HTTP/1.1 408", b"closed")), answer
 
 
+@pytest.mark.attack("exhaustion", "a log that grows by an accept without descriptors")
 def test_a_lack_of_descriptors_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     async def run_out() -> int:
         loop, crowd = asyncio.get_running_loop(), Crowd(ConnectionLimits())

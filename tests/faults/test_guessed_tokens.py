@@ -15,6 +15,7 @@ LIMIT = 50
 
 
 @pytest.mark.parametrize("guesses", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.attack("tokens", "guessing")
 def test_guesses_never_pass_and_a_valid_token_does(tmp_path: Path, guesses: int) -> None:
     with guarded(tmp_path, rates=RateSettings(refusals_per_minute=LIMIT)) as server:
         known = list(server.tokens.values())

@@ -161,6 +161,7 @@ def test_a_receiver_that_fails_is_tried_again_under_the_same_id(service: Service
     assert service.webhooks.get(webhook.id).failing_since_s is None
 
 
+@pytest.mark.attack("webhooks", "a redirect")
 def test_a_redirect_is_not_followed(service: Service) -> None:
     with receiving(302, 307) as receiver, service.sending():
         webhook = service.subscribe(receiver.url)
@@ -170,6 +171,7 @@ def test_a_redirect_is_not_followed(service: Service) -> None:
     assert [headers[":path"] for headers, _ in receiver.received] == ["/"]
 
 
+@pytest.mark.attack("webhooks", "a receiver that never answers")
 def test_a_receiver_that_hangs_does_not_hold_up_others(service: Service) -> None:
     with receiving(0) as hanging, receiving() as prompt, service.sending(total_s=1.0):
         slow, quick = service.subscribe(hanging.url), service.subscribe(prompt.url)
@@ -189,6 +191,7 @@ def test_nobody_there_is_an_error_in_the_log(service: Service) -> None:
         assert service.wait_for_tries(webhook, 1).attempts[0].error == "The receiver could not be reached (ConnectError)."
 
 
+@pytest.mark.attack("webhooks", "a name that leads inside once it is checked")
 def test_a_name_that_leads_inside_is_not_connected_to(service: Service) -> None:
     """The subscription is old, the name was public then; what counts is where it leads now."""
     with receiving() as receiver, service.sending(AddressPolicy()):
@@ -200,6 +203,7 @@ def test_a_name_that_leads_inside_is_not_connected_to(service: Service) -> None:
     assert receiver.received == []
 
 
+@pytest.mark.attack("webhooks", "a certificate of another name")
 def test_a_certificate_must_prove_the_name_though_the_address_is_connected_to(service: Service) -> None:
     """Trusted and named rightly; then signed by nobody known; then for another name."""
     certified = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -89,6 +89,7 @@ def occupy(address: str, job: str) -> ExitStack:
         return connections.pop_all()
 
 
+@pytest.mark.attack("exhaustion", "every thread of the server hanging")
 def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hanging: Hanging) -> None:
     begun, go = threading.Event(), threading.Event()
     with simulated_dome(LIGHTS, 10.0) as (host, port):
@@ -184,6 +185,7 @@ def many(item: object) -> str:
         ("PUT", "/v1/calibrations/x", f'{{"units": "mm", "channels": [], "lights": [], "cameras": {many({})}}}'),
     ],
 )
+@pytest.mark.attack("exhaustion", "a body of hundreds of thousands of faults")
 def test_a_body_of_many_faults_is_refused_at_its_first_ones(loop_server: Looped, method: str, path: str, body: str) -> None:
     listed = loop_server.listed
     answer = loop_server.client.request(method, path, content=body, headers={"Content-Type": "application/json"})
@@ -211,6 +213,7 @@ WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
 
 
 @pytest.mark.parametrize(("place", "method", "path", "sent"), WAITS_FOR_THE_LOOP, ids=[place for place, *_ in WAITS_FOR_THE_LOOP])
+@pytest.mark.attack("exhaustion", "the event loop held up by a parser")
 def test_the_loop_goes_on_while_something_is_parsed_read_or_written(
     loop_server: Looped, monkeypatch: pytest.MonkeyPatch, place: str, method: str, path: str, sent: dict[str, Any]
 ) -> None:

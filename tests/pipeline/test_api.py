@@ -182,6 +182,7 @@ def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str
         "a%00b",
     ],
 )
+@pytest.mark.attack("traversal", "an artifact's path that leads out of the job's folder")
 def test_no_path_leads_out_of_the_artifacts(serve: Any, capture_folder: str, tmp_path: Path, path: str) -> None:
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
@@ -191,6 +192,7 @@ def test_no_path_leads_out_of_the_artifacts(serve: Any, capture_folder: str, tmp
     assert client.get(f"/v1/jobs/{job_id}/artifacts/{path}").status_code == 404
 
 
+@pytest.mark.attack("cross-site", "another origin or host name (DNS rebinding)")
 def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str) -> None:
     client = serve()
     foreign = client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": "http://elsewhere.example"})
@@ -199,6 +201,7 @@ def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str
     assert client.get("/v1/jobs", headers={"Host": "elsewhere.example"}).status_code == 400
 
 
+@pytest.mark.attack("cross-site", "a script in the page or in a report")
 def test_pages_carry_a_strict_policy(serve: Any) -> None:
     headers = serve().get("/").headers
     assert "default-src 'none'" in headers["content-security-policy"]

@@ -69,6 +69,7 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
     return found
 
 
+@pytest.mark.attack("routes × scopes", "a route that declares no scope")
 def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
     declared = {f"{method} {template}": scope for method, template, scope in operations(create_app(ServerSettings(data=tmp_path)))}
     assert len(declared) > len(KNOWN_SCOPES)
@@ -84,6 +85,7 @@ def test_the_walk_sees_every_route_that_is_described(tmp_path: Path) -> None:
             assert bool(operation.get("security")) is (path not in {LIVENESS, SETUP})
 
 
+@pytest.mark.attack("routes × scopes", "every route without a token and with each scope")
 def test_every_route_with_every_scope(server: Guarded) -> None:
     for method, template, scope in operations(server.app):
         path = re.sub(r"{\w+}", "none", template)
@@ -112,6 +114,7 @@ def test_liveness_and_the_page_need_no_token(server: Guarded) -> None:
 @pytest.mark.parametrize(
     ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("GET", "/v1/jobs/", 404), ("PUT", "/v1/jobs", 405), ("OPTIONS", "/v1/jobs", 405)]
 )
+@pytest.mark.attack("routes × scopes", "looking for routes without a token")
 def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str, path: str, status: int) -> None:
     assert server.ask(method, path).status_code == 401
     answer = server.ask(method, path, Scope.READ)
@@ -121,6 +124,7 @@ def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str
 
 @pytest.mark.parametrize("declared", [0, 2])
 @pytest.mark.parametrize("path", ["/v1/thing", "/thing"])
+@pytest.mark.attack("routes × scopes", "a route that somebody adds without a scope")
 def test_a_route_without_exactly_one_scope_is_closed(tmp_path: Path, declared: int, path: str) -> None:
     called = []
     router = APIRouter()
@@ -149,6 +153,7 @@ def add_first(app: FastAPI, router: APIRouter) -> None:
     app.router.routes.insert(0, app.router.routes.pop())
 
 
+@pytest.mark.attack("routes × scopes", "a route behind no gate")
 def test_without_the_gate_a_route_is_closed(tmp_path: Path) -> None:
     app = FastAPI()
     app.add_api_route("/thing", lambda: 1, dependencies=[needs("read")])
@@ -169,6 +174,7 @@ class _As:
 
 
 @pytest.mark.parametrize("header", ["Bearer", "Basic eDp5", "Bearer dentine_0123456789ab_guess", "bearer \xff", "x" * 5000])
+@pytest.mark.attack("tokens", "a malformed, unknown or foreign credential")
 def test_a_wrong_credential_is_refused(server: Guarded, header: str) -> None:
     answer = server.client.get("/v1/jobs", headers={"Authorization": header.encode("latin-1")})
     assert (answer.status_code, answer.json()["code"]) == (401, "unauthenticated")
@@ -225,6 +231,7 @@ def test_a_session_carries_the_rights_of_its_token(server: Guarded) -> None:
         ({"Sec-Fetch-Site": "same-origin"}, 201),
     ],
 )
+@pytest.mark.attack("cross-site", "a change that another site's page asks for")
 def test_another_site_cannot_use_a_session(server: Guarded, headers: dict[str, str], status: int) -> None:
     answer = server.client.post("/v1/jobs", json={"capture": "/"}, headers=sign_in(server) | headers)
     assert answer.status_code == status
@@ -232,6 +239,7 @@ def test_another_site_cannot_use_a_session(server: Guarded, headers: dict[str, s
         assert answer.json()["code"] == "foreign-origin"
 
 
+@pytest.mark.attack("tokens", "a stream and a session of a revoked token")
 def test_revoking_a_token_ends_its_session_and_its_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gate, "RECHECK_S", 0.0)
     going = tmp_path / "going"
@@ -376,6 +384,7 @@ def spaced(length: int) -> bytes:
 
 @pytest.mark.parametrize(("length", "status"), [(LIMIT, 201), (LIMIT + 1, 413)])
 @pytest.mark.parametrize("announced", [True, False])
+@pytest.mark.attack("exhaustion", "a long body, announced or not")
 def test_a_body_has_a_limit(small: Guarded, length: int, status: int, announced: bool) -> None:
     body = spaced(length) if announced else iter([spaced(length)[:1000], spaced(length)[1000:]])
     answer = small.ask("POST", "/v1/jobs", Scope.SUBMIT, content=body, headers={"Content-Type": "application/json"})
@@ -415,6 +424,7 @@ def test_an_announced_length_is_refused_before_a_byte_is_sent(small: Guarded) ->
     assert raw_exchange(small, head(small, "/v1/jobs", "Content-Length: 99999999999"), []).startswith(b"HTTP/1.1 413")
 
 
+@pytest.mark.attack("exhaustion", "a body without an end")
 def test_a_stream_without_end_is_refused_when_it_passes_the_limit(small: Guarded) -> None:
     """No last chunk is ever sent, so an answer proves that the server did not wait for it."""
     chunk = b"400\r\n" + b" " * 0x400 + b"\r\n"
@@ -423,6 +433,7 @@ def test_a_stream_without_end_is_refused_when_it_passes_the_limit(small: Guarded
     assert b"body-too-large" in answer
 
 
+@pytest.mark.attack("exhaustion", "a stranger's body")
 def test_a_stranger_is_refused_before_the_body_is_read(small: Guarded) -> None:
     answer = raw_exchange(small, head(small, "/v1/jobs", "Content-Length: 4000", "Connection: close", scope=None), [])
     assert answer.startswith(b"HTTP/1.1 401")
@@ -469,6 +480,7 @@ def _status(app: Any, path: str, body: bytes) -> int:
     return int(sent[0]["status"])
 
 
+@pytest.mark.attack("cross-site", "an answer in a cache or a frame")
 def test_every_answer_of_the_api_is_kept_out_of_caches_and_frames(server: Guarded) -> None:
     job = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"}).json()["id"]
     for path in ("/v1/jobs", f"/v1/jobs/{job}", f"/v1/jobs/{job}/events", f"/v1/jobs/{job}/artifacts/report.html", "/v1/nothing", "/v1/tokens"):

@@ -83,23 +83,27 @@ def test_a_form_is_not_a_job(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("capture", ["relative", "/\0", "/\ud800", "/" + "x" * 300, "/" + "x/" * 3000, "/dev/null/x"])
+@pytest.mark.attack("traversal", "a capture's path that cannot be")
 def test_paths_that_cannot_be_are_refused(client: httpx.Client, capture: str) -> None:
     for options in ({"capture": capture}, {"rig": {"mouth": capture}}):
         assert_refused(client.post("/v1/jobs", content=json.dumps(options), headers=JSON), 422, "bad-settings")
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "x%2F" * 3000, "%00", "fit%00.json"])
+@pytest.mark.attack("traversal", "an artifact's name that no file can have")
 def test_artifacts_that_cannot_be_are_unknown(client: httpx.Client, name: str) -> None:
     job = client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
     assert_refused(client.get(f"/v1/jobs/{job}/artifacts/{name}"), 404, "job-unknown")
 
 
 @pytest.mark.parametrize("origin", ["http://[", "null", "http://elsewhere.example"])
+@pytest.mark.attack("cross-site", "a malformed origin")
 def test_malformed_origins_are_foreign(client: httpx.Client, origin: str) -> None:
     assert_refused(client.delete("/v1/session", headers={"Origin": origin}), 403, "foreign-origin")
 
 
 @pytest.mark.parametrize("host", ["elsewhere.example", "[", "127.0.0.1.elsewhere.example", "127.0.0.1@elsewhere.example", "127.0.0.1:8000:1", ""])
+@pytest.mark.attack("cross-site", "a malformed host")
 def test_other_hosts_are_foreign(client: httpx.Client, host: str) -> None:
     assert_refused(client.get("/v1/jobs", headers={"Host": host}), 400, "foreign-host")
 

@@ -55,6 +55,7 @@ def test_it_says_what_would_be_said_in_this_process(apart: ReadApart, tmp_path: 
         apart.describe(tmp_path)
 
 
+@pytest.mark.attack("uploads", "a description that takes memory")
 def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: ReadApart, tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "capture")
     whole = (folder / "capture.json").read_text()
@@ -72,6 +73,7 @@ def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: R
     assert faults(apart, (folder / "c0_l0.npy", "c0_l0.npy")) == {}
 
 
+@pytest.mark.attack("uploads", "a file that takes time")
 def test_a_file_that_takes_time_costs_a_process_and_a_sentence(apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.mkfifo(tmp_path / "hangs.npy")
     monkeypatch.setattr(reading, "MAX_S", 0.3)
@@ -89,6 +91,7 @@ def test_one_that_was_killed_is_replaced(apart: ReadApart, tmp_path: Path) -> No
     assert apart.describe(folder).image_px == 2 * 48
 
 
+@pytest.mark.attack("uploads", "secrets of the server beside what reads uploads")
 def test_it_knows_nothing_of_the_server(apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DENTINE__SERVER__DATABASE", "postgresql://a:secret@b/c")
     fresh = ReadApart()
@@ -114,6 +117,7 @@ def test_a_raw_capture_of_20_gigabytes_is_looked_at_by_its_headers(apart: ReadAp
     assert "export it again" in faults(apart, *files)[files[-1][1]]
 
 
+@pytest.mark.attack("uploads", "the commit of such a description")
 def test_a_commit_tells_of_a_costly_file_and_the_next_one_goes_on(tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     worse = contents | {"capture.json": contents["capture.json"][:-1] + b', "more": [' + b"{}," * (MAX_DESCRIPTION_BYTES // 3 - 1000) + b"{}]}"}

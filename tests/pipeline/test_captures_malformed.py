@@ -41,6 +41,7 @@ def assert_refused(answer: httpx.Response) -> None:
 
 @few
 @given(manifest=manifests)
+@pytest.mark.attack("uploads", "a malformed manifest")
 def test_malformed_manifests_are_refused(client: httpx.Client, manifest: Any) -> None:
     import json
 
@@ -54,5 +55,6 @@ def test_malformed_manifests_are_refused(client: httpx.Client, manifest: Any) ->
     place=st.sampled_from(["", "/none/0", "/a%00/1", f"/none/{2**40}", "/none/-1"]),
     headers=tus_headers,
 )
+@pytest.mark.attack("uploads", "malformed requests of the upload protocol")
 def test_malformed_uploads_are_refused(client: httpx.Client, method: str, place: str, headers: dict[str, str]) -> None:
     assert_refused(client.request(method, f"/v1/uploads{place}", headers=headers, content=b"x" if method == "PATCH" else None))

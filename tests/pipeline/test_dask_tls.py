@@ -59,6 +59,7 @@ def ready(client: httpx.Client) -> dict[str, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.attack("Dask and files as another user", "a scheduler by TLS, without a certificate")
 def test_a_job_runs_by_tls_and_strangers_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.api.workers.CONNECT_S", 2.0)
     ours, theirs, address = certificates(tmp_path / "ours"), certificates(tmp_path / "theirs"), f"tcp://127.0.0.1:{free_port()}"

@@ -70,6 +70,7 @@ def problem_of(answer: httpx.Response) -> tuple[int, str, str]:
     return answer.status_code, answer.json()["code"], answer.json()["detail"]
 
 
+@pytest.mark.attack("light", "a job that lights a dome, without the scope")
 def test_a_job_with_a_dome_needs_the_scope_to_operate_it(server: Guarded, chair: Callable[..., httpx.Response]) -> None:
     status, code, detail = problem_of(server.ask("POST", "/v1/jobs", Scope.SUBMIT, **job()))
     assert (status, code) == (403, "scope-missing")
@@ -79,6 +80,7 @@ def test_a_job_with_a_dome_needs_the_scope_to_operate_it(server: Guarded, chair:
     assert server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"}).status_code == 201
 
 
+@pytest.mark.attack("light", "a retry that lights a dome, without the scope")
 def test_a_retry_that_lights_a_dome_needs_the_scope_too(server: Guarded, chair: Callable[..., httpx.Response]) -> None:
     made = {dome: chair("POST", "/v1/jobs", **job(dome=dome)).json()["id"] for dome in (OWN, "simulated")}
     for one in made.values():
@@ -89,6 +91,7 @@ def test_a_retry_that_lights_a_dome_needs_the_scope_too(server: Guarded, chair: 
     assert problem_of(server.ask("POST", f"/v1/jobs/{made['simulated']}/retry", Scope.SUBMIT))[:2] == (409, "job-state")
 
 
+@pytest.mark.attack("light", "a job that makes the server connect to any address")
 def test_a_dome_that_the_server_does_not_list_is_not_connected_to(server: Guarded, chair: Callable[..., httpx.Response]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as elsewhere:
         address = f"127.0.0.1:{elsewhere.getsockname()[1]}"
@@ -112,6 +115,7 @@ def test_a_dome_that_the_server_does_not_list_is_not_connected_to(server: Guarde
         ({"exposure_s": 1.0, "level": 0.5, "light_exposure_limit_s": 0.4}, "rig-exposure-limit", "level-seconds"),
     ],
 )
+@pytest.mark.attack("light", "limits of a job's own above the server's")
 def test_light_beyond_the_servers_limits_is_refused(chair: Callable[..., httpx.Response], options: dict[str, float], code: str, named: str) -> None:
     answer = problem_of(chair("POST", "/v1/jobs", **job(**options)))
     assert answer[:2] == (422, code)

@@ -50,6 +50,7 @@ def failing_server(tmp_path: Path) -> Iterator[tuple[httpx.Client, Path]]:
                 process.wait(30)
 
 
+@pytest.mark.attack("tokens", "secrets in logs, files and answers")
 def test_secrets_are_nowhere_in_what_the_server_writes_and_says(failing_server: tuple[httpx.Client, Path], tmp_path: Path) -> None:
     client, said = failing_server
     answers: list[str] = []

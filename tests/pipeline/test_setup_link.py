@@ -58,6 +58,7 @@ def secret_of(engine: sql.Engine) -> str:
     return issued.get_secret_value()
 
 
+@pytest.mark.attack("tokens", "a setup link, used again")
 def test_a_link_makes_an_administrator_once(client: httpx.Client, engine: sql.Engine) -> None:
     secret, other = secret_of(engine), secret_of(engine)
     made = client.post("/v1/setup", json={"secret": secret})
@@ -102,6 +103,7 @@ def test_the_database_holds_no_secret(engine: sql.Engine, tmp_path: Path) -> Non
     assert secret not in dump
 
 
+@pytest.mark.attack("tokens", "guessing a setup link")
 def test_guesses_are_counted(client: httpx.Client, engine: sql.Engine) -> None:
     secret = secret_of(engine)
     answers = [client.post("/v1/setup", json={"secret": f"guess-{number}"}).status_code for number in range(8)]

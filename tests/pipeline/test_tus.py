@@ -60,7 +60,7 @@ def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
     app.include_router(build_captures_router(captures))
-    access.install(app, ServerSettings(data=tmp_path), engine, Clerks(1))
+    access.install(app, ServerSettings(data=tmp_path), engine, Clerks(1), Clerks(1))
     with serving(app) as connected:
         yield connected
     engine.dispose()
@@ -171,12 +171,14 @@ def test_only_files_of_the_manifest_are_taken(client: httpx.Client) -> None:
     assert client.head(f"/v1/uploads/{capture}/1", headers=TUS).status_code == 404
 
 
+@pytest.mark.attack("uploads", "more bytes than were announced")
 def test_more_bytes_than_the_manifest_says_are_refused(client: httpx.Client, upload: str) -> None:
     assert code_of(patch(client, upload, 0, CONTENT + b"x")) == (413, "upload-too-large")
     assert not is_known(client, upload)
     assert patch(client, upload, 0, CONTENT).status_code == 204
 
 
+@pytest.mark.attack("uploads", "other bytes than were announced")
 def test_a_finished_file_with_another_sha256_is_refused_by_name_and_can_be_sent_again(client: httpx.Client, upload: str, tmp_path: Path) -> None:
     answer = patch(client, upload, 0, CONTENT[:-1] + b"\0")
     assert code_of(answer) == (422, "upload-corrupt")
@@ -253,6 +255,7 @@ def test_a_broken_connection_keeps_what_came_unless_it_was_to_be_checked(client:
     assert offset_of(client, upload) == (0 if with_checksum else 1000)
 
 
+@pytest.mark.attack("exhaustion", "an upload that falls silent")
 def test_a_silent_client_is_told_and_loses_nothing(client: httpx.Client, upload: str) -> None:
     host, port = client.base_url.host, client.base_url.port
     lines = [f"PATCH {upload} HTTP/1.1", f"Host: {host}:{port}", "Tus-Resumable: 1.0.0", "Upload-Offset: 0", f"Content-Length: {len(CONTENT)}"]

@@ -24,6 +24,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
+@pytest.mark.attack("exhaustion", "requests without number")
 def test_reads_writes_and_refusals_are_counted_apart(clock: Clock) -> None:
     limited = Rates(RateSettings(reads_per_10_s=3, writes_per_10_s=2, refusals_per_minute=1))
     assert [limited.count("a", is_change=False) for _ in range(4)] == [0, 0, 0, 10]

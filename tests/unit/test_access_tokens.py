@@ -62,6 +62,7 @@ def issue(table: Tokens, name: str = "rig-1", scopes: tuple[Scope, ...] = (Scope
     return table.create(name, scopes, days, make_deed()).token.get_secret_value()
 
 
+@pytest.mark.attack("tokens", "reading the database")
 def test_only_the_hash_is_stored_and_the_secret_has_256_bits(table: Tokens, engine: sql.Engine, tmp_path: Path) -> None:
     token = issue(table)
     with engine.connect() as connection:

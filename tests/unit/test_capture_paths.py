@@ -82,6 +82,7 @@ def test_files_of_captures_are_accepted(path: str) -> None:
         ("capture.zarr/c/0/x", "no file of a capture"),
     ],
 )
+@pytest.mark.attack("traversal", "a file of a capture that is absolute, leads upwards, is hidden or has control characters")
 def test_other_paths_are_refused_for_a_reason(path: str, named: str) -> None:
     assert named in (path_fault(path) or "")
 
@@ -97,6 +98,7 @@ def test_other_paths_are_refused_for_a_reason(path: str, named: str) -> None:
         (["a.npy/b.npy", "a.npy"], "a folder of other files too"),
     ],
 )
+@pytest.mark.attack("traversal", "two files of a capture that some file system takes for one")
 def test_paths_that_clash_are_refused(paths: list[str], named: str) -> None:
     with pytest.raises(UploadError, match=named):
         require_paths(["capture.json", *paths])

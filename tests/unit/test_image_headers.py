@@ -103,6 +103,7 @@ def fault(tmp_path: Path, name: str, content: bytes, names: frozenset[str] = fro
     ("suffix", "bomb"),
     [(".png", png(60_000, 60_000)), (".tif", tiff(60_000, 60_000)), (".exr", exr(exr_part(60_000, 60_000, "BGR"))), (".png", png(2**32 - 1, 2**32 - 1))],
 )
+@pytest.mark.attack("uploads", "an image that decodes to more than memory")
 def test_bombs_are_refused_by_name(tmp_path: Path, suffix: str, bomb: bytes) -> None:
     detail = fault(tmp_path, f"c0{suffix}", bomb)
     assert detail is not None
@@ -120,6 +121,7 @@ def test_a_size_that_the_file_cannot_hold_is_refused(tmp_path: Path) -> None:
     assert "which no photograph packs to" in (content_fault(tmp_path / "content", "a.png", limits, frozenset()) or "")
 
 
+@pytest.mark.attack("uploads", "an array with Python objects (pickle)")
 def test_python_objects_are_refused(tmp_path: Path) -> None:
     stream = BytesIO()
     np.save(stream, np.array([{}], dtype=object), allow_pickle=True)
@@ -127,6 +129,7 @@ def test_python_objects_are_refused(tmp_path: Path) -> None:
 
 
 @given(st.sampled_from(HEADS), st.integers(0, 60), st.binary(max_size=8))
+@pytest.mark.attack("uploads", "a damaged header")
 def test_damaged_headers_are_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: Any, at: int, noise: bytes) -> None:
     suffix, head = row[0], row[1]
     damaged = (head[:at] + noise + head[at + len(noise) :]) if noise else head[:at]
@@ -135,6 +138,7 @@ def test_damaged_headers_are_a_sentence_or_harmless(tmp_path_factory: pytest.Tem
 
 
 @given(st.sampled_from([".npy", ".png", ".tif", ".exr"]), st.binary(max_size=200))
+@pytest.mark.attack("uploads", "noise for an image")
 def test_noise_is_no_image(tmp_path_factory: pytest.TempPathFactory, suffix: str, noise: bytes) -> None:
     assert (fault(tmp_path_factory.mktemp("noise"), f"image{suffix}", noise) or "").startswith(f"image{suffix} cannot be read")
 

@@ -53,6 +53,7 @@ def test_metadata_of_a_second_image_in_a_tiff_is_named(tmp_path: Path) -> None:
     assert "(Artist)" in (fault(tmp_path, ".tif", stream.getvalue()) or "")
 
 
+@pytest.mark.attack("uploads", "a TIFF of many long directories")
 def test_a_small_tiff_of_many_long_directories_is_refused_before_all_are_read(tmp_path: Path) -> None:
     # 300 directories of 65,535 entries each, one two bytes after the other: twenty million entries in 0.8 MB.
     many, most = 300, 2**16 - 1
@@ -64,6 +65,7 @@ def test_a_small_tiff_of_many_long_directories_is_refused_before_all_are_read(tm
         fault(tmp_path, ".tif", head + starts + b"\xff\xff" * many + bytes(12 * most + 4))
 
 
+@pytest.mark.attack("uploads", "a TIFF that names one list again and again")
 def test_a_small_tiff_that_names_one_long_list_of_directories_again_and_again_is_refused(tmp_path: Path) -> None:
     entries, list_at = 1000, 8 + 2 + 12 * 1000 + 4
     head = b"II" + struct.pack("<HI", 42, 8) + struct.pack("<H", entries) + struct.pack("<HHII", 330, 4, 200_000, list_at) * entries

@@ -27,6 +27,7 @@ def png(side: int, *packed: bytes) -> bytes:
     return PNG_SIGNATURE + b"".join(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)
 
 
+@pytest.mark.attack("uploads", "a mask that inflates a thousandfold")
 def test_a_mask_that_inflates_a_thousandfold_is_checked_in_little_memory() -> None:
     side = 6000
     content = png(side, zlib.compress(bytes(side * (1 + side)), 9))

@@ -28,6 +28,7 @@ def resolve(policy: AddressPolicy, host: str, scheme: str = "https") -> list[str
 
 
 @pytest.mark.parametrize("address", HIDDEN)
+@pytest.mark.attack("webhooks", "an address inside, as it is or inside an IPv6 one, tunnels included")
 def test_what_is_not_public_is_refused(address: str) -> None:
     assert not is_public(ipaddress.ip_address(address))
     host = f"[{address}]" if ":" in address else address
@@ -51,6 +52,7 @@ def test_what_is_public_needs_tls(address: str) -> None:
 
 
 @given(number=st.integers(0, 2**32 - 1))
+@pytest.mark.attack("webhooks", "any IPv4 address inside an IPv6 one")
 def test_an_address_inside_another_is_as_public_as_itself(number: int) -> None:
     inner = ipaddress.IPv4Address(number)
     for outer in (0xFFFF << 32 | number, 0x64_FF9B << 96 | number, 0x2002 << 112 | number << 80):
@@ -58,11 +60,13 @@ def test_an_address_inside_another_is_as_public_as_itself(number: int) -> None:
 
 
 @pytest.mark.parametrize("host", ["localhost", "2130706433", "0x7f000001", "127.1", "0177.0.0.1"])
+@pytest.mark.attack("webhooks", "loopback in another spelling")
 def test_other_spellings_are_refused_once_they_are_resolved(host: str) -> None:
     with pytest.raises(WebhookAddressError):
         resolve(STRICT, host)
 
 
+@pytest.mark.attack("webhooks", "a name with an address inside beside public ones")
 def test_one_hidden_address_among_public_ones_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def answer(*_: Any, **__: Any) -> list[Any]:
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 443)) for address in ("93.184.216.34", "10.0.0.1")]
@@ -81,6 +85,7 @@ def test_a_setting_opens_private_addresses(address: str) -> None:
 
 
 @pytest.mark.parametrize("address", ["224.0.0.1", "0.0.0.0", "ff02::1"])
+@pytest.mark.attack("webhooks", "an address of no host where private ones are allowed")
 def test_no_setting_opens_what_is_no_host(address: str) -> None:
     with pytest.raises(WebhookAddressError):
         resolve(PRIVATE, address)
@@ -91,6 +96,7 @@ def test_no_setting_opens_what_is_no_host(address: str) -> None:
     ["", "/hook", "example.org/hook", "ftp://example.org/", "file:///etc/passwd", "https://", "https:///hook", "https://u:p@example.org/", "https://a@example.org",
      "https://example.org/#part", "https://exa mple.org/", "https://example.org:99999/", "https://example.org/\n", "https://[::1", "http://example.org/"],
 )  # fmt: skip
+@pytest.mark.attack("webhooks", "another scheme, a login or a malformed address")
 def test_what_is_no_secure_web_address_is_refused(url: str) -> None:
     with pytest.raises(WebhookAddressError):
         STRICT.check_url(url)
