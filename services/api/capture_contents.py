@@ -13,11 +13,12 @@ from services.api.image_headers import declared
 from services.api.image_metadata import metadata_fault
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
+from services.core.slab_folder import SlabFolder
 
 MOST_TIMES_PACKED = 1100
 """Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""
 _ITEM_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "float16": 2, "int32": 4, "uint32": 4, "float32": 4}
-_PIXEL_BYTES = 4
+_PIXEL_BYTES, _SLAB_PIXEL_BYTES = 4, 8
 
 
 def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[str]) -> str | None:
@@ -32,6 +33,8 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
     try:
         if name == "capture.json":
             return _description_fault(name, FolderCapture.model_validate_json(path.read_bytes()), limits, names)
+        if name == "slab.json":
+            return _slab_fault(name, SlabFolder.model_validate_json(path.read_bytes()), limits, names)
         if name == "manifest.json":
             return _published_fault(name, from_json(path.read_bytes()), limits, names)
         if pure.name == "zarr.json":
@@ -65,6 +68,17 @@ def _description_fault(name: str, description: FolderCapture, limits: UploadLimi
             size = " x ".join(map(str, camera.size))
             return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
     for image in description.images:
+        for file in (image.file, image.variance_file):
+            if file is not None and str(PurePosixPath(file)) not in names:
+                return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
+    return None
+
+
+def _slab_fault(name: str, folder: SlabFolder, limits: UploadLimits, names: frozenset[str]) -> str | None:
+    if folder.pixels.columns * folder.pixels.rows * _SLAB_PIXEL_BYTES > limits.largest_image_bytes:
+        size = f"{folder.pixels.columns} x {folder.pixels.rows}"
+        return f"{name} has images of {size} pixels, more than {limits.largest_image_bytes} bytes; bin them."
+    for image in folder.images:
         for file in (image.file, image.variance_file):
             if file is not None and str(PurePosixPath(file)) not in names:
                 return f"{name} names image file {file}, which is not among the files; add it or remove its entry."

@@ -14,8 +14,8 @@ MOST_PARTS = 12
 TEXTS = frozenset({".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
-DESCRIPTIONS = frozenset({"capture.json", "manifest.json"})
-"""One of these makes a folder a capture: one made by anyone, or one that the capture stage published."""
+DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "slab.json"})
+"""One of these makes a folder a capture: one made by anyone, one that the capture stage published, or that of a material's cell."""
 
 _CHUNK = re.compile(r"(.*/)?[^/]+\.zarr/(.*/)?c(/\d+)+")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import sqlalchemy as sql
 from pydantic import Field
@@ -13,6 +12,7 @@ from services.api.lifecycle import JobState
 from services.api.owners import DEFAULT_GROUP, Viewer
 from services.core.errors import UnknownJobError
 from services.core.geometry import Record
+from services.core.records import KindName
 
 job_table = sql.Table(
     "job",
@@ -61,7 +61,7 @@ class JobFilter(Record):
     """Which jobs to list; what is left out allows any."""
 
     states: tuple[JobState, ...] = ()
-    kind: Literal["tooth", "jaw"] | None = None
+    kind: KindName | None = None
     created_after_s: float | None = Field(default=None, description="Unix time")
     created_before_s: float | None = Field(default=None, description="Unix time")
     source: str | None = Field(default=None, description="text in the path of the capture or of the rig's mouth, in any case")

@@ -39,6 +39,7 @@ from services.core.errors import (
     SchedulerLostError,
     WorkerLostError,
 )
+from services.core.job_kinds import JOB_KINDS
 from services.core.masks import is_stale
 from services.core.placement import DOME, STAGES, rank
 from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
@@ -59,16 +60,8 @@ KEEP_S = 10.0
 GRACE_S = 5.0
 """How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
 
-DOORS: Mapping[StageName, str] = MappingProxyType(
-    {
-        "phantom": "services.fit.stage:phantom",
-        "capture": "services.capture.stage:run",
-        "prepare": "services.preprocess.stage:run",
-        "fit": "services.fit.stage:run",
-        "export": "services.fit.stage:export",
-    }
-)
-"""``module:function`` of each stage; imported by the worker, never here."""
+DOORS: Mapping[StageName, str] = MappingProxyType({})
+"""``module:function`` of stages that are entered elsewhere than a job's kind says."""
 _PUBLISHED_AS = {"phantom": "phantom", "capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
 _EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
 """What to install where a stage runs."""
@@ -76,7 +69,8 @@ _EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit
 
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
     """The stages a job goes through, in order."""
-    return (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()), "prepare", "fit", "export")
+    made = (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()))
+    return (*made, *JOB_KINDS[spec.kind].stages)
 
 
 def first_stage(spec: JobSpec, root: Path) -> StageName | None:
@@ -104,7 +98,7 @@ def run_job(
         listener: called in this thread with every new event.
         workers: worker processes, default ``spec.workers``.
         events: event table to append to, default one in ``root``.
-        doors: where each stage is entered.
+        doors: where stages are entered other than the job's kind says.
         cluster: where it runs, default workers of its own.
         is_logged: workers write log lines on standard error.
         before: called before each stage but a capture; what it raises ends the run.
@@ -145,7 +139,8 @@ def run_stages(
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
-                tasks = [StageTask(stage, doors[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged) for stage in todo]
+                entered = {**JOB_KINDS[spec.kind].doors, **doors}
+                tasks = [StageTask(stage, entered[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged) for stage in todo]
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
             watch.tell()

@@ -3,7 +3,7 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field, StringConstraints
@@ -24,7 +24,7 @@ from services.api.repository import Deletion, Job
 from services.api.time_ranges import TimeRange
 from services.api.tokens import Scope
 from services.core.geometry import Record
-from services.core.records import JobName, JobSpec
+from services.core.records import JobName, JobSpec, KindName
 
 LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
@@ -118,7 +118,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None,
         state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
-        kind: Literal["tooth", "jaw"] | None = None,
+        kind: KindName | None = None,
         created_after_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
         created_before_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
         capture: Annotated[str | None, Query(max_length=500, description="text in the path of the capture or of the rig's mouth, in any case")] = None,

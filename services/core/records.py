@@ -7,10 +7,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Name, Record, Vector3
+from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
 
 
 def _no_stand_in(value: Any) -> Any:
@@ -29,6 +30,8 @@ Unit = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
+KindName = Annotated[str, AfterValidator(known_kind), WithJsonSchema({"type": "string", "enum": list(JOB_KINDS)})]
+"""Of ``JOB_KINDS``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
 
@@ -133,7 +136,10 @@ MAX_HELD = 1000
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
-    kind: Literal["tooth", "jaw"] = Field(default="tooth", description="what is fitted: one tooth alone, or all teeth with gums and the wall of the mouth")
+    kind: KindName = Field(
+        default="tooth",
+        description="what is measured: " + "; ".join(f"{name}: {kind.summary}" for name, kind in JOB_KINDS.items()),
+    )
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     calibration: Path | None = Field(default=None, description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>")
@@ -163,6 +169,7 @@ class JobSpec(Record):
     advise: bool = Field(default=True, description="say at the end which further light or view would help most")
     sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
+    effort: Number = Field(default=1.0, ge=0.01, le=100, description="of kind slab: paths, in units of the default budget; ± shrink as its root")
     workers: Whole = Field(default=2, ge=1, le=1024, description="processes of a local run")
     device: Device = Field(default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker")
     priority: Priority = Field(
@@ -174,6 +181,15 @@ class JobSpec(Record):
     def is_demo(self) -> bool:
         """Whether the job begins by making the mouth that it captures."""
         return self.rig is not None and self.rig.mouth == DEMO_MOUTH
+
+    @model_validator(mode="after")
+    def _options_of_its_kind(self) -> JobSpec:
+        # Stored options hold every field, so what an option was set to tells, and not whether it was.
+        told = {name for name, field in type(self).model_fields.items() if getattr(self, name) != field.get_default()}
+        if foreign := sorted(foreign_options(self.kind, frozenset(told) & JobSpec.model_fields.keys())):
+            own = sorted(JobSpec.model_fields.keys() - foreign_options(self.kind, frozenset(JobSpec.model_fields)))
+            raise ValueError(f"a job of kind {self.kind} has no option '{foreign[0]}'; it has {', '.join(own)}")
+        return self
 
     @model_validator(mode="after")
     def _one_source(self) -> JobSpec:

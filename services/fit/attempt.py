@@ -127,7 +127,7 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
     """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
-    parts = [numerics_name(), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority"})]
+    parts = [numerics_name(), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority", "effort"})]
     for channel in files:
         parts += [channel.channel, *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

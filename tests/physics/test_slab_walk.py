@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+from services.core.slab_folder import Light
 from services.fit.slab.dictionary import KNOTS, Material, henyey_greenstein
-from services.fit.slab.folder import Light
 from services.fit.slab.forward import Block, render, run_block
 from services.fit.slab.interface import Interface, fresnel
 from services.fit.slab.normal import derivative_rows

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from services.core.slab_folder import SlabFolder, read_folder
 from services.fit.slab.dictionary import ANGLES_RAD, henyey_greenstein
 from services.fit.slab.fit import SlabOptions, fit_slab, write_results
-from services.fit.slab.folder import SlabFolder, read_folder
 from services.fit.slab.forward import render
 from services.fit.slab.result import SlabFit
 from services.fit.slab.rig import rig_of

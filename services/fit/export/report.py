@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ from services.fit.export.pictures import (
     tone_map,
     white_level,
 )
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 PART_LABELS = {"enamel": "Enamel", "dentin": "Dentin", "shape": "Dentin shape", "gums": "Gums", "cavity": "Wall of the mouth"}
 LEAF_LABELS = {
@@ -79,11 +82,8 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``, ``stage`` and ``channel``.
         context: ``title``, ``boundary``, ``ior`` and ``provenance`` (a dict of label -> text); all optional.
     """
-    from jinja2 import Environment, StrictUndefined
-
     verdict = verdict_of(report)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((Path(__file__).parent / "report.html.j2").read_text(encoding="utf-8"))
+    template = page_template(Path(__file__).parent / "report.html.j2")
     boundary = context.get("boundary", "")
     page = template.render(
         title=context.get("title", "Fit"),
@@ -101,7 +101,7 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         steps=report.steps,
         seconds=_duration(report.seconds),
         triptychs=[_triptych(picture) for picture in sorted(pictures.pictures, key=lambda p: (p.camera, p.held_out))],
-        residual_bar=_gradient(DIVERGING),
+        residual_bar=gradient(DIVERGING),
         residual_limit=f"{100 * RESIDUAL_OF_WHITE:g} %",
         charts=_charts(history),
         stages=_stages(history),
@@ -110,12 +110,23 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         teeth=_tooth_rows(report.teeth),
         tooth_sentences=[(fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()],
         thickness=_thickness(pictures),
-        thickness_bar=_gradient(SEQUENTIAL),
+        thickness_bar=gradient(SEQUENTIAL),
         stains=_stains(pictures),
         caveat=THIN_CAVEAT if boundary == "thin" else "",
         provenance=_provenance(boundary, context),
     )
     write_atomic(path, page.encode())
+
+
+def page_template(path: Path) -> Template:
+    """A report's page with the style that all of them share."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+    environment.globals["style"] = Markup(style)  # noqa: S704 - our own file
+    return environment.from_string(path.read_text(encoding="utf-8"))
 
 
 def _error_rows(errors: dict[str, float], ses: dict[str, float]) -> dict[str, Any] | None:
@@ -201,7 +212,7 @@ def _parameter_rows(parameters: dict[str, dict[str, Estimate]]) -> list[dict[str
     for name in sorted(names, key=_order):
         present = [table[name] for table in parameters.values() if name in table]
         unit = "" if present[0].unit == "1" else present[0].unit
-        rows.append({"group": _group(name), "label": _label(name), "name": name, "unit": unit, "cells": [_cell(t.get(name)) for t in parameters.values()]})
+        rows.append({"group": _group(name), "label": _label(name), "name": name, "unit": unit, "cells": [cell(t.get(name)) for t in parameters.values()]})
     return rows
 
 
@@ -214,7 +225,7 @@ def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
             "state": tooth.state,
             "channel": channel,
             "errors": [_percent(errors[channel]) if channel in errors else "" for errors in (tooth.held_out_error, tooth.fit_error)],
-            "cells": [_cell(table.get(name)) for name in names],
+            "cells": [cell(table.get(name)) for name in names],
         }
         for fdi, tooth in teeth.items()
         for channel, table in tooth.parameters.items()
@@ -261,7 +272,8 @@ def _label(name: str) -> str:
     return LEAF_LABELS.get(leaf, name)
 
 
-def _cell(estimate: Estimate | None) -> dict[str, str]:
+def cell(estimate: Estimate | None) -> dict[str, str]:
+    """A number as the tables of a report show it: value, ± and flag."""
     if estimate is None:
         return {"value": "", "se": "", "flag": ""}
     if estimate.se is None:
@@ -305,7 +317,8 @@ def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
     }
 
 
-def _gradient(stops: ColourStops) -> str:
+def gradient(stops: ColourStops) -> str:
+    """Colour stops as those of a gradient in CSS."""
     return ", ".join(f"rgb{colour} {100 * position:g}%" for position, colour in stops)
 
 

@@ -1,17 +1,19 @@
-"""A slab folder to its material, wavelength by wavelength: the door that a job or a command goes through."""
+"""A slab folder to its material, wavelength by wavelength."""
 
 from __future__ import annotations
 
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.core.geometry import Record
+from services.core.slab_folder import SlabFolder, read_folder
 from services.core.store import write_atomic
 from services.fit.slab.dictionary import Material
-from services.fit.slab.folder import SlabFolder, read_folder
 from services.fit.slab.forward import Blocks, render
 from services.fit.slab.gauss_newton import Budget, GaussNewton
 from services.fit.slab.images import Measurements, read_images
@@ -22,6 +24,19 @@ from services.fit.slab.uncertainty import uncertainty_of
 
 LAST_LOOK = 2**30
 """Number of the render, counted apart from the solver's, that errors are taken from."""
+
+
+@dataclass(frozen=True)
+class Wavelength:
+    """One wavelength's result, with its images (images, rows, columns)."""
+
+    fit: SlabFit
+    measured: NDArray[np.float64]
+    """NaN where a pixel was left out."""
+    predicted: NDArray[np.float64]
+    held_out: NDArray[np.bool_]
+    names: tuple[str, ...]
+    """Camera and light of each image."""
 
 
 class SlabOptions(Record):
@@ -44,26 +59,38 @@ def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = ma
     options = options or SlabOptions()
     folder = read_folder(root)
     everything = [(wavelength, read_images(root, folder, wavelength)) for wavelength in folder.wavelengths_nm]
-    return tuple(_fit(folder, wavelength, measured, options, blocks) for wavelength, measured in everything)
+    return tuple(fit_images(folder, wavelength, measured, options, blocks).fit for wavelength, measured in everything)
 
 
-def _fit(folder: SlabFolder, wavelength_nm: float, measured: Measurements, options: SlabOptions, blocks: Blocks) -> SlabFit:
+def fit_images(
+    folder: SlabFolder,
+    wavelength_nm: float,
+    measured: Measurements,
+    options: SlabOptions,
+    blocks: Blocks = map,
+) -> Wavelength:
+    """Fit the images of one wavelength; see ``fit_slab``."""
     begun_s = time.process_time()
     rig = rig_of(folder, wavelength_nm)
     solver = GaussNewton(rig, measured, options.seed, _budget(options.effort), blocks)
     solution = solver.solve(start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
     phase = phase_of(material, uncertainty)
-    return SlabFit(
+    first, second = last_look(rig, material, solver.budget, options.seed, blocks)
+    fit = SlabFit(
         wavelength_nm=wavelength_nm,
         parameters=parameters_of(material, uncertainty, rig.interface.index),
         phase=phase,
-        errors=_errors(rig, measured, material, solver.budget, options.seed, blocks),
+        errors=_errors(measured, first, second),
         notes=_notes(measured, phase, converged=solution.converged),
         converged=solution.converged,
+        steps=solution.steps,
         paths=solution.paths,
         core_seconds=time.process_time() - begun_s,
     )
+    shape = len(measured.values), rig.grid.rows, rig.grid.columns
+    seen = np.where(np.isfinite(measured.variances), measured.values, np.nan).reshape(shape)
+    return Wavelength(fit, seen, (0.5 * (first + second)).reshape(shape), measured.held_out, measured.names)
 
 
 def _budget(effort: float) -> Budget:
@@ -72,10 +99,14 @@ def _budget(effort: float) -> Budget:
     return Budget(first_paths=max(1, round(effort * plain.first_paths)), search_paths=max(1, round(effort * plain.search_paths)), last=last)
 
 
-def _errors(rig: Rig, measured: Measurements, material: Material, budget: Budget, seed: int, blocks: Blocks) -> Errors:
-    """Errors of the images that were fitted, and of those that were not."""
+def last_look(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
+    """Two independent renders of what the fit ended with (2, images, pixels)."""
     paths = 4 * budget.last[-1][0]
-    first, second = render(rig, material, seed=seed, step=LAST_LOOK, batches=2, paths=paths, scores=False, blocks=blocks).images
+    return render(rig, material, seed=seed, step=LAST_LOOK, batches=2, paths=paths, scores=False, blocks=blocks).images
+
+
+def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[np.float64]) -> Errors:
+    """Errors of the images that were fitted, and of those that were not."""
     told = []
     for chosen in (~measured.held_out, measured.held_out):
         arrays = (image[chosen] for image in (first, second, measured.values, measured.variances))
@@ -90,8 +121,9 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
         notes.append("Images without a variance file are taken to have shot noise of 1 % at a pixel of the image's mean.")
     if lost := int(np.count_nonzero(~np.isfinite(measured.variances))):
         notes.append(f"{lost} values are not finite or have no variance and were left out.")
-    for low, high in phase.undetermined_bands_deg():
-        notes.append(f"The images do not determine the phase function from {low:.1f} to {high:.1f} degrees; what is given there is the prior's.")
+    if bands := [f"from {low:.1f} to {high:.1f}" for low, high in phase.undetermined_bands_deg()]:
+        told = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
+        notes.append(f"The images do not determine the phase function {told} degrees; what is given there is the prior's.")
     if not converged:
         notes.append("The search spent its steps before they stopped to help; the last steps were made all the same.")
     return tuple(notes)
@@ -100,6 +132,6 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
 def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
     """Write ``parameters.json``, ``phase.json`` and ``errors.json``, by wavelength."""
     out.mkdir(parents=True, exist_ok=True)
-    for name, part in (("parameters", "parameters"), ("phase", "phase"), ("errors", "errors")):
-        told = {f"{fit.wavelength_nm:g}": getattr(fit, part).model_dump() for fit in fits}
+    for name in ("parameters", "phase", "errors"):
+        told = {f"{fit.wavelength_nm:g}": getattr(fit, name).model_dump() for fit in fits}
         write_atomic(out / f"{name}.json", json.dumps(told, indent=1).encode())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.fit.slab.folder import SlabFolder, SlabImage
+from services.core.slab_folder import SlabFolder, SlabImage
 from services.fit.slab.rig import Grid, grid_of
 
 Array = NDArray[np.float64]

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from services.core.geometry import Record
+from services.core.records import FitReport, Verdict
+from services.core.verdict import verdict_of
 from services.fit.slab.dictionary import ANGLES_RAD, Material
 from services.fit.slab.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 
@@ -70,6 +72,7 @@ class SlabFit(Record):
     errors: Errors
     notes: tuple[str, ...] = Field(description="sentences about what was assumed and what the images do not tell")
     converged: bool
+    steps: int = Field(description="of the search")
     paths: int
     core_seconds: float
 
@@ -112,3 +115,24 @@ def image_error(first: NDArray[np.float64], second: NDArray[np.float64], values:
     y, noise = values[usable], float(variances[usable].sum())
     square = (float((first[usable] - y) @ (second[usable] - y)) - noise) / max(float(y @ y) - noise, 1e-300)
     return float(np.sqrt(max(square, 0.0)))
+
+
+class SlabReport(Record):
+    """Published by the fit stage of a slab: all its wavelengths."""
+
+    fits: tuple[SlabFit, ...]
+
+    def verdict(self) -> Verdict:
+        """The judgement of all wavelengths together, each in place of a channel."""
+        held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
+        stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
+        judged = FitReport(
+            converged=not stopped,
+            advice=f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort." if stopped else "",
+            parameters={},
+            fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
+            held_out_error={name: error for name, error in held_out.items() if error is not None},
+            steps=sum(fit.steps for fit in self.fits),
+            seconds=sum(fit.core_seconds for fit in self.fits),
+        )
+        return verdict_of(judged)

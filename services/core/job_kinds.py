@@ -1,0 +1,70 @@
+"""The kinds of job: what each goes through, who does it, and which options are its own.
+
+A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from services.core.stage import StageName
+
+COMMON_OPTIONS = frozenset({"kind", "capture", "seed", "workers", "priority"})
+"""What every kind of job may be told."""
+
+
+@dataclass(frozen=True)
+class JobKind:
+    """One kind of job."""
+
+    summary: str
+    """What is measured."""
+    stages: tuple[StageName, ...]
+    """In order, without those that make a capture."""
+    doors: Mapping[StageName, str]
+    """``module:function`` of each stage; imported by the worker alone."""
+    own_options: frozenset[str] | None
+    """Besides the common ones; None for all that no other kind claims."""
+
+    @property
+    def has_rig(self) -> bool:
+        """Whether a job of this kind may begin with a capture."""
+        return "capture" in self.doors
+
+
+_TEETH: Mapping[StageName, str] = {
+    "phantom": "services.fit.stage:phantom",
+    "capture": "services.capture.stage:run",
+    "prepare": "services.preprocess.stage:run",
+    "fit": "services.fit.stage:run",
+    "export": "services.fit.stage:export",
+}
+_SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export": "services.fit.slab.stage:export"}
+
+JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
+    {
+        "tooth": JobKind("one tooth alone", ("prepare", "fit", "export"), _TEETH, None),
+        "jaw": JobKind("all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None),
+        "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, frozenset({"effort"})),
+    }
+)
+
+
+def known_kind(name: str) -> str:
+    """The name of a kind, as it was given.
+
+    Raises:
+        ValueError: there is no such kind; the message lists those that there are.
+    """
+    if name not in JOB_KINDS:
+        raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(JOB_KINDS)}")
+    return name
+
+
+def foreign_options(kind: str, options: frozenset[str]) -> frozenset[str]:
+    """Those of some options that jobs of this kind do not have."""
+    own = JOB_KINDS[kind].own_options
+    others = frozenset().union(*(other.own_options or () for name, other in JOB_KINDS.items() if name != kind))
+    return options - COMMON_OPTIONS - own if own is not None else options & others

@@ -1,0 +1,81 @@
+"""What is kept of a wavelength that is done: its result and its images, and of which data and options."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from services.core.geometry import Record
+from services.core.slab_folder import read_folder
+from services.core.store import write_atomic, write_record
+from services.fit.numerics import numerics_name
+from services.fit.slab.fit import SlabOptions, Wavelength
+from services.fit.slab.result import SlabFit
+
+RESULT, IMAGES = "fit.json", "images.npz"
+
+
+class Kept(Record):
+    """``fit.json`` of a wavelength's folder; written last, so a folder that has it is whole."""
+
+    of: str
+    """See ``fingerprint``."""
+    fit: SlabFit
+
+
+@dataclass(frozen=True)
+class Images:
+    """A wavelength's images (images, rows, columns), measured and predicted."""
+
+    measured: NDArray[np.float64]
+    """NaN where a pixel was left out."""
+    predicted: NDArray[np.float64]
+    held_out: NDArray[np.bool_]
+    names: tuple[str, ...]
+
+
+def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
+    """Identifies all that a wavelength's result depends on."""
+    folder, digest = read_folder(root), hashlib.sha256()
+    for part in (numerics_name(), folder.model_dump_json(), options.model_dump_json(), f"{wavelength_nm:g}"):
+        digest.update(part.encode() + b"\n")
+    for image in folder.images:
+        if folder.wavelength_of(image) == wavelength_nm:
+            for file in (image.file, image.variance_file):
+                digest.update(b"none" if file is None else hashlib.sha256((root / file).read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def keep(place: Path, mark: str, wavelength: Wavelength) -> None:
+    """Write a wavelength's result into its folder."""
+    place.mkdir(parents=True, exist_ok=True)
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        measured=wavelength.measured,
+        predicted=wavelength.predicted,
+        held_out=wavelength.held_out,
+        names=np.array(wavelength.names),
+    )
+    write_atomic(place / IMAGES, stream.getvalue())
+    write_record(place / RESULT, Kept(of=mark, fit=wavelength.fit))
+
+
+def read_kept(place: Path) -> Kept | None:
+    """What is kept in a folder; None where nothing whole is."""
+    try:
+        return Kept.model_validate_json((place / RESULT).read_bytes())
+    except (FileNotFoundError, ValidationError):
+        return None
+
+
+def read_images_of(path: Path) -> Images:
+    """Images as ``keep`` wrote them."""
+    with np.load(path, allow_pickle=False) as held:
+        return Images(held["measured"], held["predicted"], held["held_out"], tuple(str(name) for name in held["names"]))

@@ -1,0 +1,147 @@
+"""Doors of the job kind ``slab``: ``run`` fits a folder's wavelengths on the workers, ``export`` writes what came out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.core.errors import CaptureInputError, JobCancelledError
+from services.core.placement import WEIGHTS
+from services.core.records import AssetManifest, JobSpec
+from services.core.slab_folder import SlabFolder, read_folder
+from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
+from services.core.store import StageWriter, open_stage, write_atomic, write_record
+from services.core.verdict import VERDICT
+
+if TYPE_CHECKING:
+    from services.fit.slab.fit import SlabOptions
+    from services.fit.slab.forward import Block, BlockSums
+    from services.fit.slab.result import SlabReport
+
+CHECKPOINT = "fit-checkpoint"
+"""Below the job's folder: one folder for every wavelength that is done, so that a new attempt goes on after them."""
+
+
+def run(spec: JobSpec, context: StageContext) -> SlabReport:
+    """Fit every wavelength, each as a task of its own, and publish ``fit/`` with their images.
+
+    Raises:
+        CaptureInputError: the folder cannot be read. JobCancelledError: between two blocks of paths.
+    """
+    from services.fit.executors import executor
+    from services.fit.slab.fit import SlabOptions
+    from services.fit.slab.images import read_images
+    from services.fit.slab.kept import IMAGES, read_kept
+    from services.fit.slab.result import SlabReport
+
+    context.report(StageEvent(stage="fit", kind="started"))
+    context.raise_if_cancelled()
+    root, folder = _folder(spec)
+    for wavelength_nm in folder.wavelengths_nm:  # a fault in the last one is told before the first has cost its time
+        read_images(root, folder, wavelength_nm)
+    writer = StageWriter(context.root, "fit", context.attempt)
+    flag, options = context.root / CANCEL_FLAG, SlabOptions(seed=spec.seed, effort=spec.effort)
+    places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
+    prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
+    fits = []
+    with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
+        run_on.gather([run_on.submit(f"{nm:g}", fit_task, root, nm, options, place, flag) for nm, place in places.items()])
+    for number, place in enumerate(places.values()):
+        kept = read_kept(place)
+        assert kept is not None
+        fits.append(kept.fit)
+        write_atomic(writer.folder / f"{place.name}.npz", (place / IMAGES).read_bytes())
+        done = (number + 1) / len(places)
+        context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit)))
+    report = SlabReport(fits=tuple(fits))
+    writer.publish(report)
+    verdict = report.verdict()
+    data = {VERDICT: verdict.model_dump(mode="json")}
+    context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=verdict.headline, data=data))
+    return report
+
+
+def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions, place: Path, flag: Path) -> str:
+    """Fit one wavelength into a folder, unless an earlier attempt has; returns the folder's name.
+
+    Raises:
+        JobCancelledError: ``flag`` exists.
+    """
+    from services.fit.slab.fit import fit_images
+    from services.fit.slab.images import read_images
+    from services.fit.slab.kept import fingerprint, keep, read_kept
+
+    mark = fingerprint(root, wavelength_nm, options)
+    kept = read_kept(place)
+    if kept is None or kept.of != mark:
+        folder = read_folder(root)
+        measured = read_images(root, folder, wavelength_nm)
+        keep(place, mark, fit_images(folder, wavelength_nm, measured, options, _cancellable(flag)))
+    return place.name
+
+
+def export(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Write parameters.json, phase.json, errors.json and report.html, and tables and scenes for Mitsuba as the asset.
+
+    Raises:
+        StoreError: the fit is missing or damaged. CaptureInputError: the folder is gone.
+    """
+    from services.fit.slab.fit import write_results
+    from services.fit.slab.kept import read_images_of
+    from services.fit.slab.report import write_report
+    from services.fit.slab.result import SlabReport
+    from services.fit.slab.tabphase import scene_xml, values_text
+
+    context.report(StageEvent(stage="export", kind="started"))
+    context.raise_if_cancelled()
+    root, folder = _folder(spec)
+    fit_folder, report = open_stage(context.root, "fit", SlabReport)
+    writer = StageWriter(context.root, "asset", context.attempt)
+    files = []
+    for fit in report.fits:
+        name = f"{fit.wavelength_nm:g}"
+        for file, text in ((f"tabphase_{name}.txt", values_text(fit)), (f"slab_{name}.xml", scene_xml(fit, folder.cell))):
+            write_atomic(writer.folder / file, text.encode())
+            files.append(file)
+    images = {fit.wavelength_nm: read_images_of(fit_folder / f"{fit.wavelength_nm:g}.npz") for fit in report.fits}
+    verdict = report.verdict()
+    provenance = {"Source": root.name, "Seed": str(spec.seed)}
+    write_report(context.root / "report.html", report, verdict, images, provenance)
+    write_results(report.fits, context.root)
+    manifest = AssetManifest(
+        files=tuple(files),
+        held_out_error=verdict.error.value,
+        converged=verdict.converged,
+        advice=verdict.advice,
+        verdict=verdict,
+    )
+    write_record(writer.folder / "asset.json", manifest)
+    writer.publish(manifest)
+    message = f"Asset of {len(files)} files written."
+    context.report(StageEvent(stage="export", kind="finished", done=1.0, message=message))
+    return manifest
+
+
+def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
+    assert spec.capture is not None  # a slab has no rig
+    if not (spec.capture / "slab.json").is_file():
+        raise CaptureInputError(f"{spec.capture} holds no slab.json, which a job of kind slab is fitted from; check option 'capture'.")
+    return spec.capture, read_folder(spec.capture)
+
+
+def _cancellable(flag: Path) -> Callable[[Callable[[Block], BlockSums], Sequence[Block]], Iterator[BlockSums]]:
+    def blocks(task: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
+        for block in some:
+            if flag.exists():
+                raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+            yield task(block)
+
+    return blocks
+
+
+def _told(fit: Any) -> str:
+    told = fit.parameters
+    parts = (f"{label} {value.value:.4g} ± {value.se:.1g}" for label, value in (("σs", told.sigma_s), ("σs′", told.sigma_s_reduced)))
+    return f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images {100 * fit.errors.fit_error:.2f} %."

@@ -1,0 +1,213 @@
+"""A job of kind slab: from its options to results, asset and report, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.api.pipeline import run_job
+from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
+from services.core.records import AssetManifest, JobSpec
+from services.core.settings import job_from_tree
+from services.core.slab_folder import SlabFolder
+from services.core.stage import CANCEL_FLAG, LocalContext
+from services.core.store import open_stage
+from services.fit.slab.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
+from services.fit.slab.forward import render
+from services.fit.slab.rig import rig_of
+from services.fit.slab.stage import CHECKPOINT, export, run
+from services.fit.slab.tabphase import tabphase_values
+from services.fit.transport.platform import prepare_device
+from tests.support.small_slab import description, write_folder
+
+TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}
+"""Scattering per mm and mean cosine by wavelength, nm. All but the slow test have the first alone."""
+ABSORPTION_PER_MM = 0.05
+
+
+def write_cell(root: Path, *wavelengths_nm: float) -> Path:
+    """A cell's folder with two lights and two cameras, the first image of each wavelength held out, 1 % noise."""
+    told, noise = description(wavelengths_nm=list(wavelengths_nm)), np.random.default_rng(1)
+    shown = [(nm, image) for nm in wavelengths_nm for image in told["images"]]
+    told["images"] = [{**image, "wavelength_nm": nm, "file": f"{nm:g}_{image['file']}"} for nm, image in shown]
+    for k in range(len(wavelengths_nm)):
+        told["images"][k * len(shown) // len(wavelengths_nm)]["held_out"] = True
+    described = SlabFolder.model_validate(told)
+    for nm in wavelengths_nm:
+        rig, medium = rig_of(described, nm), henyey_greenstein(*TRUTHS[nm], ABSORPTION_PER_MM)
+        images = render(rig, medium, seed=99, step=0, batches=1, paths=50_000, scores=False).mean
+        entries = [image for image in described.images if image.wavelength_nm == nm]
+        for entry, image in zip(entries, images, strict=True):
+            half = image.reshape(rig.grid.rows, rig.grid.columns)
+            whole = np.concatenate([half[::-1], half])
+            np.save(root / entry.file, whole + 0.01 * np.sqrt(whole * whole.mean()) * noise.normal(size=whole.shape))
+    (root / "slab.json").write_text(json.dumps(told))
+    return root
+
+
+def require_truths(root: Path, *wavelengths_nm: float) -> None:
+    """Coefficients within 4.5 of their standard errors: 1 value in 100,000 is not, and errors are themselves known to some per cent."""
+    told = json.loads((root / "parameters.json").read_text())
+    assert set(told) == {f"{nm:g}" for nm in wavelengths_nm}
+    for nm in wavelengths_nm:
+        sigma_s, g = TRUTHS[nm]
+        for name, truth in (("sigma_s", sigma_s), ("sigma_s_reduced", sigma_s * (1 - g))):
+            found = told[f"{nm:g}"][name]
+            assert found["unit"] == "1/mm"
+            assert abs(found["value"] - truth) <= 4.5 * found["se"] <= 0.4 * truth
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One wavelength."""
+    return write_cell(tmp_path_factory.mktemp("slab"), 532.0)
+
+
+@pytest.fixture(scope="module")
+def spec(folder: Path) -> JobSpec:
+    """A job of a fiftieth of the default's paths."""
+    return JobSpec(kind="slab", capture=folder, effort=0.02, seed=3)
+
+
+@pytest.fixture(scope="module")
+def job(spec: JobSpec, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its folder when it has run."""
+    root = tmp_path_factory.mktemp("job")
+    run(spec, LocalContext(root))
+    export(spec, LocalContext(root))
+    return root
+
+
+def test_results_hold_what_the_cell_holds_by_wavelength(job: Path) -> None:
+    require_truths(job, 532.0)
+    phase = json.loads((job / "phase.json").read_text())["532"]
+    assert {len(phase[name]) for name in ("theta_deg", "value_per_sr", "se_per_sr", "determined")} == {len(ANGLES_RAD)}
+    assert json.loads((job / "errors.json").read_text())["532"]["held_out_error"] < 0.1
+
+
+def test_the_report_opens_alone_and_shows_phase_functions_and_images(job: Path) -> None:
+    page = (job / "report.html").read_text()
+    assert not re.search(r"(?:src|href)=.(?!data:)", page)
+    assert page.count('<polygon class="band"') == 1
+    assert page.count("<img ") == 3 * 4
+    assert page.index("held out") < page.index(">fitted<")
+    assert "shot noise of 1 % at a pixel" in page
+
+
+def test_the_table_is_in_the_order_of_mitsubas_cosines() -> None:
+    cosines = np.linspace(-1, 1, len(tabphase_values(hg_values(0.6))))
+    values = tabphase_values(hg_values(0.6))
+    assert values[-1] == pytest.approx(hg_values(0.6)[0])
+    # Tents of 0.9 degrees instead of the formula: g and the norm are off by less than 1e-4.
+    assert 2 * np.pi * np.trapezoid(values, cosines) == pytest.approx(1, abs=1e-3)
+    assert 2 * np.pi * np.trapezoid(values * cosines, cosines) == pytest.approx(0.6, abs=1e-3)
+
+
+def test_stock_mitsuba_loads_and_renders_the_asset(job: Path) -> None:
+    prepare_device()
+    import drjit as dr
+    import mitsuba as mi
+
+    asset, manifest = open_stage(job, "asset", AssetManifest)
+    assert set(manifest.files) == {"tabphase_532.txt", "slab_532.xml"}
+    scene = mi.load_file(str(asset / "slab_532.xml"), optimize=False)
+    image = np.array(mi.render(scene, spp=4, seed=1))
+    assert np.isfinite(image).all()
+    assert 0 < image[32, 32, 0] < 1.5  # in light of radiance 1 from all sides
+    # Forward is forward: what the plugin draws has the mean cosine that parameters.json tells.
+    phase = mi.load_dict({"type": "tabphase", "values": (asset / "tabphase_532.txt").read_text()})
+    interaction, count = dr.zeros(mi.MediumInteraction3f, 100_000), 100_000
+    interaction.wi = mi.Vector3f(0, 0, 1)
+    interaction.sh_frame = mi.Frame3f(interaction.wi)
+    draws = mi.PCG32(size=count)
+    where = mi.Point2f(draws.next_float32(), draws.next_float32())
+    drawn, *_ = phase.sample(mi.PhaseFunctionContext(), interaction, mi.Float(0.5), where)
+    mean = float(dr.mean(dr.dot(drawn, -interaction.wi))[0])
+    told = json.loads((job / "parameters.json").read_text())["532"]["g"]["value"]
+    assert mean == pytest.approx(told, abs=0.01)  # 5 standard errors of 100,000 draws
+
+
+def copied_checkpoint(job: Path, root: Path) -> Path:
+    """What an attempt left behind that was killed when its wavelength was done."""
+    shutil.copytree(job / CHECKPOINT, root / CHECKPOINT)
+    return root
+
+
+def stored_fits(job: Path) -> list[dict[str, Any]]:
+    """As the fit published them."""
+    fits: list[dict[str, Any]] = json.loads((job / "fit" / "manifest.json").read_text())["record"]["fits"]
+    return fits
+
+
+def test_a_new_attempt_takes_the_wavelengths_that_are_done(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    again = run(spec, LocalContext(copied_checkpoint(job, tmp_path), attempt=2))
+    assert [json.loads(fit.model_dump_json()) for fit in again.fits] == stored_fits(job)  # their core-seconds too
+
+
+@pytest.mark.slow
+def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    (copied_checkpoint(job, tmp_path) / CHECKPOINT / "532" / "fit.json").write_text("{")
+    again = run(spec, LocalContext(tmp_path, attempt=2)).fits[0]
+    assert json.loads(again.parameters.model_dump_json()) == stored_fits(job)[0]["parameters"]
+    assert again.core_seconds != stored_fits(job)[0]["core_seconds"]
+
+
+def test_a_cancel_ends_the_fit_between_two_blocks(spec: JobSpec, tmp_path: Path) -> None:
+    from services.fit.slab.fit import SlabOptions
+    from services.fit.slab.stage import fit_task
+
+    assert spec.capture is not None
+    (tmp_path / CANCEL_FLAG).touch()
+    with pytest.raises(JobCancelledError):
+        fit_task(None, spec.capture, 532.0, SlabOptions(effort=0.05), tmp_path / "532", tmp_path / CANCEL_FLAG)
+
+
+def test_a_folder_of_no_slab_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureInputError, match=r"holds no slab\.json, which a job of kind slab is fitted from"):
+        run(JobSpec(kind="slab", capture=tmp_path), LocalContext(tmp_path / "job"))
+
+
+def test_a_fault_of_the_last_wavelength_is_told_before_the_first_is_fitted(folder: Path, tmp_path: Path) -> None:
+    told = json.loads((folder / "slab.json").read_text())
+    write_folder(tmp_path / "cell", told)
+    np.save(tmp_path / "cell" / told["images"][-1]["file"], np.zeros((3, 3)))
+    with pytest.raises(CaptureInputError, match=told["images"][-1]["file"]):
+        run(JobSpec(kind="slab", capture=tmp_path / "cell"), LocalContext(tmp_path / "job"))
+    assert not (tmp_path / "job" / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"kind": "slap"}, "there is no kind of job 'slap'; the kinds are tooth, jaw, slab"),
+        ({"kind": "slab", "dentin": "none"}, "a job of kind slab has no option 'dentin'; it has capture, effort, kind"),
+        ({"kind": "slab", "rig": {"mouth": "demo"}, "capture": None}, "a job of kind slab has no option 'rig'"),
+        ({"kind": "jaw", "effort": 2.0}, "a job of kind jaw has no option 'effort'; it has adam_rate"),
+        ({"kind": "slab", "effort": 0}, "greater than or equal to 0.01"),
+    ],
+)
+def test_options_that_a_kind_does_not_have_are_refused(options: dict[str, object], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=re.escape(sentence)):
+        job_from_tree({"capture": "cell"} | options, tmp_path, "JOB.toml")
+
+
+def test_options_of_a_slab_are_read_again_as_they_were_stored(spec: JobSpec) -> None:
+    assert JobSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+@pytest.mark.slow
+def test_wavelengths_are_fitted_on_two_workers_as_they_are_on_one(tmp_path: Path) -> None:
+    (cell := tmp_path / "cell").mkdir()
+    write_cell(cell, *TRUTHS)
+    asset = run_job(JobSpec(kind="slab", capture=cell, effort=0.02, workers=2), tmp_path / "two")
+    assert asset.converged
+    require_truths(tmp_path / "two", *TRUTHS)
+    run_job(JobSpec(kind="slab", capture=cell, effort=0.02, workers=1), tmp_path / "one")
+    for name in ("parameters.json", "phase.json", "errors.json"):
+        assert (tmp_path / "one" / name).read_text() == (tmp_path / "two" / name).read_text()
