@@ -211,11 +211,11 @@ class Jobs:
 
     def waits_for(self, job: Job) -> str | None:
         """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
-        if job.state is JobState.RUNNING:
-            return self._admission.reason(job.id)
-        if job.state is not JobState.QUEUED:
+        if job.state not in {JobState.RUNNING, JobState.QUEUED}:
             return None
-        return self._admission.reason(job.id) or (None if self.is_running() else "This server does not run jobs; restart it and read its log.")
+        if (reason := self._admission.reason(job.id)) is not None:
+            return self.server_paths.tell(reason, self.locate(job.spec))
+        return None if job.state is JobState.RUNNING or self.is_running() else "This server does not run jobs; restart it and read its log."
 
     def _is_kept_by(self, job: Job) -> str | None:
         return self._admission.reason(job.id, besides_turn=True) if job.state is JobState.QUEUED else None

@@ -42,7 +42,7 @@ class Runner:
         locate: a job's options with the folder of an uploaded capture.
         on_round: called every so often.
         on_success: called with a job that has succeeded, and how many on average ran while it did.
-        tell: why a job failed, as those who look at jobs may read it.
+        tell: why a job failed or waits, as those who look at jobs may read it.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Runner:
                 return
             spec, is_to_capture = self._locate(job.spec), first_stage(job.spec, self._folder(job.id)) == "capture"
             if self._admission.holds(job.id, spec, is_to_capture=is_to_capture):
-                self._tell_obstacle(job.id)
+                self._tell_obstacle(job.id, spec)
                 continue
             self._told_obstacles.pop(job.id, None)
             try:
@@ -151,7 +151,7 @@ class Runner:
                 self._running[job.id] = lease, thread
             thread.start()
 
-    def _tell_obstacle(self, job_id: str) -> None:
+    def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
         # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers change all the time. That others
         # are before it is nothing to act on.
         reason = self._admission.reason(job_id, besides_turn=True)
@@ -159,7 +159,7 @@ class Runner:
         if kind != self._told_obstacles.get(job_id):
             self._told_obstacles[job_id] = kind
             if reason is not None:
-                self._repository.tell(job_id, reason)
+                self._repository.tell(job_id, self._tell(reason, located))
 
     def _run_in_thread(self, lease: Lease) -> None:
         job = lease.job

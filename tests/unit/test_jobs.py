@@ -111,3 +111,21 @@ def test_a_job_is_told_to_stop_while_the_database_keeps_writers_waiting(service:
         assert service.repository.get(job.id).state is JobState.RUNNING
     cancelling.join()
     assert service.repository.get(job.id).state is JobState.CANCELLING
+
+
+def test_why_a_job_waits_is_told_as_an_event_once_and_without_the_servers_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    service = Jobs(ServerSettings(data=data, job_roots=str(tmp_path)), lambda *_: None)
+    reasons = [f"Waits for disk: The disk was full at {data}/jobs/x; free some space.", "Waits for disk: 0.1 GiB are free.", "Waits for a place: job 1 runs."]
+    try:
+        job = service.submit(JobSpec(capture=tmp_path)).job
+        monkeypatch.setattr(service._admission, "holds", lambda *_, **__: True)
+        for reason in (*reasons[:2], *reasons):
+            service._admission._reasons[job.id] = reason
+            monkeypatch.setattr(service._admission, "begin_round", lambda _: None)
+            service._runner._start_what_may()
+            assert str(data) not in (service.waits_for(job) or "")
+        told = [event.message for event in service.repository.events_of(job.id).read(kind="log")]
+        assert told == ["Waits for disk: The disk was full at jobs/x; free some space."]
+    finally:
+        service.repository.close()
