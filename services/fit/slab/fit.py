@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Record
 from services.core.slab_folder import SlabFolder, read_folder
 from services.core.store import write_atomic
+from services.fit.slab.diagnosis import sample_faults
 from services.fit.slab.dictionary import Material
 from services.fit.slab.forward import Blocks, render
 from services.fit.slab.gauss_newton import Budget, GaussNewton
@@ -82,7 +83,7 @@ def fit_images(
         parameters=parameters_of(material, uncertainty, rig.interface.index),
         phase=phase,
         errors=_errors(measured, first, second),
-        notes=_notes(measured, phase, converged=solution.converged),
+        notes=measured.faults + sample_faults(material, rig.width_mm) + _notes(measured, phase, converged=solution.converged),
         converged=solution.converged,
         steps=solution.steps,
         paths=solution.paths,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.slab_folder import SlabFolder, SlabImage
+from services.fit.slab.diagnosis import grid_faults, image_faults
 from services.fit.slab.rig import Grid, grid_of
 
 Array = NDArray[np.float64]
@@ -31,6 +32,8 @@ class Measurements:
     """Camera and light of each image."""
     assumed_noise: bool
     """Whether some image came without its variance."""
+    faults: tuple[str, ...] = ()
+    """Sentences on what seems wrong with the images; see ``diagnosis``."""
 
 
 def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measurements:
@@ -43,13 +46,14 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
     if not entries:
         raise CaptureInputError(f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength.")
-    values, variances = [], []
+    values, variances, faults = [], [], list(grid_faults(folder.pixels))
     for entry in entries:
         image = _read(root, folder, entry, entry.file)
         variance = shot_noise(image) if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
         usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
         if not usable.any():
             raise CaptureInputError(f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again.")
+        faults += image_faults(f"{entry.camera} under {entry.light}", image, folder.pixels, folder.beam)
         value, of_value = _folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
         values.append(value)
         variances.append(of_value)
@@ -58,7 +62,7 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
     return Measurements(
         np.stack(values), np.stack(variances), held_out, tuple(f"{entry.camera} under {entry.light}" for entry in entries),
-        any(entry.variance_file is None for entry in entries),
+        any(entry.variance_file is None for entry in entries), tuple(faults),
     )  # fmt: skip
 
 

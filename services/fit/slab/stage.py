@@ -40,7 +40,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     context.raise_if_cancelled()
     root, folder = _folder(spec)
     for wavelength_nm in folder.wavelengths_nm:  # a fault in the last one is told before the first has cost its time
-        read_images(root, folder, wavelength_nm)
+        for fault in read_images(root, folder, wavelength_nm).faults:
+            context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
     writer = StageWriter(context.root, "fit", context.attempt)
     flag, options = context.root / CANCEL_FLAG, SlabOptions(seed=spec.seed, effort=spec.effort)
     places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}

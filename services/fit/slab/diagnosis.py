@@ -1,0 +1,83 @@
+"""Whether a cell's images can tell its phase function, and what to measure instead.
+
+Images are looked at one by one before the fit. How thick and how absorbing the sample is comes from the fit itself: the HG
+medium that it starts from takes a thin sample and an absorbing one for each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.slab_folder import Beam, PixelGrid
+from services.fit.slab.dictionary import Material
+
+Array = NDArray[np.float64]
+
+THINNEST, THICKEST = 0.1, 10.0
+"""Range of sigma_t w in which images tell a phase function (Gkioulekas et al. 2013, figure 6): below, they hold little but
+noise, above, light has forgotten each single deflection."""
+BEST = 2.0
+"""sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
+LEAST_ALBEDO = 0.2
+"""Below, most of what scatters is absorbed before it leaves, and higher orders add nothing."""
+MOST_AT_MAXIMUM = 4
+"""Pixels that may share an image's largest value: as many as are alike by symmetry in an image without noise."""
+LEAST_LIT = 0.5
+"""Share of an image's maximum from which pixels count for where the beam is."""
+MOST_OFF = 1.0
+"""How far the beam may lie beside y = 0, in pixels and in beams' sizes, whichever is more."""
+
+
+def image_faults(name: str, image: Array, pixels: PixelGrid, beam: Beam) -> tuple[str, ...]:
+    """What is wrong with one image (rows, columns) as taken, a sentence each.
+
+    Args:
+        name: camera and light, such as "b0 under l1".
+    """
+    finite = np.where(np.isfinite(image), image, -np.inf)
+    largest = float(finite.max())
+    if largest <= 0:
+        return (f"Image {name} holds no light; check its exposure and its file.",)
+    if (count := int((finite == largest).sum())) > MOST_AT_MAXIMUM:
+        what = f"Image {name} looks saturated: {count} pixels hold its largest value, {largest:.4g}"
+        return (f"{what}; expose it for less long, or give those pixels no value (NaN).",)
+    return _off_axis(name, finite, largest, pixels, beam)
+
+
+def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: Beam) -> tuple[str, ...]:
+    # Beams and cameras lie in the plane y = 0, so every image is symmetric about it.
+    low, high = pixels.y_mm
+    pitch_mm = (high - low) / pixels.rows
+    y_mm = low + pitch_mm * (np.arange(pixels.rows) + 0.5)
+    lit = np.where(image >= LEAST_LIT * largest, image, 0.0)
+    centre_mm = float(lit.sum(axis=1) @ y_mm / lit.sum())
+    if abs(centre_mm) <= MOST_OFF * max(pitch_mm, beam.size_mm):
+        return ()
+    return (f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct pixels.y_mm.",)
+
+
+def grid_faults(pixels: PixelGrid) -> tuple[str, ...]:
+    """Whether the beam's axis, which meets its face at x = y = 0, lies where pixels are."""
+    beside = [axis for axis, (low, high) in (("x", pixels.x_mm), ("y", pixels.y_mm)) if not low < 0 < high]
+    return tuple(f"The beam meets the cell at {axis} = 0, beside the pixels; correct pixels.{axis}_mm." for axis in beside)
+
+
+def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
+    """Whether the sample is too thin, too thick or too absorbing to tell its phase function, and what to measure instead."""
+    thickness = material.extinction_per_mm * width_mm
+    albedo = material.scattering_per_mm / material.extinction_per_mm
+    known = f"σt·w is about {thickness:.2g}, and images tell a phase function from {THINNEST:g} to {THICKEST:g}"
+    told = []
+    if thickness < THINNEST:
+        what = f"concentrate it {BEST / thickness:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
+        told.append(f"The sample is too thin: {known}; {what}.")
+    if thickness > THICKEST:
+        what = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
+        told.append(f"The sample is too thick: {known}; {what}.")
+    if albedo < LEAST_ALBEDO:
+        told.append(
+            f"The sample absorbs too much: about {100 * (1 - albedo):.0f} % of what meets a particle is absorbed, and little but "
+            "single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a thinner cell."
+        )
+    return tuple(told)

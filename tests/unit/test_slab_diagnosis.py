@@ -1,0 +1,78 @@
+"""What is said of a cell's images before a fit: each fault is told with its number and remedy, and good images say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.core.slab_folder import Beam, PixelGrid, SlabFolder
+from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults
+from services.fit.slab.dictionary import henyey_greenstein
+from services.fit.slab.fit import SlabOptions, fit_images
+from services.fit.slab.forward import render
+from services.fit.slab.images import Measurements, shot_noise
+from tests.support.small_slab import description, small_rig
+
+PIXELS = PixelGrid(x_mm=(-4.0, 4.0), y_mm=(-4.0, 4.0), columns=16, rows=16)
+BEAM = Beam(profile="gaussian", sigma_mm=0.25)
+
+
+def spot(y_mm: float = 0.0, noise: float = 0.0) -> NDArray[np.float64]:
+    """A blurred beam."""
+    at = -4.0 + 0.5 * (np.arange(16) + 0.5)
+    image = np.exp(-np.abs(at[:, None] - y_mm) - np.abs(at[None, :]))
+    return np.asarray(image * (1 + noise * np.random.default_rng(1).normal(size=image.shape)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
+def test_a_good_image_says_nothing(noise: float) -> None:
+    assert image_faults("b0 under l0", spot(noise=noise), PIXELS, BEAM) == ()
+    assert grid_faults(PIXELS) == ()
+
+
+@pytest.mark.parametrize(
+    ("image", "sentence"),
+    [
+        (np.minimum(spot(noise=0.01), 0.3), "Image b0 under l0 looks saturated: 12 pixels hold its largest value, 0.3; "),
+        (spot(y_mm=1.5), "In image b0 under l0 the light lies 1.5 mm off the plane y = 0; "),
+        (np.zeros((16, 16)), "Image b0 under l0 holds no light; "),
+        (np.full((16, 16), np.nan), "Image b0 under l0 holds no light; "),
+    ],
+)
+def test_a_faulty_image_is_told_with_its_number_and_remedy(image: NDArray[np.float64], sentence: str) -> None:
+    (told,) = image_faults("b0 under l0", image, PIXELS, BEAM)
+    assert told.startswith(sentence)
+
+
+def test_pixels_that_lie_beside_the_beam_are_told() -> None:
+    (told,) = grid_faults(PIXELS.model_copy(update={"x_mm": (1.0, 9.0)}))
+    assert told == "The beam meets the cell at x = 0, beside the pixels; correct pixels.x_mm."
+
+
+@pytest.mark.parametrize(
+    ("sigma_s", "sigma_a", "sentences"),
+    [
+        (1.0, 0.05, ()),
+        (0.04, 0.001, ("The sample is too thin: σt·w is about 0.041",)),
+        (20.0, 0.0, ("The sample is too thick: σt·w is about 20, and images tell a phase function from 0.1 to 10; dilute it 10-fold",)),
+        (0.1, 0.9, ("The sample absorbs too much: about 90 % ",)),
+    ],
+)
+def test_a_sample_that_tells_nothing_is_told_with_what_to_measure(sigma_s: float, sigma_a: float, sentences: tuple[str, ...]) -> None:
+    found = sample_faults(henyey_greenstein(sigma_s, 0.5, sigma_a), width_mm=1.0)
+    assert len(found) == len(sentences)
+    assert all(told.startswith(sentence) for told, sentence in zip(found, sentences, strict=True))
+
+
+@pytest.mark.slow
+def test_a_fit_of_an_absorbing_sample_says_so_and_not_that_it_is_thin() -> None:
+    # The medium that a fit starts from has a sigma_t w of 0.05 here.
+    rig, rng = small_rig(), np.random.default_rng(1)
+    exact = render(rig, henyey_greenstein(0.15, 0.5, 1.5), seed=9, step=0, batches=1, paths=100_000, scores=False).mean
+    variances = np.stack([shot_noise(image) for image in exact])
+    images = exact + np.sqrt(variances) * rng.normal(size=exact.shape)
+    measured = Measurements(images, variances, np.zeros(len(images), dtype=bool), ("a",) * len(images), True)
+    notes = fit_images(SlabFolder.model_validate(description()), 532.0, measured, SlabOptions(effort=0.1)).fit.notes
+    assert sum(note.startswith("The sample absorbs too much: ") for note in notes) == 1
+    assert not any(note.startswith("The sample is too") for note in notes)
