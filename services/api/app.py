@@ -27,11 +27,12 @@ PHANTOMS = "phantoms"
 """In the data folder: mouths of demonstrations, each rendered once. Whatever is removed there is made again."""
 STATIC = Path(__file__).parent / "dashboard" / "static"
 DARKENERS = 8
-"""Threads that do nothing but ALL OFF, so that nothing that hangs keeps anybody from darkness: as many as may be asked for at once."""
+"""Threads that do nothing but ALL OFF, so that nothing that hangs keeps anybody from darkness: as many as may be asked
+for at once."""
 CANCELLERS = 4
 """Threads that cancel jobs. Each of them may wait for the database, which ALL OFF does only once it is dark."""
 OPERATORS = 8
-"""Threads that ask a dome for its state and light single lights. One that hangs holds each of them for half a minute."""
+"""Threads that ask a dome for its state and light single lights. A dome that hangs holds each for half a minute."""
 UNBUILT = STATIC.with_name("unbuilt")
 """The page that says how the dashboard is built."""
 
@@ -90,7 +91,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
 
     readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
     # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
-    darkeners, dark_auditors, cancellers, operators = Clerks(DARKENERS), Clerks(1), Clerks(CANCELLERS), Clerks(OPERATORS)
+    darkeners, dark_auditors = Clerks(DARKENERS), Clerks(1)
+    cancellers, operators = Clerks(CANCELLERS), Clerks(OPERATORS)
     feed = EventFeed(jobs.repository, readers.ask)
     observation = Observation(jobs, settings, readers, openers, certificates, None if run else workers.condition)
 

@@ -1,4 +1,7 @@
-"""Bodies in JSON, refused at their first faults: to list hundreds of thousands of them takes seconds in which the loop serves nobody."""
+"""Bodies in JSON, refused at their first faults.
+
+To list hundreds of thousands of them takes seconds in which the loop serves nobody.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from pydantic import ValidationError, ValidatorFunctionWrapHandler, WrapValidato
 from pydantic_core import PydanticCustomError
 
 MOST_FAULTS = 100
-"""More are counted, and not listed: whoever sends so many has sent something else than was asked for. No record has so many members either."""
+"""More are counted, and not listed: whoever sends so many has sent something else than was asked for. No record has so
+many members either."""
 T = TypeVar("T")
 
 

@@ -56,7 +56,9 @@ class Chapter:
     @property
     def told(self) -> bytes:
         """As a stream of this job alone sends it."""
-        return self.text if self.ended is None else self.text + format_sse_event(event="end", data_str=f'"{self.ended}"')
+        if self.ended is None:
+            return self.text
+        return self.text + format_sse_event(event="end", data_str=f'"{self.ended}"')
 
 
 @dataclass
@@ -141,10 +143,11 @@ class EventFeed:
                 turn = following
 
     async def follow_several(self, after: Mapping[str, int]) -> AsyncIterator[bytes]:
-        """Events of several jobs in one stream, each after an id, replayed and then live, until all have ended or are deleted.
+        """Events of several jobs in one stream, each after an id, replayed and then live.
 
-        A browser has six connections to a server; a stream for each job that it shows would leave none for anything else. Each job ends with event 'end',
-        whose data names it and its final state, null for a job that is not there.
+        The stream ends once all of them have ended or are deleted. A browser has six connections to a server; a stream
+        for each job that it shows would leave none for anything else. Each job ends with event 'end', whose data names
+        it and its final state, null for a job that is not there.
         """
         reached, due, turn = dict(after), set(after), self._turns[-1]
         while reached:

@@ -148,7 +148,7 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: it has ended.
         """
         if self.repository.get(job_id).state is JobState.RUNNING:
-            # Darkness before the record of it: whoever reads the database never waits, and whoever writes may wait for seconds.
+            # Darkness before the record of it: whoever reads the database never waits, whoever writes may for seconds.
             self._tell_to_stop(job_id)
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
             self._tell_to_stop(job_id)  # again, as a job that was just begun forgets what was told before

@@ -74,7 +74,13 @@ class Health(Record):
 
 
 def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, lookers: Clerks, cancellers: Clerks) -> APIRouter:
-    """Routes over the given jobs; ``openers`` read their files, ``lookers`` their captures, which may hang, and ``cancellers`` cancel."""
+    """Routes over the given jobs.
+
+    Args:
+        openers: read their files.
+        lookers: read their captures, which may hang.
+        cancellers: cancel.
+    """
     router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
 
@@ -174,7 +180,10 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
 
     @router.get("/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
     async def events_of_several(asker: Asker, job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MOST_STREAMED, description=_PLACE)]) -> Response:
-        """The events of several jobs in one stream, as a browser has few connections; event 'end' names the job and its final state, null for an absent one."""
+        """The events of several jobs in one stream, as a browser has few connections.
+
+        Event 'end' names the job and its final state, null for an absent one.
+        """
         places = {job_id: int(after or 0) for job_id, _, after in (place.partition(":") for place in job)}
         seen = await readers.ask(jobs.repository.seen, places, asker)
 

@@ -152,8 +152,8 @@ class Runner:
             thread.start()
 
     def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
-        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers change all the time. That others
-        # are before it is nothing to act on.
+        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers
+        # change all the time. That others are before it is nothing to act on.
         reason = self._admission.reason(job_id, besides_turn=True)
         kind = None if reason is None else reason.partition(":")[0]
         if kind != self._told_obstacles.get(job_id):

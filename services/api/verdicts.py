@@ -1,4 +1,7 @@
-"""How well the fits of jobs went: read from the events with which they finished, as many jobs are listed at once and their folders may hang."""
+"""How well the fits of jobs went.
+
+Read from the events with which they finished, as many jobs are listed at once and their folders may hang.
+"""
 
 from __future__ import annotations
 

@@ -33,7 +33,8 @@ from services.core.errors import InterlockError, ReadbackError, RigError, RigSto
 
 REPLY_TIMEOUT_S = 0.5
 IDENTITY_TIMEOUT_S = 0.1
-"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and one that is late may be lit."""
+"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and
+one that is late may be lit."""
 HANG_MARGIN_S = 2.0
 DARK_ATTEMPTS = 3
 

@@ -1,8 +1,8 @@
 """How well a fit went: the one judgement that the report, the page, the API and the command line show.
 
-Whether a job *succeeded* says that its stages ran to their end; whether its fit *converged* says whether to believe the numbers. The first is a stored state
-of the job's life, the second is derived here from the fit's report and is no state: a job is retried, deleted and told of by its life alone, and the states
-that version 0.1 has stored keep their meaning.
+Whether a job *succeeded* says that its stages ran to their end; whether its fit *converged* says whether to believe the
+numbers. The first is a stored state of the job's life, the second is derived here from the fit's report and is no state:
+a job is retried, deleted and told of by its life alone, and the states that version 0.1 has stored keep their meaning.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Literal
 from services.core.records import Figure, FitReport, Verdict
 
 MAX_ERROR = 0.15
-"""Relative error on the fitted or on the held-out images of a channel above which a fit is not called converged, however its solver ended."""
+"""Relative error on the fitted or on the held-out images of a channel above which a fit is not called converged,
+however its solver ended."""
 _HELD_OUT: Literal["held-out"] = "held-out"
 _FITTED: Literal["fitted"] = "fitted"
 VERDICT = "verdict"

@@ -246,8 +246,9 @@ export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "
 export const getDome = (): Promise<DomeState> => inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
 
 /**
- * ALL OFF waits for no lane, and the stream of events makes room for it. A server that asks nobody for a token is sent no cookie either: browsers keep
- * connections with and without cookies apart, so that this one is free whatever else is under way, downloads too.
+ * ALL OFF waits for no lane, and the stream of events makes room for it. A server that asks nobody for a token is sent
+ * no cookie either: browsers keep connections with and without cookies apart, so that this one is free whatever else is
+ * under way, downloads too.
  */
 export function allOff(isOpen: boolean): Promise<{ status: DomeStatus; stopped: string[] }> {
   clearTheWay();

@@ -1,6 +1,6 @@
 /**
- * One stream of events for all pages of a browser, which opens six connections to a server and no more: a stream for each page would leave none for
- * ALL OFF. Runs in a shared worker, or in the page itself where there is none.
+ * One stream of events for all pages of a browser, which opens six connections to a server and no more: a stream for
+ * each page would leave none for ALL OFF. Runs in a shared worker, or in the page itself where there is none.
  */
 
 const REOPEN_MS = 3000;

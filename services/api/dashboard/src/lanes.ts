@@ -1,6 +1,7 @@
 /**
- * How many requests all pages of a browser have under way at once. A browser opens six connections to a server by HTTP/1.1: one is for the stream of
- * events, one for an upload, three for all that is asked, and so one is left for ALL OFF, which takes no lane.
+ * How many requests all pages of a browser have under way at once. A browser opens six connections to a server by
+ * HTTP/1.1: one is for the stream of events, one for an upload, three for all that is asked, and so one is left for ALL
+ * OFF, which takes no lane.
  */
 
 const LANES = 3;
