@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from fastapi import APIRouter, FastAPI
 
-from services.api import gate
+from services.api import body_limit, gate
 from services.api.app import create_app
 from services.api.guard import LIVENESS, SETUP, guarded_routes, needs
 from services.api.sessions import COOKIE
@@ -431,6 +431,15 @@ def test_a_stream_without_end_is_refused_when_it_passes_the_limit(small: Guarded
     answer = raw_exchange(small, head(small, "/v1/jobs", "Transfer-Encoding: chunked"), [chunk] * 6)
     assert answer.startswith(b"HTTP/1.1 413")
     assert b"body-too-large" in answer
+
+
+@pytest.mark.attack("exhaustion", "a body that comes a byte at a time, a stranger's with a setup link among them")
+@pytest.mark.parametrize(("path", "scope"), [("/v1/jobs", Scope.SUBMIT), ("/v1/setup", None)])
+def test_a_body_that_does_not_end_is_given_up(small: Guarded, monkeypatch: pytest.MonkeyPatch, path: str, scope: Scope | None) -> None:
+    monkeypatch.setattr(body_limit, "MAX_BODY_S", 0.3)
+    answer = raw_exchange(small, head(small, path, "Content-Length: 1000", scope=scope), [b"{"])
+    assert answer.startswith(b"HTTP/1.1 408")
+    assert b"request-timeout" in answer
 
 
 @pytest.mark.attack("exhaustion", "a stranger's body")
