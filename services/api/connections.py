@@ -1,7 +1,7 @@
 """The connections of one server: how many there may be, and how long each may keep a request to itself before its head is whole.
 
 Whoever opens connections and sends no whole request, by mistake or to keep others out, loses them: after ``header_s``, or at once where a newcomer
-finds all places taken. So there is always one for ALL OFF.
+finds all places taken; those that have sent a request before are closed last. So there is always one for ALL OFF.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ _TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-lengt
 
 
 class Crowd:
-    """The open connections, and of those the ones without a request, longest waiting first."""
+    """The open connections, and of those the ones without a request, longest waiting first: those that never sent one, and those that did."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.most, self.header_s = min(limits.most, round(MAX_SHARE * raise_descriptors())), limits.header_s
         self.open: set[BoundedProtocol] = set()
-        self.waiting: dict[BoundedProtocol, None] = {}
+        self.fresh: dict[BoundedProtocol, None] = {}
+        self.served: dict[BoundedProtocol, None] = {}
         self._told_at: dict[str, float] = {}
 
     def admit(self, newcomer: BoundedProtocol) -> bool:
@@ -52,7 +53,7 @@ class Crowd:
 
     def shed(self, count: int) -> int:
         """Close so many connections without a request; returns how many there were."""
-        chosen = list(self.waiting)[:count]
+        chosen = [*self.fresh, *self.served][:count]
         for one in chosen:
             self.leave(one)
             one.transport.abort()
@@ -63,7 +64,16 @@ class Crowd:
     def leave(self, one: BoundedProtocol) -> None:
         """Forget a connection."""
         self.open.discard(one)
-        self.waiting.pop(one, None)
+        self.end_wait(one)
+
+    def wait(self, one: BoundedProtocol, *, is_fresh: bool) -> None:
+        """Note that a connection has no request."""
+        (self.fresh if is_fresh else self.served)[one] = None
+
+    def end_wait(self, one: BoundedProtocol) -> None:
+        """Note that it has one, or is closed."""
+        self.fresh.pop(one, None)
+        self.served.pop(one, None)
 
     def tell(self, message: str, *values: object) -> None:
         """Log something once, and again after a while if it goes on."""
@@ -121,11 +131,11 @@ class BoundedProtocol(H11Protocol):
 
     def _await_request(self) -> None:
         self._end_wait()
-        self._crowd.waiting[self] = None
+        self._crowd.wait(self, is_fresh=self.cycle is None)
         self._limit = self.loop.call_later(self._crowd.header_s, self._close)
 
     def _end_wait(self) -> None:
-        self._crowd.waiting.pop(self, None)
+        self._crowd.end_wait(self)
         if self._limit is not None:
             self._limit.cancel()
             self._limit = None

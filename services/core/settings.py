@@ -43,7 +43,7 @@ class UploadLimits(Record):
 class ConnectionLimits(Record):
     """How many connections a server keeps, and how long each may wait for a request."""
 
-    most: int = Field(default=1000, ge=8, description="connections at once; beyond them those without a request make room, longest waiting first")
+    most: int = Field(default=2000, ge=8, description="connections at once; beyond them those without a request make room, longest waiting first")
     header_s: float = Field(default=10.0, gt=0, description="a connection is closed if the head of a request is not whole by then")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import http.client
 import json
 import os
 import shutil
@@ -112,14 +113,22 @@ def half_open(address: httpx.URL, count: int) -> list[socket.socket]:
 @pytest.mark.attack("exhaustion", "more half-open connections than there are places")
 def test_half_open_connections_keep_nobody_from_all_off(served: tuple[httpx.Client, Path]) -> None:
     client, _ = served
+    known = http.client.HTTPConnection(client.base_url.host, client.base_url.port, timeout=20)
+    known.request("GET", "/v1/health/live")
+    assert known.getresponse().read()
+    kept = known.sock
     opened = half_open(client.base_url, 3 * PLACES)
     try:
+        known.request("GET", "/v1/health/live")  # whoever has asked before is closed last
+        assert known.getresponse().status == 200
+        assert known.sock is kept
         for _ in range(3):
             with httpx.Client(base_url=client.base_url, timeout=20) as newcomer:
                 assert newcomer.post("/v1/dome/off").status_code == 200
         closed = [one for one in opened[:PLACES] if is_closed(one)]
         assert len(closed) == PLACES  # those that have waited longest
     finally:
+        known.close()
         for one in opened:
             one.close()
 
