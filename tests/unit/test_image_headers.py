@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.api.capture_contents import content_fault
@@ -128,6 +128,7 @@ def test_python_objects_are_refused(tmp_path: Path) -> None:
     assert "Python objects" in (fault(tmp_path, "a.npy", stream.getvalue()) or "")
 
 
+@settings(deadline=None)
 @given(st.sampled_from(HEADS), st.integers(0, 60), st.binary(max_size=8))
 @pytest.mark.attack("uploads", "a damaged header")
 def test_damaged_headers_are_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: Any, at: int, noise: bytes) -> None:
@@ -137,6 +138,7 @@ def test_damaged_headers_are_a_sentence_or_harmless(tmp_path_factory: pytest.Tem
     assert detail is None or detail.startswith((f"image{suffix} cannot be read", f"Image image{suffix} declares", f"Image image{suffix} carries metadata"))
 
 
+@settings(deadline=None)
 @given(st.sampled_from([".npy", ".png", ".tif", ".exr"]), st.binary(max_size=200))
 @pytest.mark.attack("uploads", "noise for an image")
 def test_noise_is_no_image(tmp_path_factory: pytest.TempPathFactory, suffix: str, noise: bytes) -> None:

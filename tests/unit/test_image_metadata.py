@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.api.image_metadata import metadata_fault, plain_png
@@ -87,6 +87,7 @@ def test_a_plain_exr_passes(tmp_path: Path) -> None:
     assert metadata_fault(tmp_path / "absent", "a.npy", ".npy") is None
 
 
+@settings(deadline=None)
 @given(st.sampled_from([(".png", told_png()), (".tif", written(".tif", exif=exif()))]), st.integers(0, 400), st.binary(max_size=8))
 def test_damage_is_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: tuple[str, bytes], at: int, noise: bytes) -> None:
     suffix, content = row
