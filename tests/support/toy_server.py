@@ -6,11 +6,12 @@ Leases are short, as tests wait for them.
 from __future__ import annotations
 
 import sys
+from typing import get_args
 from unittest.mock import patch
 
-from services.api.pipeline import DOORS
 from services.api.server import serve
 from services.core.settings import ServerSettings
+from services.core.stage import StageName
 
 LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 
@@ -22,7 +23,7 @@ def main(settings: ServerSettings, stages: str = "tests.support.toy_stages") -> 
         patch("services.api.runner.ROUND_S", ROUND_S),
         patch("services.api.admission.RETRY_S", RETRY_S),
     ):
-        serve(settings, doors={stage: f"{stages}:{stage}" for stage in DOORS})
+        serve(settings, doors={stage: f"{stages}:{stage}" for stage in get_args(StageName)})
 
 
 if __name__ == "__main__":
