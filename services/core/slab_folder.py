@@ -105,6 +105,15 @@ class SlabImage(Record):
     held_out: bool = False
 
 
+class ThroughBeam(Record):
+    """Where a slanted beam leaves the other face, unscattered: what tells the sample's index."""
+
+    light: Name
+    wavelength_nm: Positive | None = Field(default=None, description="null where it holds for all")
+    peak_x_mm: float = Field(description="of its peak, from where the beam's axis meets its own face")
+    se_mm: Positive = Field(description="standard error of the peak")
+
+
 class SlabFolder(Record):
     """What ``slab.json`` says."""
 
@@ -117,6 +126,7 @@ class SlabFolder(Record):
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
     cameras: Annotated[tuple[SlabCamera, ...], Field(min_length=1)]
     images: Annotated[tuple[SlabImage, ...], Field(min_length=1)]
+    through_beam: tuple[ThroughBeam, ...] = ()
 
     @model_validator(mode="after")
     def _names_agree(self) -> SlabFolder:
@@ -124,8 +134,7 @@ class SlabFolder(Record):
             names = [thing.name for thing in things]
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
-        if self.cell.boundary == "smooth" and self.cell.index is None:
-            raise ValueError("cell.index is null, and the through-beam is not evaluated yet; give the sample's index")
+        self._require_index()
         seen: set[tuple[str, str, float]] = set()
         for image in self.images:
             self._require_known(image)
@@ -134,6 +143,21 @@ class SlabFolder(Record):
                 raise ValueError(f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice; keep one")
             seen.add(key)
         return self
+
+    def _require_index(self) -> None:
+        angles = {light.name: light.angle_deg for light in self.lights}
+        for beam in self.through_beam:
+            if beam.light not in angles:
+                raise ValueError(f"a through_beam names light {beam.light}, which is not among the lights; correct the name")
+            if angles[beam.light] == 0:
+                what = f"the through_beam of light {beam.light} meets the cell at 0 degrees and is not bent"
+                raise ValueError(f"{what}; measure one at an angle, or leave it out")
+        if self.cell.boundary == "matched" or self.cell.index is not None:
+            return
+        told = {beam.wavelength_nm for beam in self.through_beam}
+        if lacking := [nm for nm in self.wavelengths_nm if not told & {nm, None}]:
+            what = f"cell.index is null, and no through_beam at {lacking[0]:g} nm tells it"
+            raise ValueError(f"{what}; add one, or give the sample's index")
 
     def _require_known(self, image: SlabImage) -> None:
         for what, name, things in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):

@@ -47,6 +47,11 @@ def write_cell(root: Path, *wavelengths_nm: float) -> Path:
             half = image.reshape(rig.grid.rows, rig.grid.columns)
             whole = np.concatenate([half[::-1], half])
             np.save(root / entry.file, whole + 0.01 * np.sqrt(whole * whole.mean()) * noise.normal(size=whole.shape))
+    # The folder does not say the index; its through-beam does, as the cell has no glass.
+    sine = described.cell.index_outside * np.sin(np.radians(told["lights"][1]["angle_deg"])) / told["cell"]["index"]
+    peak_mm = told["cell"]["width_mm"] * sine / np.sqrt(1 - sine**2)
+    told["through_beam"] = [{"light": told["lights"][1]["name"], "peak_x_mm": float(peak_mm), "se_mm": 1e-4}]
+    told["cell"] = told["cell"] | {"index": None}
     (root / "slab.json").write_text(json.dumps(told))
     return root
 
@@ -86,6 +91,9 @@ def job(spec: JobSpec, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_results_hold_what_the_cell_holds_by_wavelength(job: Path) -> None:
     require_truths(job, 532.0)
+    index = json.loads((job / "parameters.json").read_text())["532"]["index"]
+    assert index["value"] == pytest.approx(1.33, rel=1e-9)
+    assert 0 < index["se"] < 1e-3
     phase = json.loads((job / "phase.json").read_text())["532"]
     assert {len(phase[name]) for name in ("theta_deg", "value_per_sr", "se_per_sr", "determined")} == {len(ANGLES_RAD)}
     assert json.loads((job / "errors.json").read_text())["532"]["held_out_error"] < 0.1

@@ -21,6 +21,7 @@ from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
 from services.fit.slab.rig import Rig, rig_of
 from services.fit.slab.start import start
+from services.fit.slab.through_beam import index_of
 from services.fit.slab.uncertainty import uncertainty_of
 
 LAST_LOOK = 2**30
@@ -72,7 +73,8 @@ def fit_images(
 ) -> Wavelength:
     """Fit the images of one wavelength; see ``fit_slab``."""
     begun_s = time.process_time()
-    rig = rig_of(folder, wavelength_nm)
+    index = index_of(folder, wavelength_nm)
+    rig = rig_of(folder, wavelength_nm, index.value)
     solver = GaussNewton(rig, measured, options.seed, _budget(options.effort), blocks)
     solution = solver.solve(start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
@@ -80,7 +82,7 @@ def fit_images(
     first, second = last_look(rig, material, solver.budget, options.seed, blocks)
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
-        parameters=parameters_of(material, uncertainty, rig.interface.index),
+        parameters=parameters_of(material, uncertainty, index),
         phase=phase,
         errors=_errors(measured, first, second),
         notes=measured.faults + sample_faults(material, rig.width_mm) + _notes(measured, phase, converged=solution.converged),

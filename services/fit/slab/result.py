@@ -12,6 +12,7 @@ from services.core.geometry import Record
 from services.core.records import FitReport, Verdict
 from services.core.verdict import verdict_of
 from services.fit.slab.dictionary import ANGLES_RAD, Material
+from services.fit.slab.through_beam import Index
 from services.fit.slab.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 
 
@@ -77,7 +78,7 @@ class SlabFit(Record):
     core_seconds: float
 
 
-def parameters_of(material: Material, uncertainty: Uncertainty, index: float) -> Parameters:
+def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) -> Parameters:
     """The coefficients with their standard errors. One of a small value is judged by the extinction that it is part of."""
     values = {
         "sigma_t": material.extinction_per_mm,
@@ -95,7 +96,7 @@ def parameters_of(material: Material, uncertainty: Uncertainty, index: float) ->
             unit="1" if name == "g" else "1/mm",
             determined=uncertainty.undetermined_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
         )
-    return Parameters(**told, index=Quantity(value=index, se=0.0, unit="1", determined=True))
+    return Parameters(**told, index=Quantity(value=index.value, se=index.se, unit="1", determined=True))
 
 
 def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:

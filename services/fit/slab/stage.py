@@ -35,11 +35,13 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     from services.fit.slab.images import read_images
     from services.fit.slab.kept import IMAGES, read_kept
     from services.fit.slab.result import SlabReport
+    from services.fit.slab.through_beam import index_of
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
     root, folder = _folder(spec)
     for wavelength_nm in folder.wavelengths_nm:  # a fault in the last one is told before the first has cost its time
+        index_of(folder, wavelength_nm)
         for fault in read_images(root, folder, wavelength_nm).faults:
             context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
     writer = StageWriter(context.root, "fit", context.attempt)
