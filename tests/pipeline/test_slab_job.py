@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.api.pipeline import run_job
+from services.api.pipeline import run_job, stages_of
+from services.api.presets import find_preset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
 from services.core.records import AssetManifest, JobSpec
 from services.core.settings import job_from_tree
@@ -188,6 +189,11 @@ def test_a_fault_of_the_last_wavelength_is_told_before_the_first_is_fitted(folde
     with pytest.raises(CaptureInputError, match=told["images"][-1]["file"]):
         run(JobSpec(kind="slab", capture=tmp_path / "cell"), LocalContext(tmp_path / "job"))
     assert not (tmp_path / "job" / CHECKPOINT).exists()
+
+
+def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> None:
+    assert stages_of(spec) == ("fit", "export")
+    assert find_preset("slab").options == {"kind": "slab"}
 
 
 @pytest.mark.parametrize(
