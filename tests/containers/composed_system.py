@@ -106,7 +106,8 @@ class ComposedSystem:
     def token(self, name: str, *scopes: str) -> str:
         """A new token, whose name begins with ``name``."""
         chosen = [part for scope in scopes for part in ("--scope", scope)]
-        return self.inside("api", "dentine", "token", "create", f"{name}-{secrets.token_hex(3)}", *chosen).strip().splitlines()[-1]
+        said = self.inside("api", "dentine", "token", "create", f"{name}-{secrets.token_hex(3)}", *chosen)
+        return next(line for line in said.splitlines() if line.startswith("dentine_"))
 
     def is_live(self) -> bool:
         """Whether the API answers at all."""
