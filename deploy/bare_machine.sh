@@ -55,6 +55,8 @@ make_machine() {
     say "making $suite"
     mmdebstrap --quiet --variant=apt --include="$packages" --components="$parts" ${BARE_KEYRING:+--keyring="$BARE_KEYRING"} \
         "$suite" "$machine" "${BARE_MIRROR:-$mirror}" </dev/null >"$logs/$suite-machine.log" 2>&1 || die "mmdebstrap failed; see $logs/$suite-machine.log." 1
+    # The file that an installation writes and the packages alone do not.
+    echo "127.0.0.1 localhost" >"$machine/etc/hosts"
     home=$machine/root
     if [ "$who" != root ]; then
         chroot "$machine" useradd --create-home "$who"
