@@ -87,6 +87,7 @@ def test_a_refused_stream_is_not_opened_anew_for_a_view_that_was_left(page: Page
     page.locator(f"#jobs a[href='#/{second}']").click()
     expect(page.locator(".job h2")).to_have_text("Job 2")
     expect(page.locator("#connection")).to_have_text("")
+    page.wait_for_function("job => streams.at(-1).url.includes(job)", arg=second)  # opened a moment after the view
     opened = page.evaluate("streams.length")
     for _ in range(2):
         await_refresh(page)
@@ -135,6 +136,7 @@ def test_a_view_that_is_left_lets_go_of_its_curve(page: Page, job: ScriptedJob) 
     expect(page.locator(".job h2")).to_have_text("Job 2")
     assert page.evaluate("listeners") == listeners
     assert chart.evaluate("chart => chart.querySelector('.uplot')") is None
+    page.wait_for_function("job => streams.at(-1).url.includes(job)", arg=second)  # opened a moment after the view
     assert page.evaluate(OPEN_STREAMS) == 1
 
 
