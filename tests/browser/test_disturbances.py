@@ -112,6 +112,8 @@ def test_a_late_answer_leaves_the_view_that_was_opened_since(page: Page, is_refu
 
     page.route(f"**/v1/jobs/{first}", hold)
     page.goto(f"/#/{first}")
+    while not held:  # asked for once a lane is free
+        page.wait_for_timeout(20)
     page.locator(f"#jobs a[href='#/{second}']").click()
     expect(page.locator(".job h2")).to_have_text("Job 2")
     with page.expect_response(f"**/v1/jobs/{first}"):
