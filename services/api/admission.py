@@ -224,7 +224,7 @@ class Admission:
             self._stalled.pop(job_id, None)
 
     def look_for_stalled(self) -> None:
-        """Find the running jobs whose next task no worker can take; ``reason`` then says why, until a later look finds one that can."""
+        """Find the running jobs whose next task no worker can take; ``stalled`` then says why, until a later look finds one that can."""
         with self._lock:
             captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
         lacking = {kind: self._lacks(kind) for kind in set(captures.values())}
@@ -238,10 +238,15 @@ class Admission:
         with self._lock:
             self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
 
-    def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
-        """Why a queued job does not start, or a running one does not go on; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
+    def stalled(self, job_id: str) -> str | None:
+        """Why a running job does not go on; None if it does."""
         with self._lock:
-            reason = self._stalled.get(job_id) or self._reasons.get(job_id)
+            return self._stalled.get(job_id)
+
+    def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
+        """Why a queued job does not start; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
+        with self._lock:
+            reason = self._reasons.get(job_id)
             return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
 
     def _obstacle(self, job_id: str, spec: JobSpec, *, is_to_capture: bool) -> str:

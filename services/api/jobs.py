@@ -213,7 +213,9 @@ class Jobs:
         """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
         if job.state not in {JobState.RUNNING, JobState.QUEUED}:
             return None
-        if (reason := self._admission.reason(job.id)) is not None:
+        # Not both of either: a job that is read as running may have been paused since.
+        look = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
+        if (reason := look(job.id)) is not None:
             return self.server_paths.tell(reason, self.locate(job.spec))
         return None if job.state is JobState.RUNNING or self.is_running() else "This server does not run jobs; restart it and read its log."
 

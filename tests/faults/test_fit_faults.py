@@ -109,6 +109,7 @@ def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
     assert run_on.gather([run_on.submit("same", echo, number) for number in range(5)]) == list(range(5))
 
 
+@pytest.mark.slow
 def test_fits_side_by_side_give_the_answer_that_each_gives_alone(client: Client, undisturbed: Path, tmp_path: Path) -> None:
     roots = [tmp_path / "first", tmp_path / "second"]
     for root in roots:
@@ -149,6 +150,7 @@ def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: P
     assert len(read_entries(tmp_path)) > entries
 
 
+@pytest.mark.slow
 def test_killed_helper_worker_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
     # The other worker dies with whatever blocks it held; the driver goes on.
     write_prepared(tmp_path)

@@ -103,7 +103,6 @@ def standard_error(values: NDArray[np.float64]) -> float:
         pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
         pytest.param(SHAPE, "thin", id="shape-thin", marks=pytest.mark.slow),
         pytest.param(GRADUAL, "matched", id="gradual-matched", marks=pytest.mark.slow),
-        pytest.param(replace(GRADUAL, samples={"shape.0": 512, "enamel.alpha": 256}), "matched", id="two-gradual-matched"),
         pytest.param(IN_A_MOUTH, "thin", id="mouth-thin"),
     ],
 )

@@ -45,6 +45,7 @@ def test_derivatives_of_denser_slabs_agree_within_one_percent(name: str) -> None
     require_unbiased(np.concatenate([to_one_percent(case, seed=400) for case in cases]), independent=len(cases))
 
 
+@pytest.mark.slow
 def test_all_derivatives_are_unbiased_at_the_error_reached() -> None:
     cases, scores, at_tolerance = derivative_cases(), [], 0
     for number, case in enumerate(cases):

@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import psutil
 import pytest
 import yaml
 
+from services.core.verdict import NOT_CONVERGED_STATUS
 from tests.support.live_server import connect
 from tests.support.postgres import PostgresServer, new_database, postgres_server
 from tests.support.small_system import free_port
@@ -180,9 +181,9 @@ def _is_live(address: str) -> bool:
         return False
 
 
-def dentine(folder: Path, environment: Mapping[str, str], *arguments: str) -> str:
+def dentine(folder: Path, environment: Mapping[str, str], *arguments: str, ends_with: Collection[int] = (0,)) -> str:
     done = subprocess.run([*DENTINE, *arguments], cwd=folder, env=dict(environment), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode in ends_with, done.stderr
     return done.stdout.strip()
 
 
@@ -196,7 +197,9 @@ def test_a_small_job_runs_through_what_the_file_starts(composition: Composition,
     size = ["--pixel-mm", "1.5", "--cameras", "1", "--lights", "4", "--samples", "64"]
     dentine(tmp_path, environment, "phantom", "--out", "mouth", *size)
     (tmp_path / "job.toml").write_text(JOB)
-    job = dentine(tmp_path, environment, "submit", "job.toml", "--upload", "--watch", "--server", composition.address).splitlines()[0]
+    # So few pixels and paths tell little: whether the fit converged is not asked here.
+    submit = ["submit", "job.toml", "--upload", "--watch", "--server", composition.address]
+    job = dentine(tmp_path, environment, *submit, ends_with=(0, NOT_CONVERGED_STATUS)).splitlines()[0]
 
     headers = {"Authorization": f"Bearer {token}"}
     with connect(composition.address) as client:

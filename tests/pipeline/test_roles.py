@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import httpx
 import psutil
 import pytest
 
+from services.core.verdict import NOT_CONVERGED_STATUS
 from tests.support.installed import build_wheel, environment_without_this_tree, install
 from tests.support.live_server import connect
 from tests.support.roles import ROLES
@@ -76,11 +77,11 @@ class Parts:
         process = subprocess.Popen(command, cwd=self._folder, env=environment_without_this_tree(**settings), stdout=log, stderr=log)
         stack.callback(end, process)
 
-    def run(self, role: str, *arguments: str) -> str:
+    def run(self, role: str, *arguments: str, ends_with: Collection[int] = (0,)) -> str:
         """Run a command to its end in a role's environment; gives what it printed."""
         command = [str(self._programs[role] / "dentine"), *arguments]
         ended = subprocess.run(command, cwd=self._folder, env=environment_without_this_tree(), capture_output=True, text=True, check=False)
-        assert ended.returncode == 0, f"{role}: {ended.stderr}\n{self.logs()}"
+        assert ended.returncode in ends_with, f"{role}: {ended.stderr}\n{self.logs()}"
         return ended.stdout.strip()
 
     def log(self, name: str) -> Path:
@@ -132,7 +133,8 @@ def test_a_small_job_runs_through_parts_that_have_only_their_own_packages(parts:
     assert (tmp_path / "data" / uploaded["path"]).is_dir()
 
     (tmp_path / "job.toml").write_text(JOB.format(port=parts.dome.rpartition(":")[2], mouth=tmp_path / "mouth"))
-    job = parts.run("client", "submit", "job.toml", "--watch", "--server", parts.address).splitlines()[0]
+    # So few pixels and paths tell little: whether the fit converged is not asked here.
+    job = parts.run("client", "submit", "job.toml", "--watch", "--server", parts.address, ends_with=(0, NOT_CONVERGED_STATUS)).splitlines()[0]
     with connect(parts.address) as client:
         detail = client.get(f"/v1/jobs/{job}").json()
         assert detail["state"] == "SUCCEEDED", detail

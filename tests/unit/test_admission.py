@@ -123,13 +123,13 @@ def test_a_running_job_whose_workers_went_away_says_so_until_one_comes(spec: Job
     world = World()
     world.admission.start("fit", 1, spec)
     world.admission.look_for_stalled()
-    assert world.admission.reason("fit") is None
+    assert world.admission.stalled("fit") is None
     world.lacking[False] = "The scheduler has no workers; start some with dentine worker."
     world.admission.look_for_stalled()
-    assert world.admission.reason("fit") == "Waits for workers: The scheduler has no workers; start some with dentine worker."
+    assert world.admission.stalled("fit") == "Waits for workers: The scheduler has no workers; start some with dentine worker."
     world.lacking.clear()
     world.admission.look_for_stalled()
-    assert world.admission.reason("fit") is None
+    assert world.admission.stalled("fit") is None
 
 
 def test_a_job_that_ended_waits_for_no_workers(spec: JobSpec) -> None:
@@ -138,4 +138,4 @@ def test_a_job_that_ended_waits_for_no_workers(spec: JobSpec) -> None:
     world.admission.start("fit", 1, spec)
     world.admission.look_for_stalled()
     world.admission.end("fit")
-    assert world.admission.reason("fit") is None
+    assert world.admission.stalled("fit") is None

@@ -74,6 +74,7 @@ def test_held_out_lights_lie_between_the_others() -> None:
     assert all(len(held_out_lights(count, k)) == k for count in range(1, 40) for k in range(count))
 
 
+@pytest.mark.slow
 def test_a_scanned_jaw_is_the_same_by_both_renderers(tmp_path: Path) -> None:
     scan = bumps({11: (-4.5, 0.0), 21: (4.5, 0.0)})
     write_vtp(tmp_path / "scan.vtp", scan.mesh, universal(scan.fdi))
