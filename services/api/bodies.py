@@ -10,19 +10,19 @@ from typing import Annotated, Any, TypeVar
 from pydantic import ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 from pydantic_core import PydanticCustomError
 
-MOST_FAULTS = 100
+MAX_FAULTS = 100
 """More are counted, and not listed: whoever sends so many has sent something else than was asked for. No record has so
 many members either."""
 T = TypeVar("T")
 
 
 def _few_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
-    if isinstance(value, dict) and len(value) > MOST_FAULTS:
+    if isinstance(value, dict) and len(value) > MAX_FAULTS:
         raise PydanticCustomError("many_faults", "The body has {count} members", {"count": len(value)})
     try:
         return validate(value)
     except ValidationError as problem:
-        if (count := problem.error_count()) <= MOST_FAULTS:
+        if (count := problem.error_count()) <= MAX_FAULTS:
             raise
         raise PydanticCustomError("many_faults", "The body has {count} faults", {"count": count}) from None
 

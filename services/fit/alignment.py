@@ -26,10 +26,10 @@ LEAST_MM = 0.5
 LEAST_GAIN = 0.55
 """Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 1 mm gave 0.53 to
 1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the scattering."""
-LEAST_Z = 3.0
+MIN_Z = 3.0
 """Standard errors that what goes away has to reach. Noise passes at one shift with a chance of 1e-3, and is tried at some
 300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
-LEAST_SE_MM = 0.01
+MIN_SE_MM = 0.01
 """Least ± that is told: what an offset is off by besides noise, such as by its pixels, is more."""
 LEAST_PIXELS = 16
 
@@ -55,7 +55,7 @@ class Offset:
         """What is wrong and what to do."""
         steps = [(self.right_mm, "right", "left"), (self.down_mm, "down", "up")]
         parts = [f"{abs(size):.1f} mm {name if size > 0 else other}" for size, name, other in steps if abs(size) >= 0.3 * self.length_mm]
-        apart = f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, LEAST_SE_MM):.1g} mm by the noise of both"
+        apart = f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, MIN_SE_MM):.1g} mm by the noise of both"
         return (
             f"In camera {self.camera} images and {what} are {apart} (the images lie {' and '.join(parts)}); "
             "how far along the line of sight cannot be seen in this way; recalibrate the camera or register the mesh again."
@@ -120,7 +120,7 @@ def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64]
 
 def _is_clear(found: FoundOffset, pixel_mm: float) -> bool:
     is_large = found.length_px * pixel_mm > max(LEAST_MM, pixel_mm)
-    return is_large and found.gain >= LEAST_GAIN and found.z >= LEAST_Z and np.isfinite(found.length_se_px)
+    return is_large and found.gain >= LEAST_GAIN and found.z >= MIN_Z and np.isfinite(found.length_se_px)
 
 
 def _in_mm(camera: str, found: FoundOffset, pixel_mm: float) -> Offset:

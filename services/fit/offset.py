@@ -31,7 +31,7 @@ REACH_MM = 4.0
 """Farthest offset that is looked for, half of a small tooth."""
 GRID = 8
 """Offsets tried to each side before the best is refined."""
-LEAST_KNOWN = 0.7
+MIN_KNOWN = 0.7
 """Share of the render's pixels that a shift must leave on usable pixels of the photograph."""
 MEDIAN_OF_SQUARE = 0.4549
 """Median of the square of a standard normal number."""
@@ -139,7 +139,7 @@ class Slide:
     def _matches(self, shift: Shift) -> list[_Match]:
         # Of all images, or none where one of them is known on too few pixels.
         matches = [_match(image, self.pixels, shift) for image in self.images]
-        return matches if all(len(match.a) >= LEAST_KNOWN * len(self.pixels) for match in matches) else []
+        return matches if all(len(match.a) >= MIN_KNOWN * len(self.pixels) for match in matches) else []
 
 
 def _match(image: Comparison, pixels: NDArray[np.int64], shift: Shift) -> _Match:

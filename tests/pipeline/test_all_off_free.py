@@ -20,7 +20,7 @@ from fastapi import FastAPI
 
 from services.api import problems
 from services.api.app import create_app
-from services.api.bodies import MOST_FAULTS
+from services.api.bodies import MAX_FAULTS
 from services.api.jobs import Jobs
 from services.api.repository import Repository
 from services.capture.simulator import simulated_dome
@@ -192,7 +192,7 @@ def test_a_body_of_many_faults_is_refused_at_its_first_ones(loop_server: Looped,
     assert answer.status_code == 422, answer.text
     assert answer.json()["code"] == "bad-settings"
     assert len(listed) == 1, "the faults were told once"
-    assert listed.pop() <= MOST_FAULTS
+    assert listed.pop() <= MAX_FAULTS
 
 
 WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (

@@ -19,13 +19,13 @@ THINNEST, THICKEST = 0.1, 10.0
 noise, above, light has forgotten each single deflection."""
 BEST = 2.0
 """sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
-LEAST_ALBEDO = 0.2
+MIN_ALBEDO = 0.2
 """Below, most of what scatters is absorbed before it leaves, and higher orders add nothing."""
-MOST_AT_MAXIMUM = 4
+MAX_AT_MAXIMUM = 4
 """Pixels that may share an image's largest value: as many as are alike by symmetry in an image without noise."""
-LEAST_LIT = 0.5
+MIN_LIT = 0.5
 """Share of an image's maximum from which pixels count for where the beam is."""
-MOST_OFF = 1.0
+MAX_OFF = 1.0
 """How far the beam may lie beside y = 0, in pixels and in beams' sizes, whichever is more."""
 
 
@@ -39,7 +39,7 @@ def image_faults(name: str, image: Array, pixels: PixelGrid, beam: Beam) -> tupl
     largest = float(finite.max())
     if largest <= 0:
         return (f"Image {name} holds no light; check its exposure and its file.",)
-    if (count := int((finite == largest).sum())) > MOST_AT_MAXIMUM:
+    if (count := int((finite == largest).sum())) > MAX_AT_MAXIMUM:
         what = f"Image {name} looks saturated: {count} pixels hold its largest value, {largest:.4g}"
         return (f"{what}; expose it for less long, or give those pixels no value (NaN).",)
     return _off_axis(name, finite, largest, pixels, beam)
@@ -50,9 +50,9 @@ def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: 
     low, high = pixels.y_mm
     pitch_mm = (high - low) / pixels.rows
     y_mm = low + pitch_mm * (np.arange(pixels.rows) + 0.5)
-    lit = np.where(image >= LEAST_LIT * largest, image, 0.0)
+    lit = np.where(image >= MIN_LIT * largest, image, 0.0)
     centre_mm = float(lit.sum(axis=1) @ y_mm / lit.sum())
-    if abs(centre_mm) <= MOST_OFF * max(pitch_mm, beam.size_mm):
+    if abs(centre_mm) <= MAX_OFF * max(pitch_mm, beam.size_mm):
         return ()
     return (f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct pixels.y_mm.",)
 
@@ -75,7 +75,7 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
     if thickness > THICKEST:
         what = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
         told.append(f"The sample is too thick: {known}; {what}.")
-    if albedo < LEAST_ALBEDO:
+    if albedo < MIN_ALBEDO:
         told.append(
             f"The sample absorbs too much: about {100 * (1 - albedo):.0f} % of what meets a particle is absorbed, and little but "
             "single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a thinner cell."

@@ -28,7 +28,7 @@ LABELS = {
 }
 RESIDUAL_OF_WHITE = 0.1
 """Share of an image's white at which the residual's colours end."""
-MOST_PICTURES = 12
+MAX_PICTURES = 12
 """Images shown of each wavelength; the held-out ones come first."""
 
 
@@ -94,7 +94,7 @@ def _phase(fit: SlabFit) -> tuple[str, str, str]:
 
 
 def _pictures(images: Images) -> list[dict[str, Any]]:
-    order = np.argsort(~images.held_out, kind="stable")[:MOST_PICTURES]
+    order = np.argsort(~images.held_out, kind="stable")[:MAX_PICTURES]
     return [_picture(images, int(k)) for k in order]
 
 

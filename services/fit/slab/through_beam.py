@@ -16,7 +16,7 @@ from services.core.errors import CaptureInputError
 from services.core.slab_folder import Cell, SlabFolder, ThroughBeam
 
 SMALLEST_INDEX, LARGEST_INDEX = 1.0, 4.0
-MOST_APART = 4.0
+MAX_APART = 4.0
 """Standard errors by which one beam's index may differ from the mean of all: more is no noise of the peaks."""
 
 
@@ -43,7 +43,7 @@ def index_of(folder: SlabFolder, wavelength_nm: float) -> Index:
     total = sum(weights.values())
     mean = sum(weights[light] * one.value for light, one in found.items()) / total
     for light, one in found.items():
-        if abs(one.value - mean) > MOST_APART * one.se:
+        if abs(one.value - mean) > MAX_APART * one.se:
             raise CaptureInputError(
                 f"The through-beam of light {light} at {wavelength_nm:g} nm gives an index of {one.value:.3f} ± {one.se:.1g} and all "
                 f"together {mean:.3f}; measure its peak_x_mm again, or correct the light's angle_deg or the cell's width_mm."
