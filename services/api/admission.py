@@ -17,8 +17,9 @@ from pathlib import Path
 
 import psutil
 
+from services.api.errors import JobTooLargeError
 from services.api.repository import Job
-from services.core.errors import DentineError, DiskFullError, JobTooLargeError, StoreError
+from services.core.errors import DentineError, DiskFullError, StoreError
 from services.core.placement import rank
 from services.core.records import JobSpec
 from services.core.store import MANIFEST

@@ -24,18 +24,11 @@ from services.api.capture_records import CaptureDetail, CaptureFile, CapturePage
 from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
 from services.api.descriptions import CaptureReader, ReadHere
+from services.api.errors import CaptureStateError, CorruptUploadError, LockedError, TooLargeError, UnknownCaptureError
 from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.uploads import Uploads, upload_path
 from services.core.calibration import Calibration
-from services.core.errors import (
-    CaptureStateError,
-    CorruptUploadError,
-    DiskFullError,
-    LockedError,
-    SettingsError,
-    TooLargeError,
-    UnknownCaptureError,
-)
+from services.core.errors import DiskFullError, SettingsError
 from services.core.records import JobSpec
 from services.core.settings import UploadLimits
 

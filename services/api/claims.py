@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from services.core.errors import LockedError
+from services.api.errors import LockedError
 
 
 class Claims:

@@ -12,10 +12,11 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.dome_process import DomeProcess
+from services.api.errors import UnknownDomeError
 from services.api.jobs import Jobs
 from services.api.light_limits import LightLimits
 from services.core.dome import DomeAnswer, DomeStatus
-from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError, UnknownDomeError
+from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError
 from services.core.geometry import Record
 from services.core.records import Number, RigSpec, Unit, Whole
 from services.core.settings import DomeSettings

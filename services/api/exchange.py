@@ -14,8 +14,9 @@ from urllib.parse import quote
 
 from pydantic import SecretStr
 
+from services.api.errors import JobStateError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
 from services.api.events import JobEvent
-from services.core.errors import DentineError, InputError, JobStateError, PlatformError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
+from services.core.errors import DentineError, InputError, PlatformError
 from services.core.records import JobSpec
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.database import metadata
+from services.api.errors import UnknownJobError
 from services.api.lifecycle import JobState
 from services.api.owners import DEFAULT_GROUP, Viewer
-from services.core.errors import UnknownJobError
 from services.core.geometry import Record
 from services.core.records import KindName
 

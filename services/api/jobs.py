@@ -16,6 +16,7 @@ from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
 from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.erasure import erase, forget_listing
+from services.api.errors import JobStateError, UnknownJobError
 from services.api.events import EventAddress, JobEvent
 from services.api.job_table import JobFilter
 from services.api.lifecycle import Instruction, JobState, Trigger
@@ -28,7 +29,7 @@ from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
 from services.api.server_paths import ServerPaths
 from services.api.time_ranges import TimeRange, TimeRanges
-from services.core.errors import JobStateError, SettingsError, StoreError, UnknownJobError
+from services.core.errors import SettingsError, StoreError
 from services.core.geometry import Record
 from services.core.masks import is_stale
 from services.core.records import JobSpec

@@ -6,8 +6,8 @@ import struct
 import zlib
 from typing import TYPE_CHECKING
 
+from services.api.errors import MaskError
 from services.api.image_headers import PNG_SIGNATURE, PngHeader, png_header
-from services.core.errors import MaskError
 from services.core.geometry import Camera
 
 if TYPE_CHECKING:

@@ -30,15 +30,7 @@ from services.api.database import patiently
 from services.api.events import EventAddress, EventLog, JobEvent, folder_events
 from services.api.machine_class import machine_class
 from services.api.workers import Workers
-from services.core.errors import (
-    CorruptStoreError,
-    InputError,
-    JobCancelledError,
-    MissingStageError,
-    PlatformError,
-    SchedulerLostError,
-    WorkerLostError,
-)
+from services.core.errors import CorruptStoreError, InputError, JobCancelledError, MissingStageError, PlatformError, SchedulerLostError, WorkerLostError
 from services.core.job_kinds import JOB_KINDS
 from services.core.masks import is_stale
 from services.core.placement import DOME, STAGES, rank

@@ -8,28 +8,18 @@ from urllib.parse import quote
 
 from pydantic import Field
 
-from services.core.errors import (
+from services.api.errors import (
     BodyTooLargeError,
     CalibrationTakenError,
     CaptureStateError,
     ChecksumError,
-    DentineError,
-    DiskFullError,
-    DomeBusyError,
     ExpiredError,
-    ExposureLimitError,
-    InputError,
-    InterlockError,
     JobStateError,
     JobTooLargeError,
     LockedError,
     OffsetError,
-    PlatformError,
     RangeError,
     RateError,
-    RigError,
-    RigStoppedError,
-    RigUnreachableError,
     ScopeError,
     SetupLinkError,
     TooLargeError,
@@ -42,6 +32,18 @@ from services.core.errors import (
     UnknownPresetError,
     UnknownTokenError,
     UnknownWebhookError,
+)
+from services.core.errors import (
+    DentineError,
+    DiskFullError,
+    DomeBusyError,
+    ExposureLimitError,
+    InputError,
+    InterlockError,
+    PlatformError,
+    RigError,
+    RigStoppedError,
+    RigUnreachableError,
 )
 from services.core.geometry import Record
 from services.core.redaction import redacted

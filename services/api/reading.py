@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from services.api.descriptions import MAX_DESCRIPTION_BYTES, Described
-from services.core.errors import CaptureInputError, DentineError, PlatformError, error_of
+from services.api.errors import error_of
+from services.core.errors import CaptureInputError, DentineError, PlatformError
 from services.core.settings import UploadLimits
 
 PROCESSES = 2

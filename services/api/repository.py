@@ -18,6 +18,7 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.database import Query, open_database, writing
+from services.api.errors import JobStateError
 from services.api.events import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
 from services.api.job_table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.lifecycle import JobState, Transition, Trigger, apply
@@ -27,7 +28,7 @@ from services.api.past_runs import PastRuns, past_run_table
 from services.api.server_paths import without_folders
 from services.api.verdicts import Verdicts
 from services.api.webhook_outbox import collect_changes
-from services.core.errors import DentineError, FencedError, JobStateError
+from services.core.errors import DentineError, FencedError
 from services.core.geometry import Record
 from services.core.records import JobName, JobSpec, Verdict
 from services.core.stage import StageName

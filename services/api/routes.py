@@ -30,7 +30,7 @@ LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
 
 
-MOST_STREAMED = 64
+MAX_STREAMED = 64
 """Jobs in one stream of events."""
 _PLACE = "a job's id, and after a colon the id of its last event that is known already"
 Place = Annotated[str, StringConstraints(pattern=r"^[0-9a-zA-Z]{1,40}(:[0-9]{1,9})?$")]
@@ -179,7 +179,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         return await feed.answer(job_id, last_event_id or 0)
 
     @router.get("/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
-    async def events_of_several(asker: Asker, job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MOST_STREAMED, description=_PLACE)]) -> Response:
+    async def events_of_several(asker: Asker, job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MAX_STREAMED, description=_PLACE)]) -> Response:
         """The events of several jobs in one stream, as a browser has few connections.
 
         Event 'end' names the job and its final state, null for an absent one.

@@ -17,8 +17,8 @@ from pydantic import SecretStr
 
 from services.api.audit import Deed
 from services.api.database import metadata, writing
+from services.api.errors import SetupLinkError
 from services.api.tokens import IssuedToken, Scope, insert_token, token_table
-from services.core.errors import SetupLinkError
 from services.core.settings import ServerSettings
 
 LIFETIME_S = 3600.0

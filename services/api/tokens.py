@@ -28,8 +28,9 @@ from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 from services.api.audit import Deed
 from services.api.database import Query, metadata, writing
 from services.api.ended_sessions import EndedSessions
+from services.api.errors import UnauthenticatedError, UnknownTokenError
 from services.api.owners import LOCAL_VIEWER, Viewer, owner_of_token
-from services.core.errors import InputError, UnauthenticatedError, UnknownTokenError
+from services.core.errors import InputError
 from services.core.geometry import Record
 
 TRUSTED_S = 1.0

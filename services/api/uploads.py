@@ -9,8 +9,8 @@ from services.api.blobs import Blobs, PartialFile
 from services.api.capture_records import CaptureState
 from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
+from services.api.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
 from services.api.owners import LOCAL_VIEWER, Viewer
-from services.core.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
 from services.core.settings import UploadLimits
 
 

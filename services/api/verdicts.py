@@ -21,7 +21,7 @@ from services.core.verdict import VERDICT
 if TYPE_CHECKING:
     from services.api.repository import Job
 
-MOST_KEPT = 1024
+MAX_KEPT = 1024
 """Verdicts that are kept as they were read: as many as the jobs that are."""
 
 
@@ -55,7 +55,7 @@ class Verdicts:
 
     def _keep(self, found: dict[tuple[str, float], Verdict | None]) -> None:
         self._kept |= found
-        while len(self._kept) > MOST_KEPT:
+        while len(self._kept) > MAX_KEPT:
             self._kept.popitem(last=False)
 
 

@@ -12,12 +12,12 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.database import writing
+from services.api.errors import JobStateError, UnknownWebhookError
 from services.api.events import event_table
 from services.api.lifecycle import JobState
 from services.api.webhook_address import AddressPolicy
 from services.api.webhook_outbox import collect_changes, states_of
 from services.api.webhook_tables import DeliveryState, attempt_table, delivery_table, webhook_table
-from services.core.errors import JobStateError, UnknownWebhookError
 from services.core.geometry import Record
 
 MOST_WEBHOOKS = 100

@@ -21,7 +21,8 @@ from functools import partial
 
 from services.capture.address import dome_address
 from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import DomeObserver, ModbusDome, all_off
+from services.capture.dome_controller import DomeObserver, all_off
+from services.capture.dome_modbus import ModbusDome
 from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigError, RigStoppedError, SettingsError
 from services.core.settings import DomeSettings

@@ -17,7 +17,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Self
 
@@ -26,90 +26,13 @@ from numpy.typing import NDArray
 
 from services.capture import registers as reg
 from services.capture.dome import ExposureBudget, Rgb
+from services.capture.dome_controller import DARK_ATTEMPTS, REPLY_TIMEOUT_S, OtherDeviceError, error_kind, fault_names, read_status, require_dome
 from services.capture.keepalive import KeepAlive
 from services.capture.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
 from services.core.dome import DomeStatus
-from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError, RigUnreachableError
+from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError
 
-REPLY_TIMEOUT_S = 0.5
-IDENTITY_TIMEOUT_S = 0.1
-"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and
-one that is late may be lit."""
 HANG_MARGIN_S = 2.0
-DARK_ATTEMPTS = 3
-
-
-class OtherDeviceError(LinkError):
-    """What answers is no dome controller, and gets no write."""
-
-
-def all_off(host: str, port: int) -> DomeStatus:
-    """Switch every light off, whoever drives the dome, and keep the supply open until a driver arms the watchdog anew.
-
-    Raises:
-        RigError: darkness could not be confirmed.
-    """
-    link, asker = ModbusLink(host, port, REPLY_TIMEOUT_S), ModbusLink(host, port, IDENTITY_TIMEOUT_S)
-    problem: Exception | None = None
-    try:
-        for _ in range(DARK_ATTEMPTS):
-            try:
-                with suppress(NoReplyError, RefusedError, WrongReplyError), closing(asker):
-                    _require_dome(asker, repeated=False)
-                link.write(reg.ALL_OFF, [1])
-                link.write(reg.KEEPALIVE, [1, reg.STOPPED_MS])
-                status = _read_status(link)
-            except LinkError as failure:
-                link.close()
-                problem = failure
-                continue
-            if not status.lit:
-                return status
-            problem = LinkError(f"light {status.lit[0]} still emits")
-    finally:
-        link.close()
-    raise _kind(problem)(f"The dome at {host}:{port} is not confirmed dark ({problem}); press its emergency stop or cut its power.") from problem
-
-
-class DomeObserver:
-    """Read-only eyes on the dome's light, over a connection of their own; never feeds the watchdog."""
-
-    def __init__(self, host: str, port: int) -> None:
-        self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
-        self._lights = self._read(reg.LIGHT_COUNT)[0]
-
-    def outputs(self) -> NDArray[np.float64]:
-        """What each LED emits now, (light, 3) as fraction of full scale."""
-        return np.asarray(self._read(reg.OUTPUTS, 3 * self._lights), dtype=np.float64).reshape(-1, 3) / reg.FULL_SCALE
-
-    def trigger_count(self) -> int:
-        """Exposure triggers since power-on, modulo 65536."""
-        return self._read(reg.TRIGGER_COUNT)[0]
-
-    def faults(self) -> reg.FaultBit:
-        """Latched faults."""
-        return reg.FaultBit(self._read(reg.FAULTS)[0])
-
-    def status(self) -> DomeStatus:
-        """The controller's state."""
-        try:
-            return _read_status(self._link)
-        except LinkError as problem:
-            raise self._blind(problem) from problem
-
-    def close(self) -> None:
-        """Drop the connection."""
-        self._link.close()
-
-    def _blind(self, problem: LinkError) -> RigError:
-        self._link.close()
-        return _kind(problem)(f"The dome cannot be observed: {problem}; check its power and network.")
-
-    def _read(self, register: reg.Register, count: int | None = None) -> list[int]:
-        try:
-            return self._link.read(register, count)
-        except LinkError as problem:
-            raise self._blind(problem) from problem
 
 
 class ModbusDome:
@@ -256,7 +179,7 @@ class ModbusDome:
     def status(self) -> DomeStatus:
         """Read the controller's state."""
         with self._dark_on_error():
-            return _read_status(self._link)
+            return read_status(self._link)
 
     @contextmanager
     def _dark_on_error(self) -> Iterator[None]:
@@ -277,7 +200,7 @@ class ModbusDome:
                         self._require_armed()
                         self._require_safe()
                         self._require_no_fault()
-                raise _kind(problem)(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
+                raise error_kind(problem)(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
             raise
 
     def _confirmed(self) -> Rgb:
@@ -301,7 +224,7 @@ class ModbusDome:
 
     def _require_dome(self) -> None:
         try:
-            _require_dome(self._link)
+            require_dome(self._link)
         except (OtherDeviceError, RefusedError) as answer:
             raise RigError(f"The device at {self.address} does not answer as a dome controller; correct rig.dome.") from answer
         except LinkError:
@@ -335,7 +258,7 @@ class ModbusDome:
         faults = reg.FaultBit(self._link.read(reg.FAULTS)[0])
         if faults:
             self._require_armed()
-            raise RigError(f"The dome at {self.address} reports {' and '.join(_names(faults))}; remove the cause and run again.")
+            raise RigError(f"The dome at {self.address} reports {' and '.join(fault_names(faults))}; remove the cause and run again.")
 
     def _rgb(self, register: reg.Register) -> NDArray[np.int64]:
         return np.asarray(self._link.read(register, 3 * self._light_count), dtype=np.int64).reshape(-1, 3)
@@ -367,39 +290,6 @@ class ModbusDome:
         for number in self._previous_handlers:
             signal.signal(number, signal.SIG_DFL)
         self._previous_handlers.clear()
-
-
-def _require_dome(link: ModbusLink, *, repeated: bool = True) -> None:
-    if link.read(reg.IDENTITY, repeated=repeated)[0] != reg.IDENTITY_VALUE:
-        raise OtherDeviceError(f"the device at {link.address} is no dome controller")
-
-
-def _read_status(link: ModbusLink) -> DomeStatus:
-    _require_dome(link)
-    firmware, lights = link.read(reg.FIRMWARE)[0], min(link.read(reg.LIGHT_COUNT)[0], reg.MAX_LIGHTS)
-    closed, pressed, supply = link.read(reg.INTERLOCK_CLOSED, 3)
-    banks = -(-lights // reg.LIGHTS_PER_BANK)
-    outputs = np.asarray(link.read(reg.OUTPUTS, 3 * lights)).reshape(-1, 3)
-    return DomeStatus(
-        firmware=f"{firmware >> 8}.{firmware & 0xFF}",
-        light_count=lights,
-        interlock_closed=bool(closed),
-        emergency_stop=bool(pressed),
-        supply_on=bool(supply),
-        stopped=link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS,
-        faults=_names(reg.FaultBit(link.read(reg.FAULTS)[0])),
-        lit=tuple(int(light) for light in np.flatnonzero(outputs.any(axis=1))),
-        temperature_degc=tuple(tenths / 10 for tenths in link.read(reg.BANK_TEMPERATURE, banks)),
-        current_ma=tuple(link.read(reg.BANK_CURRENT, banks)),
-    )
-
-
-def _kind(problem: Exception | None) -> type[RigError]:
-    return RigUnreachableError if isinstance(problem, NoReplyError) else RigError
-
-
-def _names(faults: reg.FaultBit) -> tuple[str, ...]:
-    return tuple(bit.name.lower().replace("_", " ") for bit in reg.FaultBit if bit in faults and bit.name)
 
 
 def _unwind(number: int, _frame: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from services.capture.dome_modbus import DomeObserver
+from services.capture.dome_controller import DomeObserver
 from services.capture.motion import SubjectMotion, resample
 from services.capture.plan import PlannedFrame
 from services.capture.stills import Stills

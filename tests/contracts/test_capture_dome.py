@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.capture.dome import Dome, ExposureBudget
-from services.capture.dome_modbus import HANG_MARGIN_S, DomeObserver, ModbusDome
+from services.capture.dome_controller import DomeObserver
+from services.capture.dome_modbus import HANG_MARGIN_S, ModbusDome
 from services.capture.registers import FULL_SCALE
 from services.capture.simulator import simulated_dome
 from services.core.errors import ExposureLimitError, RigError

@@ -12,7 +12,8 @@ import pytest
 
 from services.capture import registers as reg
 from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import DomeObserver, ModbusDome
+from services.capture.dome_controller import DomeObserver
+from services.capture.dome_modbus import ModbusDome
 from services.capture.registers import FaultKind
 from services.capture.simulator import order_fault, serve_dome, simulated_dome
 from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError

@@ -14,7 +14,7 @@ import numpy as np
 import zarr
 
 from services.capture import stage
-from services.capture.dome_modbus import DomeObserver
+from services.capture.dome_controller import DomeObserver
 from services.capture.registers import FaultBit
 from services.capture.simulator import simulated_dome
 from services.core.records import JobSpec, RigSpec, SimulatedCameraSpec

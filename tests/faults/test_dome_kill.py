@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.capture.dome_modbus import DomeObserver
+from services.capture.dome_controller import DomeObserver
 from services.capture.registers import FaultBit
 from services.capture.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings

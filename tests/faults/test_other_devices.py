@@ -12,7 +12,8 @@ import pytest
 
 from services.capture import registers as reg
 from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import ModbusDome, all_off
+from services.capture.dome_controller import all_off
+from services.capture.dome_modbus import ModbusDome
 from services.core.errors import RigError, RigUnreachableError
 
 READ_INPUT = 4

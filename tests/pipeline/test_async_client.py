@@ -15,8 +15,9 @@ import pytest
 
 from services.api.app import create_app
 from services.api.client import AsyncClient, Client
+from services.api.errors import JobStateError, UnknownJobError
 from services.api.events import EventAddress, JobEvent
-from services.core.errors import CaptureInputError, JobStateError, PlatformError, UnknownJobError
+from services.core.errors import CaptureInputError, PlatformError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent

@@ -14,8 +14,9 @@ import pytest
 
 from services.api.app import create_app
 from services.api.client import Client
+from services.api.errors import UnknownCalibrationError
 from services.api.events import EventAddress
-from services.core.errors import CaptureInputError, UnknownCalibrationError
+from services.core.errors import CaptureInputError
 from services.core.records import JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext

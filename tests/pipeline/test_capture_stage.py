@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from services.capture import stage
 from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import DomeObserver, ModbusDome
+from services.capture.dome_controller import DomeObserver
+from services.capture.dome_modbus import ModbusDome
 from services.capture.frames import FrameStore
 from services.capture.motion import SubjectMotion
 from services.capture.plan import PlannedFrame, plan_capture

@@ -24,7 +24,8 @@ from services.capture import registers as reg
 from services.capture import stage
 from services.capture.console import Console
 from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import DomeObserver, ModbusDome
+from services.capture.dome_controller import DomeObserver
+from services.capture.dome_modbus import ModbusDome
 from services.capture.registers import FaultBit, FaultKind
 from services.capture.simulator import order_fault, simulated_dome
 from services.core.dome import DomeAnswer, DomeCommand
@@ -399,7 +400,8 @@ def test_of_two_all_offs_at_once_the_later_one_holds(shared_dome: Address, obser
 
 def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
     late_s = 3.0
-    monkeypatch.setattr("services.capture.dome_modbus.REPLY_TIMEOUT_S", 4 * late_s)
+    for module in ("dome_controller", "dome_modbus"):
+        monkeypatch.setattr(f"services.capture.{module}.REPLY_TIMEOUT_S", 4 * late_s)
     # As the process does it, each command in a thread of its own.
     with console(shared_dome) as answer, ThreadPoolExecutor(2) as threads:
         assert threads.submit(answer, do="light", light=0, level=0.1, on_s=20).result().code is None

@@ -13,7 +13,7 @@ import pytest
 
 from services.capture import registers as reg
 from services.capture.console import Console
-from services.capture.dome_modbus import DomeObserver
+from services.capture.dome_controller import DomeObserver
 from services.capture.modbus_link import ModbusLink
 from services.capture.preflight import preflight
 from services.capture.rig import PlannedRig

@@ -13,7 +13,7 @@ import pytest
 
 from services.api.dome import Dome, LightRequest
 from services.api.jobs import Jobs
-from services.capture.dome_modbus import DomeObserver
+from services.capture.dome_controller import DomeObserver
 from services.capture.simulator import simulated_dome
 from services.core.errors import RigUnreachableError
 from services.core.settings import DomeSettings, ServerSettings

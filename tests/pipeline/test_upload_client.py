@@ -14,8 +14,9 @@ import pytest
 
 from services.api.app import create_app
 from services.api.client import Client
+from services.api.errors import CorruptUploadError, IncompleteCaptureError, TooLargeError, UploadError
 from services.api.uploader import CHUNK_BYTES, Uploader, UploadProgress
-from services.core.errors import CaptureInputError, CorruptUploadError, DiskFullError, IncompleteCaptureError, PlatformError, TooLargeError, UploadError
+from services.core.errors import CaptureInputError, DiskFullError, PlatformError
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import serving

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.api.capture_paths import MOST_PARTS, MOST_PATH_BYTES, path_fault, require_paths
-from services.core.errors import UploadError
+from services.api.errors import UploadError
 
 names = st.text(st.sampled_from(["a", "B", "ß", "é", "\u0301", ".", " ", "/", "\\", "\0", "\n", "\u202e", "\u2028", "~", "c", "0"]), max_size=8)
 any_path = st.one_of(

@@ -1,0 +1,138 @@
+"""What anybody may ask of a dome's controller without driving it: its state, what it emits, and ALL OFF."""
+
+from __future__ import annotations
+
+from contextlib import closing, suppress
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.capture import registers as reg
+from services.capture.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
+from services.core.dome import DomeStatus
+from services.core.errors import RigError, RigUnreachableError
+
+REPLY_TIMEOUT_S = 0.5
+IDENTITY_TIMEOUT_S = 0.1
+"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and
+one that is late may be lit."""
+DARK_ATTEMPTS = 3
+"""How often a dome is told to go dark before a person is asked to cut its power."""
+
+
+class OtherDeviceError(LinkError):
+    """What answers is no dome controller, and gets no write."""
+
+
+def all_off(host: str, port: int) -> DomeStatus:
+    """Switch every light off, whoever drives the dome, and keep the supply open until a driver arms the watchdog anew.
+
+    Raises:
+        RigError: darkness could not be confirmed.
+    """
+    link, asker = ModbusLink(host, port, REPLY_TIMEOUT_S), ModbusLink(host, port, IDENTITY_TIMEOUT_S)
+    problem: Exception | None = None
+    try:
+        for _ in range(DARK_ATTEMPTS):
+            try:
+                with suppress(NoReplyError, RefusedError, WrongReplyError), closing(asker):
+                    require_dome(asker, repeated=False)
+                link.write(reg.ALL_OFF, [1])
+                link.write(reg.KEEPALIVE, [1, reg.STOPPED_MS])
+                status = read_status(link)
+            except LinkError as failure:
+                link.close()
+                problem = failure
+                continue
+            if not status.lit:
+                return status
+            problem = LinkError(f"light {status.lit[0]} still emits")
+    finally:
+        link.close()
+    raise error_kind(problem)(f"The dome at {host}:{port} is not confirmed dark ({problem}); press its emergency stop or cut its power.") from problem
+
+
+class DomeObserver:
+    """Read-only eyes on the dome's light, over a connection of their own; never feeds the watchdog."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
+        self._lights = self._read(reg.LIGHT_COUNT)[0]
+
+    def outputs(self) -> NDArray[np.float64]:
+        """What each LED emits now, (light, 3) as fraction of full scale."""
+        return np.asarray(self._read(reg.OUTPUTS, 3 * self._lights), dtype=np.float64).reshape(-1, 3) / reg.FULL_SCALE
+
+    def trigger_count(self) -> int:
+        """Exposure triggers since power-on, modulo 65536."""
+        return self._read(reg.TRIGGER_COUNT)[0]
+
+    def faults(self) -> reg.FaultBit:
+        """Latched faults."""
+        return reg.FaultBit(self._read(reg.FAULTS)[0])
+
+    def status(self) -> DomeStatus:
+        """The controller's state."""
+        try:
+            return read_status(self._link)
+        except LinkError as problem:
+            raise self._blind(problem) from problem
+
+    def close(self) -> None:
+        """Drop the connection."""
+        self._link.close()
+
+    def _blind(self, problem: LinkError) -> RigError:
+        self._link.close()
+        return error_kind(problem)(f"The dome cannot be observed: {problem}; check its power and network.")
+
+    def _read(self, register: reg.Register, count: int | None = None) -> list[int]:
+        try:
+            return self._link.read(register, count)
+        except LinkError as problem:
+            raise self._blind(problem) from problem
+
+
+def require_dome(link: ModbusLink, *, repeated: bool = True) -> None:
+    """Ask a device whether it is a dome's controller; ``repeated`` asks again where it does not reply.
+
+    Raises:
+        OtherDeviceError: it is something else. LinkError: it does not say.
+    """
+    if link.read(reg.IDENTITY, repeated=repeated)[0] != reg.IDENTITY_VALUE:
+        raise OtherDeviceError(f"the device at {link.address} is no dome controller")
+
+
+def read_status(link: ModbusLink) -> DomeStatus:
+    """The controller's state, register by register.
+
+    Raises:
+        LinkError: it cannot be read, or the device is no dome.
+    """
+    require_dome(link)
+    firmware, lights = link.read(reg.FIRMWARE)[0], min(link.read(reg.LIGHT_COUNT)[0], reg.MAX_LIGHTS)
+    closed, pressed, supply = link.read(reg.INTERLOCK_CLOSED, 3)
+    banks = -(-lights // reg.LIGHTS_PER_BANK)
+    outputs = np.asarray(link.read(reg.OUTPUTS, 3 * lights)).reshape(-1, 3)
+    return DomeStatus(
+        firmware=f"{firmware >> 8}.{firmware & 0xFF}",
+        light_count=lights,
+        interlock_closed=bool(closed),
+        emergency_stop=bool(pressed),
+        supply_on=bool(supply),
+        stopped=link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS,
+        faults=fault_names(reg.FaultBit(link.read(reg.FAULTS)[0])),
+        lit=tuple(int(light) for light in np.flatnonzero(outputs.any(axis=1))),
+        temperature_degc=tuple(tenths / 10 for tenths in link.read(reg.BANK_TEMPERATURE, banks)),
+        current_ma=tuple(link.read(reg.BANK_CURRENT, banks)),
+    )
+
+
+def error_kind(problem: Exception | None) -> type[RigError]:
+    """What a failure of the link is to whoever uses the dome: a controller that gives no reply may still be lit."""
+    return RigUnreachableError if isinstance(problem, NoReplyError) else RigError
+
+
+def fault_names(faults: reg.FaultBit) -> tuple[str, ...]:
+    """The latched faults in words."""
+    return tuple(bit.name.lower().replace("_", " ") for bit in reg.FaultBit if bit in faults and bit.name)
