@@ -7,10 +7,10 @@ demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and repor
 	@$(BIN)/dentine demo --out demo
 
 gallery: setup ## pictures of a tooth in an ordinary scene, in gallery/, some minutes
-	@$(BIN)/python -m services.fit.gallery --out gallery
+	@$(BIN)/python -m services.bench.figures.gallery --out gallery
 
 figures: setup ## the figures of teeth 2018 from fits of this project's own, in figures/, tens of minutes
-	@$(BIN)/python -m services.fit.figures --out figures
+	@$(BIN)/python -m services.bench.figures --out figures
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
 	@deploy/setup.sh dashboard browser

@@ -229,14 +229,14 @@ def phantom(
 
 _BENCHMARKS = MappingProxyType(
     {
-        "jaw": "services.fit.bench.jaw:run",
-        "slab": "services.fit.bench.slab:run",
-        "stability": "services.fit.bench.stability:run",
-        "tooth": "services.fit.bench.tooth:run",
-        "transport-gradient": "services.fit.bench.transport_gradient:run",
-        "transport-lights": "services.fit.bench.transport_lights:run",
-        "transport-skip": "services.fit.bench.transport_skip:run",
-        "transport-stack": "services.fit.bench.transport_stack:run",
+        "jaw": "services.bench.fits.jaw:run",
+        "slab": "services.bench.slab:run",
+        "stability": "services.bench.stability.run:run",
+        "tooth": "services.bench.fits.tooth:run",
+        "transport-gradient": "services.bench.transport.gradient:run",
+        "transport-lights": "services.bench.transport.lights:run",
+        "transport-skip": "services.bench.transport.skip:run",
+        "transport-stack": "services.bench.transport.stack:run",
     }
 )
 """Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and ``keep``, which stores unfinished rows."""
@@ -284,7 +284,7 @@ def bench(
 def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
     """Draw a benchmark in its module's own way if it has one."""
     try:
-        from services.fit.bench.plots import error_against_time, write_png
+        from services.bench.plots import error_against_time, write_png
     except ModuleNotFoundError as missing:
         print(f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install 'dentine[bench]'.", file=sys.stderr)
         return

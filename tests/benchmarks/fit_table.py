@@ -23,11 +23,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.fits.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.anatomy.thickness import thickness_image
-from services.fit.bench.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
 from services.fit.optics.parameters import Tissue
 from services.fit.schedule import ChannelSchedule
 from services.fit.stage import fitted_teeth, run

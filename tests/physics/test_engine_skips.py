@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.fit.bench.transport_skip import Case, cases, kernel_operations
+from services.bench.transport.skip import Case, cases, kernel_operations
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.slab.simulate import Layer, accumulate
 from services.fit.transport.engine import Engine

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from services.bench.transport.gradient import our_gradient
+from services.bench.transport.gradient_rows import of_parts
+from services.bench.transport.stock_gradient import StockGradient
 from services.core.meshfiles import write_mesh
-from services.fit.bench.gradient_rows import of_parts
-from services.fit.bench.stock_gradient import StockGradient
-from services.fit.bench.transport_gradient import our_gradient
 from services.fit.export.mitsuba_scene import load_scene, nested_scene
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine

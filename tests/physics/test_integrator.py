@@ -324,7 +324,7 @@ def png_pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> None:
-    from services.fit.gallery import main
+    from services.bench.figures.gallery import main
 
     with variant("llvm_ad_rgb"):
         status = main(["--out", str(tmp_path), "--views", "front", "backlit", "--size", "20", "25", "--samples", "32"])
@@ -340,8 +340,8 @@ def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> No
 
 
 def test_the_gallery_renders_a_scene_of_ones_own(tooth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from services.bench.figures.gallery import main
     from services.fit.export.scene_xml import write_scene
-    from services.fit.gallery import main
 
     scene = tmp_path / "scene.xml"
     write_scene(scene, scene_dict(tooth))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.bench.stability.corners import MATCHED, REGIONS, SMOOTH, THIN, Corners, draw
+from services.bench.stability.difficult_scenes import Scene, ellipsoid, look, scenes, with_slivers
+from services.bench.stability.formula_errors import FORMULAS
+from services.bench.stability.run import WHITE, as_table, formula_rows, stress_plan, trace, walk_rows
 from services.core.errors import InputError, MeshError
 from services.core.geometry import Mesh
-from services.fit.bench.corners import MATCHED, REGIONS, SMOOTH, THIN, Corners, draw
-from services.fit.bench.difficult_scenes import Scene, ellipsoid, look, scenes, with_slivers
-from services.fit.bench.formula_errors import FORMULAS
-from services.fit.bench.stability import WHITE, as_table, formula_rows, stress_plan, trace, walk_rows
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab, specular_share
 from services.fit.transport.engine import Engine

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from services.bench.fits.stock_fit import StockFit
+from services.bench.fits.tooth_capture import prepared_tooth
 from services.core.records import JobSpec
 from services.fit.anatomy.phantom import write_phantom
-from services.fit.bench.stock_fit import StockFit
-from services.fit.bench.tooth_capture import prepared_tooth
 from services.fit.optics.parameters import Medium, Tissue
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.bench.figures.surroundings import environment_light, read_environment, seen_under
 from services.core.errors import InputError
-from services.fit.figures.surroundings import environment_light, read_environment, seen_under
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from tests.support.small_tooth import SEMI_AXES_MM, camera_at, ellipsoid

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from services.bench.figures.__main__ import main
 from services.core.verdict import MAX_ERROR
-from services.fit.figures.__main__ import main
 
 
 @pytest.mark.slow

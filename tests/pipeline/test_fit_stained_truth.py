@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
 from services.core.meshfiles import read_mesh
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.fit.anatomy.phantom import write_phantom
 from services.fit.anatomy.stain_paint import TEXEL_MM, painted_depth
 from services.fit.anatomy.stain_uv import stain_layout, texel_edge_mm
-from services.fit.bench.tooth_capture import prepared_tooth, tissue_of
 from services.fit.driver import dentin_shape
 from services.fit.export.stains import kept_stains
 from services.fit.observations import channel_scene

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.fits.tooth_capture import photograph
 from services.core.geometry import Mesh, teeth_folder
 from services.core.meshfiles import read_mesh, write_mesh
-from services.fit.bench.tooth_capture import photograph
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "truths"
 SIDE_LIGHTS = ("l2", "l4", "l6")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.fit.bench.jaw import Judge, mouth_of, picture, tooth_off
+from services.bench.fits.jaw import Judge, mouth_of, picture, tooth_off
 from services.fit.evaluate import ErrorSums
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 

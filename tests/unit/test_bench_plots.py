@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 import services.__main__ as command
-from services.fit.bench import Row
-from services.fit.bench.plots import error_against_time, write_png
-from services.fit.bench.transport_lights import LightsRow, picture, spread_lights
+from services.bench import Row
+from services.bench.plots import error_against_time, write_png
+from services.bench.transport.lights import LightsRow, picture, spread_lights
 
 ROWS: list[dict[str, Any]] = [
     Row(benchmark="race", peer="dentine", seconds=1.0, error=0.1).model_dump(),
@@ -88,7 +88,7 @@ def test_the_picture_lies_beside_the_rows(toy_benchmark: None, tmp_path: Path) -
 def test_without_a_drawing_library_the_rows_are_still_written(
     toy_benchmark: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "services.fit.bench.plots")
+    monkeypatch.delitem(sys.modules, "services.bench.plots")
     monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
     command.bench("toy", tmp_path / "one.json")
     assert json.loads((tmp_path / "one.json").read_text()) == ROWS

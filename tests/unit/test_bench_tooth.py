@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from services.fit.bench.tooth import PEER, Judge, ToothRow, picture, summary
-from services.fit.bench.tooth_capture import tissue_of
+from services.bench.fits.tooth import PEER, Judge, ToothRow, picture, summary
+from services.bench.fits.tooth_capture import tissue_of
 from services.fit.evaluate import ErrorSums
 from services.fit.optics.parameters import Medium, Tissue
 

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.bench.figures import cases
+from services.bench.figures.__main__ import FIGURES, chosen_figures, keep, main
+from services.bench.figures.ambient import QUANTITIES, Row, sentence, table
+from services.bench.figures.cases import Capture, Case, fingerprint, run_dentine, write_photographs
+from services.bench.figures.drawings import Drawn
+from services.bench.figures.environment import finer
+from services.bench.figures.mosaic import GAP_PX, HEAD_PX, PAPER, Column, cropped, mosaic, photo_and_fit
 from services.core.errors import DentineError, InputError
 from services.core.geometry import Camera, Light
 from services.core.records import FolderCapture, ImageEntry
 from services.core.store import read_record, write_record
 from services.fit.export.pictures import MASKED, Picture
-from services.fit.figures import cases
-from services.fit.figures.__main__ import FIGURES, chosen_figures, keep, main
-from services.fit.figures.ambient import QUANTITIES, Row, sentence, table
-from services.fit.figures.cases import Capture, Case, fingerprint, run_dentine, write_photographs
-from services.fit.figures.drawings import Drawn
-from services.fit.figures.environment import finer
-from services.fit.figures.mosaic import GAP_PX, HEAD_PX, PAPER, Column, cropped, mosaic, photo_and_fit
 
 SIZE = (4, 3)
 """Width and height of the small capture's images."""

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from services.bench.fits.tooth_capture import CHANNEL, PreparedTooth
 from services.core.meshfiles import write_mesh
-from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth
 from services.fit.optics.domain import LN10, to_dual, to_natural
 from services.fit.optics.parameters import Medium, Tissue
 

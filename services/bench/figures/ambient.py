@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.figures.cases import Case
+from services.bench.figures.cast import Cast
+from services.bench.figures.drawings import Drawn
+from services.bench.figures.fitted import Fitted
+from services.bench.figures.surroundings import seen_under
+from services.bench.fits.tooth_capture import tissue_of
 from services.core.meshfiles import read_mesh
 from services.core.records import FitReport, FolderCapture
 from services.core.store import read_record
 from services.fit.anatomy.reflection import ROUGHNESS
-from services.fit.bench.tooth_capture import tissue_of
-from services.fit.figures.cases import Case
-from services.fit.figures.cast import Cast
-from services.fit.figures.drawings import Drawn
-from services.fit.figures.fitted import Fitted
-from services.fit.figures.surroundings import seen_under
 
 CHANNEL = "green"
 AMBIENT_SAMPLES = 256
@@ -128,7 +128,7 @@ def plot(rows: Sequence[Row]) -> NDArray[np.uint8]:
     """Found over true, with standard errors, against the strength of the ambient light."""
     from PIL import Image
 
-    from services.fit.bench.plots import grid, write_png
+    from services.bench.plots import grid, write_png
 
     figure, axes = grid(2)
     for one, leaf in zip(axes, ("sigma_s_reduced", "absorption_share"), strict=True):

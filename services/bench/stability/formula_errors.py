@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench.corners import REGIONS, SMOOTH, Corners
+from services.bench.stability.corners import REGIONS, SMOOTH, Corners
 from services.fit.optics import fresnel, phase
 from services.fit.optics.domain import BOUNDS, natural_derivative, to_dual, to_natural
 from services.fit.optics.free_flight import minus_log1m, one_minus_exp

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from services.fit.bench import Row
+from services.bench import Row
 from services.fit.slab.simulate import Layer, simulate_slab
 
 CASES = {

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from services.bench.figures.cast import Cast
+from services.bench.figures.drawings import Drawn
+from services.bench.figures.fitted import Fitted
+from services.bench.figures.gallery import SIMILAR_G
+from services.bench.figures.mosaic import Column, mosaic
+from services.bench.figures.surroundings import environment_light, read_environment, seen_under
 from services.core.geometry import Camera, Mesh
 from services.fit.anatomy.reflection import ROUGHNESS
 from services.fit.export.pictures import tone_map, white_level
-from services.fit.figures.cast import Cast
-from services.fit.figures.drawings import Drawn
-from services.fit.figures.fitted import Fitted
-from services.fit.figures.mosaic import Column, mosaic
-from services.fit.figures.surroundings import environment_light, read_environment, seen_under
-from services.fit.gallery import SIMILAR_G
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 

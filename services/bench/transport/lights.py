@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from services.bench import Row
+from services.bench.transport.incisor_stack import TISSUE, incisor_stack
 from services.fit.anatomy.rig import dome_cameras
-from services.fit.bench import Row
-from services.fit.bench.incisor_stack import TISSUE, incisor_stack
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View
 
@@ -118,7 +118,7 @@ def spread_lights(count: int) -> tuple[int, ...]:
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
     """Error against run time, cost against lights, and time against pixels."""
-    from services.fit.bench.plots import draw_errors, finish, grid
+    from services.bench.plots import draw_errors, finish, grid
 
     figure, (errors, by_lights, by_pixels) = grid(3)
     lights = [row for row in rows if row["benchmark"] == "transport-lights" and row["peer"] != PEER]

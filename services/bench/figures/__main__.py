@@ -1,4 +1,4 @@
-"""Figures of teeth 2018 by this project's own fits: ``python -m services.fit.figures --out DIR``.
+"""Figures of teeth 2018 by this project's own fits: ``python -m services.bench.figures --out DIR``.
 
 Each figure is a PNG with its caption beside it, and ``index.html`` shows all that are there. Captures and fits are made once, by the command line, and
 kept below ``DIR/work``; what is finished is used again.
@@ -13,14 +13,14 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
+from services.bench.figures.ambient import under_ambient_light
+from services.bench.figures.cast import FULL, QUICK, Cast
+from services.bench.figures.drawings import Drawn, caption_page, five_lights, front_and_side, stages, unseen_camera, whole_jaw
+from services.bench.figures.environment import memorial, under_an_environment
+from services.bench.fits.tooth_capture import real_tooth
 from services.core.errors import DentineError, InputError
 from services.core.store import write_atomic
-from services.fit.bench.tooth_capture import real_tooth
 from services.fit.export.pictures import png_bytes
-from services.fit.figures.ambient import under_ambient_light
-from services.fit.figures.cast import FULL, QUICK, Cast
-from services.fit.figures.drawings import Drawn, caption_page, five_lights, front_and_side, stages, unseen_camera, whole_jaw
-from services.fit.figures.environment import memorial, under_an_environment
 
 Drawing = Callable[[Cast], Drawn]
 
@@ -64,7 +64,7 @@ def keep(folder: Path, name: str, drawn: Drawn) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Make figures; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m services.fit.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser = argparse.ArgumentParser(prog="python -m services.bench.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the figures (default: figures)")
     parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas (default: all)")
     parser.add_argument("--quick", action="store_true", help="smaller captures of the procedural incisor and fits of few samples, for a check")

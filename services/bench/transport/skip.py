@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench import Row
 from services.core.geometry import Camera, Mesh
 from services.fit.anatomy.blend import dentin_blend_shape
 from services.fit.anatomy.incisor import build_incisor
 from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.bench import Row
 from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
@@ -70,7 +70,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 def cases() -> list[Case]:
     """Everything that a kernel is specialised for, on a procedural incisor."""
-    from services.fit.bench.plain_walk import PlainEngine
+    from services.bench.transport.plain_walk import PlainEngine
 
     incisor = build_incisor()
     rig = dome_lights(LIGHTS, ("green",), seed=1)
@@ -157,7 +157,7 @@ def _compare(case: Case, samples: int) -> list[SkipRow]:
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
     """Times relative to a kernel that never had the feature, and the kernels' operations, feature off and on."""
-    from services.fit.bench.plots import grid
+    from services.bench.plots import grid
 
     compared = [row for row in rows if row["time_ratio"] is not None][::-1]
     names = [row["benchmark"].removeprefix("transport-skip ") for row in compared]

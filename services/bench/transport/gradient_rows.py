@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench import Row
+from services.bench import Row
 
 Array = NDArray[np.float64]
 

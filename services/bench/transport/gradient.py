@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench.gradient_rows import Estimate, GradientRow, of_parts
-from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
-from services.fit.bench.shape_gradient import shape_rows
-from services.fit.bench.stain_gradient import stain_rows
-from services.fit.bench.stock_gradient import StockGradient, shared_names
+from services.bench.transport.gradient_rows import Estimate, GradientRow, of_parts
+from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
+from services.bench.transport.shape_gradient import shape_rows
+from services.bench.transport.stain_gradient import stain_rows
+from services.bench.transport.stock_gradient import StockGradient, shared_names
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View

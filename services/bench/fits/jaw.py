@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from services.bench import Row
+from services.bench.fits.tooth_capture import CHANNEL, PreparedTooth, prepare, write_photograph
 from services.core.records import FitReport, FolderCapture, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, read_record
-from services.fit.bench import Row
-from services.fit.bench.tooth_capture import CHANNEL, PreparedTooth, prepare, write_photograph
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.platform import prepare_device
 
@@ -187,7 +187,7 @@ def reported_mouth(report: FitReport, like: Mouth) -> Mouth:
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
     """Errors of images, and the median tooth's errors of its media, against processor time; what ends a stage is ringed."""
-    from services.fit.bench.plots import finish, grid
+    from services.bench.plots import finish, grid
 
     figure, (images, media) = grid(2)
     seconds = [row["seconds"] for row in rows]

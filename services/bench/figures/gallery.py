@@ -1,6 +1,6 @@
 """Pictures of a tooth in an ordinary Mitsuba scene, by the ``dentine`` integrator.
 
-``python -m services.fit.gallery --out DIR`` stands an incisor on a table and writes one PNG per view. Other teeth come with
+``python -m services.bench.figures.gallery --out DIR`` stands an incisor on a table and writes one PNG per view. Other teeth come with
 ``--outer`` and ``--dentin``, other surroundings with ``--environment``, and a scene of one's own with ``--scene FILE.xml
 --enamel ID --core ID``: the shapes of these ids become a tooth, and every sensor gives a picture.
 """
@@ -221,7 +221,7 @@ def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, floa
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the gallery; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m services.fit.gallery", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m services.bench.figures.gallery", description=__doc__.split("\n\n")[0])
     parser.add_argument("--out", type=Path, default=Path("gallery"), help="folder of the pictures (default: gallery)")
     parser.add_argument("--views", nargs="+", choices=tuple(VIEWS), default=tuple(VIEWS), help="which views (default: all)")
     parser.add_argument("--samples", type=int, default=256, help="paths per pixel (default: 256)")

@@ -16,10 +16,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench import Row
-from services.fit.bench.corners import REGIONS, SMOOTH, Corners, draw
-from services.fit.bench.difficult_scenes import look, scenes
-from services.fit.bench.formula_errors import FORMULAS, worst_by_region
+from services.bench import Row
+from services.bench.stability.corners import REGIONS, SMOOTH, Corners, draw
+from services.bench.stability.difficult_scenes import look, scenes
+from services.bench.stability.formula_errors import FORMULAS, worst_by_region
 from services.fit.optics import fresnel
 from services.fit.optics.parameters import MEDIUM_FIELDS
 from services.fit.slab.simulate import specular_share
@@ -118,7 +118,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
     """Every formula's error in every region with its bound; errors of regions and scenes against run time, without lines, as they are different things."""
-    from services.fit.bench.plots import draw_errors, grid
+    from services.bench.plots import draw_errors, grid
 
     figure, (formulas, walk, scenes) = grid(3)
     of = {part: [row for row in rows if row["benchmark"] == f"stability-{part}"] for part in ("formula", "walk", "scene")}

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench import Row
-from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
+from services.bench import Row
+from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View
 

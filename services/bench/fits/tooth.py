@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from services.bench import Row
+from services.bench.fits.stock_fit import StockFit
+from services.bench.fits.tooth_capture import PreparedTooth, smallest_case, tissue_of
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.fit.bench import Row
-from services.fit.bench.stock_fit import StockFit
-from services.fit.bench.tooth_capture import PreparedTooth, smallest_case, tissue_of
 from services.fit.optics.parameters import Tissue
 from services.fit.transport.platform import prepare_device
 
@@ -88,7 +88,7 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
         keep: called with all rows so far after every new one.
     """
     if case == "scale":
-        from services.fit.bench.tooth_scale import run as run_scale
+        from services.bench.fits.tooth_scale import run as run_scale
 
         return run_scale(quick=quick, keep=keep)
     prepare_device(threads=1)
@@ -171,7 +171,7 @@ def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
     """Held-out error against processor time; of the scale case, workers against time."""
-    from services.fit.bench.plots import draw_errors, finish, grid
+    from services.bench.plots import draw_errors, finish, grid
 
     if rows and rows[0]["benchmark"].startswith("tooth-scale"):
         figure, (axes,) = grid(1)

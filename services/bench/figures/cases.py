@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.fits.tooth_capture import write_photograph
 from services.core.errors import InputError
 from services.core.records import FolderCapture, JobSpec
 from services.core.settings import read_job
 from services.core.store import read_record, write_record
-from services.fit.bench.tooth_capture import write_photograph
 
 Array = NDArray[np.float64]
 JOB = "job.toml"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from services.bench.figures.cases import Case
+from services.bench.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
+from services.bench.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
+from services.bench.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
 from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
-from services.fit.figures.cases import Case
-from services.fit.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
-from services.fit.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
-from services.fit.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
 from services.fit.optics.domain import similar_tissue
 from services.fit.schedule import SIMILAR_G
 

@@ -14,13 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from services.bench import Row
+from services.bench.fits.tooth_capture import prepare
 from services.core.dask_config import DASK_CONFIG
 from services.core.errors import InputError
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.bench import Row
-from services.fit.bench.tooth_capture import prepare
 
 PIXEL_MM, CAMERAS, LIGHTS, SAMPLES = 0.064, 3, 54, 64
 CACHE = Path(".cache")

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from services.bench.figures.cases import Capture, Case
+from services.bench.figures.gallery import tooth_surfaces
 from services.core.meshfiles import write_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.figures.cases import Capture, Case
-from services.fit.gallery import tooth_surfaces
 
 FRONT_LIGHTS = tuple(f"l{n}" for n in range(9))
 """Of eighteen: up to 70 degrees from the front."""

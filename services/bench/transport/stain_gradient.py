@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.bench.gradient_rows import GradientRow
-from services.fit.bench.incisor_stack import TISSUE, IncisorStack, incisor_stack
+from services.bench.transport.gradient_rows import GradientRow
+from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
 from services.fit.optics.parameters import Stain
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import SceneRecipe, ToothSurfaces

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.figures.gallery import render
 from services.core.errors import InputError
 from services.core.geometry import Camera, Mesh
 from services.core.meshfiles import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, sensor_dict
-from services.fit.gallery import render
 from services.fit.optics.parameters import Tissue
 from services.fit.transport.platform import prepare_device
 

@@ -1,0 +1,1 @@
+"""Fits of teeth and jaws, timed against their error."""

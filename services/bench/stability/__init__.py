@@ -1,0 +1,1 @@
+"""Numerical stability at the corners of the parameters and in difficult scenes."""

@@ -1,1 +1,0 @@
-"""Figures of what a fit does, made from fits that the command line runs: ``python -m services.fit.figures --out DIR``."""
