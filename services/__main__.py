@@ -217,11 +217,11 @@ def phantom(
     rig: dict[str, Any] = {"cameras": cameras, "lights": lights, "held_out": held_out, "channels": channels, "seed": seed, "samples": samples}
     rig |= {"boundary": boundary.value, "renderer": renderer.value} | ({} if pixel_mm is None else {"pixel_mm": pixel_mm})
     if jaw:
-        from services.fit.anatomy.phantom_jaw import write_jaw_phantom
+        from services.phantom.jaw import write_jaw_phantom
 
         write_jaw_phantom(out, subject=subject, scan=scan, **rig)
     else:
-        from services.fit.anatomy.phantom import write_phantom
+        from services.phantom.tooth import write_phantom
 
         write_phantom(out, outer=outer, dentin=dentin, fdi=fdi, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
     print(f"phantom: {out}")

@@ -35,7 +35,7 @@ class JobKind:
 
 
 _TEETH: Mapping[StageName, str] = {
-    "phantom": "services.fit.stage:phantom",
+    "phantom": "services.phantom.stage:run",
     "capture": "services.capture.stage:run",
     "prepare": "services.preprocess.stage:run",
     "fit": "services.fit.stage:run",

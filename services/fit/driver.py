@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
 from services.fit.alignment import offsets_told
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.stain_uv import ToothStains, stain_layout, texel_edge_mm
-from services.fit.anatomy.thickness import ThicknessMap, thickness_map
 from services.fit.attempt import Attempt, judge, standard_errors, worst_error
+from services.fit.checks.thickness import ThicknessMap, thickness_map
 from services.fit.executors import Executor
 from services.fit.export.stains import keep_stains
 from services.fit.identifiability import NOTHING, correlation, told
+from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.journal import Journal
 from services.fit.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.optics.parameters import Tissue
@@ -147,14 +147,14 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
         assert tooth.dentin is not None
         return DentinShape.known(tooth.dentin)
     if spec.dentin == "fit":
-        from services.fit.anatomy.jaw_frames import tooth_frame
+        from services.anatomy.jaw_frames import tooth_frame
 
         return blend_shape(tooth, tooth_frame(tooth, viewpoints_mm(cameras)))
     return None
 
 
 def _number_told(tooth: Tooth, spec: JobSpec) -> str:
-    from services.fit.anatomy.jaw_frames import number_told
+    from services.anatomy.jaw_frames import number_told
 
     return number_told(tooth) if spec.dentin == "fit" else ""
 
@@ -165,8 +165,8 @@ def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
     Raises:
         MeshError: the mesh allows none.
     """
-    from services.fit.anatomy.blend import dentin_blend_shape
-    from services.fit.anatomy.dimensions import upper_tooth
+    from services.anatomy.blend import dentin_blend_shape
+    from services.anatomy.templates.dimensions import upper_tooth
 
     return dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
 

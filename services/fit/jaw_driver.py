@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
-from services.fit.anatomy.frame import ToothFrame
 from services.fit.attempt import Attempt
 from services.fit.blocks import GUMS
 from services.fit.driver import blend_shape, viewpoints_mm
@@ -108,7 +108,7 @@ def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSp
         return known_dentins(teeth)
     if spec.dentin == "none":
         return [None for _ in teeth]
-    from services.fit.anatomy.jaw_frames import jaw_frames
+    from services.anatomy.jaw_frames import jaw_frames
 
     def blended(tooth: Tooth, frame: ToothFrame) -> DentinShape | None:
         try:

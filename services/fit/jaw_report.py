@@ -10,8 +10,8 @@ import numpy as np
 from services.core.records import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
 from services.fit.alignment import offsets_told
-from services.fit.anatomy.thickness import thickness_map
 from services.fit.attempt import judge, standard_errors, worst_error
+from services.fit.checks.thickness import thickness_map
 from services.fit.driver import shape_covariance
 from services.fit.evaluate import ErrorSums, Evaluation
 from services.fit.identifiability import told

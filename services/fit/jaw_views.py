@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.fit.anatomy.rays import RayScene
 from services.fit.blocks import CAVITY, GUMS, PixelParts
 from services.fit.observations import Observations, ViewStack
+from services.fit.transport.rays import RayScene
 
 
 def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple[ViewStack, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.anatomy.average_arch import is_upper
+from services.anatomy.templates.average_arch import is_upper
 from services.fit.blocks import PixelParts
 from services.fit.optics.domain import Domain
 

@@ -28,8 +28,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.fit.anatomy.stain_uv import StainLayout
 from services.fit.closing import Held
+from services.fit.inputs.stain_uv import StainLayout
 from services.fit.next_capture import Sensor, advice
 from services.fit.observations import COARSE_PIXELS
 from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium

@@ -1,4 +1,4 @@
-"""The fit service's doors: ``phantom`` makes a demonstration's mouth, ``run`` fits a prepared capture, ``export`` turns the fit into an asset."""
+"""The fit service's doors: ``run`` fits a prepared capture, ``export`` turns the fit into an asset."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from services.core.geometry import Mesh
 from services.core.installed import require_packages
-from services.core.records import AssetManifest, FitReport, FolderCapture, JobSpec, PreparedManifest, ToothReport
+from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
-from services.core.store import StageWriter, open_stage, read_record, write_atomic, write_record
+from services.core.store import StageWriter, open_stage, write_atomic, write_record
 from services.core.verdict import VERDICT, verdict_of
 
 if TYPE_CHECKING:
@@ -42,35 +42,6 @@ def check() -> None:
     for module in ("services.fit.jaw_driver", "services.fit.export.report", "services.fit.transport.engine"):
         importlib.import_module(module)
     require_renderer()
-
-
-def phantom(spec: JobSpec, context: StageContext) -> FolderCapture:
-    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig looks at; ``spec.rig.mouth`` is where such mouths are kept, if anywhere.
-
-    Raises:
-        CrashError: it could not be rendered. JobCancelledError: in mid-kernel.
-    """
-    from services.fit.demo_mouth import DESCRIPTION, make_demo_mouth
-
-    done = -1.0
-
-    def look(fraction: float) -> None:
-        nonlocal done
-        context.raise_if_cancelled()
-        if fraction > done:
-            done = fraction
-            context.report(StageEvent(stage="phantom", kind="progress", done=done, message="A virtual incisor is being rendered."))
-
-    context.report(StageEvent(stage="phantom", kind="started"))
-    context.raise_if_cancelled()
-    writer = StageWriter(context.root, "phantom", context.attempt)
-    kept_in = spec.rig.mouth if spec.rig is not None and not spec.is_demo else None
-    is_new = make_demo_mouth(writer.folder, kept_in, look)
-    description = read_record(writer.folder / DESCRIPTION, FolderCapture)
-    writer.publish(description)
-    how = "rendered" if is_new else "taken from an earlier demonstration"
-    context.report(StageEvent(stage="phantom", kind="finished", done=1.0, message=f"A virtual incisor was {how}."))
-    return description
 
 
 def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:

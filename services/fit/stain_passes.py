@@ -18,9 +18,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.anatomy.stain_uv import StainLayout
 from services.fit.blocks import BlockTask, read_block
 from services.fit.engine_host import EngineHost
+from services.fit.inputs.stain_uv import StainLayout
 from services.fit.journal import Journal
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue

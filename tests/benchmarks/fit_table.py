@@ -27,7 +27,7 @@ from services.bench.fits.tooth_capture import PreparedTooth, prepared_tooth, tis
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.anatomy.thickness import thickness_image
+from services.fit.checks.thickness import thickness_image
 from services.fit.optics.parameters import Tissue
 from services.fit.schedule import ChannelSchedule
 from services.fit.stage import fitted_teeth, run

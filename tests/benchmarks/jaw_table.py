@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from services.anatomy.templates.dimensions import upper_tooth
+from services.anatomy.templates.jaw import build_jaw
 from services.bench.fits.jaw import prepared_jaw, reported_mouth
 from services.bench.fits.tooth_capture import PreparedTooth
 from services.core.records import FitReport, JobSpec, PreparedManifest
 from services.core.store import open_stage
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.jaw import build_jaw
-from services.fit.anatomy.thickness import enamel_thickness_mm
+from services.fit.checks.thickness import enamel_thickness_mm
 from services.fit.jaw_views import showing
 from services.fit.optics.parameters import Mouth
 from services.fit.stage import fitted_teeth

@@ -11,10 +11,10 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from services.anatomy.templates.jaw import build_jaw
 from services.core.geometry import Mesh
 from services.core.meshfiles import write_mesh
-from services.fit.anatomy.jaw import build_jaw
-from services.fit.anatomy.phantom import write_phantom
+from services.phantom.tooth import write_phantom
 from tests.support.truths import FOLDER, pack
 
 PIXEL_MM, CAMERAS, LIGHTS, SAMPLES = 0.5, 3, 8, 1024

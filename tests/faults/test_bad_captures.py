@@ -14,8 +14,8 @@ import trimesh
 
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext
-from services.fit.anatomy.phantom import write_phantom
 from services.fit.stage import export, run
+from services.phantom.tooth import write_phantom
 from services.preprocess.stage import run as prepare
 
 pytestmark = pytest.mark.slow

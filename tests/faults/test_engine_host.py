@@ -15,8 +15,8 @@ import psutil
 import pytest
 from distributed import Client, LocalCluster, get_worker
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
-from services.fit.anatomy.incisor import build_incisor
 from services.fit.blocks import StoredFile, write_recipe
 from services.fit.engine_host import CancellableHost, ChildHost, EngineHost
 from services.fit.engine_process import memory_kills

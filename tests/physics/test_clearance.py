@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Mesh
-from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.transport.platform import prepare_device
 
 EDGE_MM, RADIUS_MM = (12.0, 6.0, 6.0), 1.5

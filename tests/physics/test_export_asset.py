@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
 from services.core.records import Boundary, Estimate, FitReport
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.anatomy.stain_paint import painted_depth
-from services.fit.anatomy.stain_uv import ToothStains, stain_layout
 from services.fit.export.asset import tissue_of, write_asset
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
+from services.fit.inputs.stain_uv import ToothStains, stain_layout
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.stain_paint import painted_depth
 
 TISSUE = Tissue(Medium(2.5, 0.97, 0.9, 0.6, -0.1), Medium(6.0, 0.93, 1.0, 0.5, 0.0))
 """Paths of some tens of scatters: the comparison costs seconds."""

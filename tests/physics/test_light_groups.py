@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.anatomy.rig import dome_lights
 from services.fit.transport.platform import prepare_device
+from services.phantom.dome_rig import dome_lights
 
 POINT_MM = (1.0, -2.0, 3.0)
 AHEAD = np.array([0.6, 0.0, 0.8])

@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from services.anatomy.distance import SurfaceDistance
 from services.core.errors import InputError
 from services.core.geometry import Mesh
 from services.core.meshfiles import write_mesh
-from services.fit.anatomy.distance import SurfaceDistance
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.phase_table import PhaseTable

@@ -9,8 +9,8 @@ import pytest
 from services.bench.fits.stock_fit import StockFit
 from services.bench.fits.tooth_capture import prepared_tooth
 from services.core.records import JobSpec
-from services.fit.anatomy.phantom import write_phantom
 from services.fit.optics.parameters import Medium, Tissue
+from services.phantom.tooth import write_phantom
 
 
 @pytest.mark.slow

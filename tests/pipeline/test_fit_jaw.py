@@ -13,7 +13,7 @@ from services.core.errors import CaptureInputError, DentineError, InputError, Se
 from services.core.records import FitReport, JobSpec, PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
-from services.fit.anatomy.thickness import enamel_thickness_mm
+from services.fit.checks.thickness import enamel_thickness_mm
 from services.fit.jaw_schedule import TIED_SD
 from services.fit.optics.priors import SHAPE
 from services.fit.stage import ENGINE, export, fitted_teeth, run

@@ -21,7 +21,7 @@ from services.core.meshfiles import read_mesh, read_teeth, write_mesh
 from services.core.records import FolderCapture, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import read_record
-from services.fit.anatomy.rays import RayScene, pixel_rays
+from services.fit.transport.rays import RayScene, pixel_rays
 from services.preprocess.stage import run
 
 FDI = (*range(11, 18), *range(21, 28))

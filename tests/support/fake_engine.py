@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.anatomy.stain_uv import bilinear_texels
+from services.fit.inputs.stain_uv import bilinear_texels
 from services.fit.optics.parameters import Stain, Tissue
 from services.fit.solve.table_search import bin_powers
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.anatomy.rays import RayScene, pixel_rays
 from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.transport.rays import RayScene, pixel_rays
 from services.fit.transport.recipe import SceneRecipe, View
 from tests.support.fake_engine import FakeEngine, Slowly
 

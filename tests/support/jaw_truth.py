@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
-from services.fit.anatomy.phantom_files import held_out_lights, write_description, write_images
-from services.fit.anatomy.phantom_jaw import JawSurfaces, jaw_surfaces, jaw_truth, known_mouth, write_jaw_meshes
-from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.optics.parameters import Mouth
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.files import held_out_lights, write_description, write_images
+from services.phantom.jaw import JawSurfaces, jaw_surfaces, jaw_truth, known_mouth, write_jaw_meshes
 
 STORED = Path(__file__).resolve().parents[1] / "data" / "truths-jaw" / "subject-1.npz"
 SUBJECT, CHANNEL = 1, "green"
@@ -77,8 +77,8 @@ def read_jaw_truth(stored: Path = STORED) -> JawTruth:
 
 def by_engine(truth: JawTruth, samples: int) -> JawTruth:
     """The same jaw as the project's own engine renders it, where the question is what a fit makes of photographs with less noise than stock Mitsuba affords."""
-    from services.fit.anatomy.phantom_render import render_engine
     from services.fit.transport.engine import Engine
+    from services.phantom.render import render_engine
 
     engine = Engine(truth.jaw.recipe(truth.lights, 0, "matched"))
     whole = [(9001 + k, camera, np.ones(camera.size[::-1], dtype=bool)) for k, camera in enumerate(truth.cameras)]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.scan import LabelledScan
 from services.core.geometry import Mesh
-from services.fit.anatomy.scan import LabelledScan
 
 PITCH_MM = 0.4
 CROWN_MM = 7.0

@@ -17,17 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Camera, Light, Mesh
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.phantom_render import render_engine
-from services.fit.anatomy.reflection import reflect
-from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.anatomy.subjects import subject_tissues
 from services.fit.evaluate import error_sums
 from services.fit.offset import REACH_MM, Comparison
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, single_tooth
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.reflection import reflect
+from services.phantom.render import render_engine
+from services.phantom.subjects import subject_tissues
 
 Array = NDArray[np.float64]
 

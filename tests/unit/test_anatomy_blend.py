@@ -8,17 +8,17 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.anatomy.blend import BASE_DEPTH_MM, CLEARANCE_MM, FULL_DEPTH_MM, MODES, dentin_blend_shape
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.frame import ToothFrame, estimate_frame
+from services.anatomy.templates.dimensions import upper_tooth
+from services.anatomy.templates.incisor import build_incisor
+from services.anatomy.templates.jaw import build_jaw
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
 from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.blend import BASE_DEPTH_MM, CLEARANCE_MM, FULL_DEPTH_MM, MODES, dentin_blend_shape
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.frame import ToothFrame, estimate_frame
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.jaw import build_jaw
 from services.fit.transport.recipe import DentinShape
 from tests.support.shared_data import shared_path
 

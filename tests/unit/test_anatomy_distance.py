@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.isosurface import surface_net
 from services.core.geometry import Mesh
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.isosurface import surface_net
 
 
 def mesh_of(shape: trimesh.Trimesh) -> Mesh:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from services.anatomy.frame import ToothFrame, estimate_frame
+from services.anatomy.templates.crown import build_tooth
+from services.anatomy.templates.dimensions import upper_tooth
+from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Mesh
 from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.crown import build_tooth
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.frame import ToothFrame, estimate_frame
-from services.fit.anatomy.incisor import build_incisor
 from tests.support.shared_data import shared_path
 
 VIEWPOINTS = np.array([[300.0, 950.0, 100.0], [-300.0, 950.0, -100.0]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.incisor import CROWN_MM, Incisor, build_incisor, cervix_height_mm, enamel_thickness_mm
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.templates.incisor import CROWN_MM, Incisor, build_incisor, cervix_height_mm, enamel_thickness_mm
 
 
 @pytest.fixture(scope="module")

@@ -10,15 +10,15 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SurfaceDistance
+from services.anatomy.templates.dimensions import UPPER_TEETH, upper_tooth
+from services.anatomy.templates.jaw import GAP_MM, SHORT_OF_PLANE_MM, TILT_SPREAD_DEG, Jaw, JawTooth, build_jaw
 from services.core.geometry import Mesh
-from services.fit.anatomy.dimensions import UPPER_TEETH, upper_tooth
-from services.fit.anatomy.distance import SurfaceDistance
-from services.fit.anatomy.jaw import GAP_MM, SHORT_OF_PLANE_MM, TILT_SPREAD_DEG, Jaw, JawTooth, build_jaw
-from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.nesting import require_nested
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.phantom.dome_rig import dome_cameras, dome_lights
 from tests.support.shared_data import shared_path
 
 FDI = (17, 16, 15, 14, 13, 12, 11, 21, 22, 23, 24, 25, 26, 27)

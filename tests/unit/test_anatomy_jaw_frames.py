@@ -7,17 +7,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from services.anatomy.frame import ToothFrame
+from services.anatomy.jaw_frames import jaw_frames, number_told, tooth_frame
+from services.anatomy.templates.average_arch import arch_from_middles, nominal_places
+from services.anatomy.templates.crown import build_tooth
+from services.anatomy.templates.dimensions import upper_tooth
+from services.anatomy.templates.jaw import Jaw, build_jaw
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
 from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.average_arch import arch_from_middles, nominal_places
-from services.fit.anatomy.crown import build_tooth
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.jaw import Jaw, build_jaw
-from services.fit.anatomy.jaw_frames import jaw_frames, number_told, tooth_frame
 from tests.support.shared_data import shared_path
 
 Axes = NDArray[np.float64]

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import InputError
 from services.core.meshfiles import read_mesh, read_teeth, write_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.phantom import write_phantom
+from services.phantom.tooth import write_phantom
 
 SMALL: dict[str, Any] = {"pixel_mm": 1.5, "cameras": 1, "lights": 4, "samples": 32}
 

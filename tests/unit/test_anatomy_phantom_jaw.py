@@ -11,16 +11,16 @@ import pytest
 from typer.testing import CliRunner
 
 from services.__main__ import build_app
+from services.anatomy.distance import SurfaceDistance
 from services.core.errors import CaptureInputError, InputError
 from services.core.meshfiles import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.distance import SurfaceDistance
-from services.fit.anatomy.jaw_optics import COSINE_SPREAD, SIGMA_SPREAD, gums_medium, jaw_mouth
-from services.fit.anatomy.phantom import TRUE_TISSUE
-from services.fit.anatomy.phantom_files import Renderer, held_out_lights
-from services.fit.anatomy.phantom_jaw import SCAN_DENTIN, write_jaw_phantom
 from services.fit.optics.parameters import Medium
+from services.phantom.files import Renderer, held_out_lights
+from services.phantom.jaw import SCAN_DENTIN, write_jaw_phantom
+from services.phantom.jaw_optics import COSINE_SPREAD, SIGMA_SPREAD, gums_medium, jaw_mouth
+from services.phantom.tooth import TRUE_TISSUE
 from tests.support.labelled_scan import bumps, universal, write_vtp
 
 FDI = (11, 12, 13, 21)

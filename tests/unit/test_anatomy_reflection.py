@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rays import RayScene
-from services.fit.anatomy.reflection import fresnel, ggx_reflection, reflect
-from services.fit.anatomy.rig import dome_cameras, dome_lights
+from services.anatomy.templates.incisor import build_incisor
 from services.fit.transport.platform import prepare_device
+from services.fit.transport.rays import RayScene
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.reflection import fresnel, ggx_reflection, reflect
 
 NORMAL = np.array([0.0, 0.0, 1.0])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rig import RADIUS_MM, dome_cameras, dome_lights
+from services.anatomy.templates.incisor import build_incisor
+from services.phantom.dome_rig import RADIUS_MM, dome_cameras, dome_lights
 
 
 @pytest.mark.parametrize("count", [5, 8, 54])

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.anatomy.scans.scan import LabelledScan, fdi_from_universal, read_scan
 from services.core.errors import CaptureInputError, InputError, MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.scan import LabelledScan, fdi_from_universal, read_scan
 from tests.support.labelled_scan import bumps, universal, write_labelled_ply, write_vtp
 
 SCAN = bumps({11: (-4.5, 0.0), 21: (4.5, 0.0)})

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.jaw_frames import jaw_frames
+from services.anatomy.scans.patches import areas_mm2, boundary_loops, harmonic_rows, manifold_piece, touching_pieces
+from services.anatomy.scans.roots import STUB_MM, close_crown
+from services.anatomy.scans.scan import LabelledScan, read_scan
+from services.anatomy.scans.scanned_gums import fill_outline
+from services.anatomy.scans.scanned_jaw import STEEPEST_TILT_DEG, ScannedJaw, jaw_from_scan
 from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.jaw_frames import jaw_frames
-from services.fit.anatomy.patches import areas_mm2, boundary_loops, harmonic_rows, manifold_piece, touching_pieces
-from services.fit.anatomy.rays import RayScene
-from services.fit.anatomy.roots import STUB_MM, close_crown
-from services.fit.anatomy.scan import LabelledScan, read_scan
-from services.fit.anatomy.scanned_gums import fill_outline
-from services.fit.anatomy.scanned_jaw import STEEPEST_TILT_DEG, ScannedJaw, jaw_from_scan
+from services.fit.transport.rays import RayScene
 from tests.support.labelled_scan import CROWN_MM, NECK_MM, PITCH_MM, bumps
 from tests.support.shared_data import shared_path
 

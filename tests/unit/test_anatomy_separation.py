@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import areas_mm2
+from services.anatomy.scans.separation import separate
 from services.core.errors import MeshError
 from services.core.geometry import Mesh, Tooth
-from services.fit.anatomy.patches import areas_mm2
-from services.fit.anatomy.separation import separate
 from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.phantom import write_phantom
-from services.fit.anatomy.stain_paint import STRENGTH, painted_depth, painted_stains
-from services.fit.anatomy.stain_uv import stain_layout
+from services.anatomy.templates.incisor import build_incisor
 from services.fit.export.stains import kept_stains
+from services.fit.inputs.stain_uv import stain_layout
+from services.phantom.stain_paint import STRENGTH, painted_depth, painted_stains
+from services.phantom.tooth import write_phantom
 
 
 def test_painted_stains_are_plausible() -> None:

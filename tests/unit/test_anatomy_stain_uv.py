@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Mesh
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.stain_uv import REACH, TEXEL_MM, StainLayout, bilinear_texels, stain_layout, texel_edge_mm
+from services.fit.inputs.stain_uv import REACH, TEXEL_MM, StainLayout, bilinear_texels, stain_layout, texel_edge_mm
 
 TEXEL = 0.75
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.fit.anatomy.subjects import DENTIN, ENAMEL, subject_tissues
+from services.phantom.subjects import DENTIN, ENAMEL, subject_tissues
 
 CHANNELS = ("red", "green", "blue")
 

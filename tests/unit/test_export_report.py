@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.core.records import Correlation, Estimate, FitReport
-from services.fit.anatomy.thickness import ThicknessMap
+from services.fit.checks.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import Picture
 from services.fit.export.report import THIN_CAVEAT, ReportPictures, write_report

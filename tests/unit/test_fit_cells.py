@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rig import dome_cameras
+from services.anatomy.templates.incisor import build_incisor
 from services.fit.blocks import PixelParts
 from services.fit.observations import CELL_EDGE, LEAST_CELLS, ViewStack, comparison_cells, on_coarse_grid
+from services.phantom.dome_rig import dome_cameras
 
 
 def view(width: int, height: int, step: int = 1, shown: np.ndarray | None = None) -> ViewStack:

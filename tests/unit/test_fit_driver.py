@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Tooth
 from services.core.records import JobSpec
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rig import dome_cameras
 from services.fit.driver import fitted_thickness, shape_covariance
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
+from services.phantom.dome_rig import dome_cameras
 
 
 def known(*names: str) -> Uncertainty:

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from services.anatomy.distance import SurfaceDistance
+from services.anatomy.templates.crown import build_tooth
+from services.anatomy.templates.dimensions import upper_tooth
 from services.core.errors import CaptureInputError, InputError, JobCancelledError, MeshError
 from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec
-from services.fit.anatomy.crown import build_tooth
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.distance import SurfaceDistance
-from services.fit.anatomy.rig import dome_cameras
 from services.fit.closing import _with_cosine
 from services.fit.jaw_driver import jaw_dentins
 from services.fit.jaw_schedule import JawSchedule
@@ -24,6 +23,7 @@ from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tiss
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.optics.priors import SHAPE
+from services.phantom.dome_rig import dome_cameras
 
 
 def tissue(sigma: float, alpha: float = 0.99) -> Tissue:

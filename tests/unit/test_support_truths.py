@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.fit.anatomy.subjects import subject_tissues
 from services.fit.optics.parameters import MEDIUM_FIELDS
+from services.phantom.subjects import subject_tissues
 from tests.support.truths import FOLDER, SIDE_LIGHTS, names, read, write_capture
 
 

@@ -20,7 +20,7 @@ from services.bench.fits.tooth_capture import tissue_of
 from services.core.meshfiles import read_mesh
 from services.core.records import FitReport, FolderCapture
 from services.core.store import read_record
-from services.fit.anatomy.reflection import ROUGHNESS
+from services.phantom.reflection import ROUGHNESS
 
 CHANNEL = "green"
 AMBIENT_SAMPLES = 256

@@ -13,10 +13,10 @@ from services.bench.figures.gallery import SIMILAR_G
 from services.bench.figures.mosaic import Column, mosaic
 from services.bench.figures.surroundings import environment_light, read_environment, seen_under
 from services.core.geometry import Camera, Mesh
-from services.fit.anatomy.reflection import ROUGHNESS
 from services.fit.export.pictures import tone_map, white_level
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
+from services.phantom.reflection import ROUGHNESS
 
 MEMORIAL = Path("shared") / "data" / "hdr-memorial" / "memorial.hdr"
 TURNS_DEGREES = (0.0, 120.0, 240.0)

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.frame import estimate_frame
+from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import DentineError, InputError, NonFiniteError
 from services.core.geometry import Mesh, Vector3
 from services.core.meshfiles import read_mesh, write_mesh
 from services.core.store import write_atomic
-from services.fit.anatomy.frame import estimate_frame
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.phantom import TRUE_TISSUE
 from services.fit.export.pictures import png_bytes, tone_map, white_level
 from services.fit.optics.domain import similar_medium
 from services.fit.transport.platform import prepare_device
+from services.phantom.tooth import TRUE_TISSUE
 
 SceneDict = dict[str, Any]
 Image = NDArray[np.float64]

@@ -99,7 +99,7 @@ def tooth_off(found: Tissue, true: Tissue) -> dict[str, float]:
 
 def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _: None) -> list[dict[str, Any]]:
     """One row per joint step and one for the end."""
-    from services.fit.anatomy.phantom_jaw import jaw_surfaces, known_mouth
+    from services.phantom.jaw import jaw_surfaces, known_mouth
 
     prepare_device(threads=1)
     case = QUICK if quick else FULL
@@ -115,7 +115,7 @@ def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _:
 
 def write_photographs(folder: Path, case: Case) -> None:
     """Let stock Mitsuba render the jaw, and add sensor noise."""
-    from services.fit.anatomy.phantom_jaw import write_jaw_phantom
+    from services.phantom.jaw import write_jaw_phantom
 
     write_jaw_phantom(
         folder, subject=SUBJECT, pixel_mm=case.pixel_mm, cameras=CAMERAS, lights=LIGHTS, held_out=HELD_OUT, samples=case.photograph_samples, renderer="mitsuba"

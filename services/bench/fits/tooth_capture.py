@@ -125,7 +125,7 @@ def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> Prepar
     """Write and prepare the smallest real case below ``folder``: one view, five lights to fit and those its capture holds out."""
     source = real_tooth()
     if source is None:
-        from services.fit.anatomy.phantom import write_phantom
+        from services.phantom.tooth import write_phantom
 
         source = folder / "phantom"
         write_phantom(source, cameras=1, samples=PHANTOM_SAMPLES, renderer="mitsuba", subject=1)

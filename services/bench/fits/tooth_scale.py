@@ -61,7 +61,7 @@ def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None]) -> list[di
 
 
 def _capture(quick: bool) -> Path:
-    from services.fit.anatomy.phantom import write_phantom
+    from services.phantom.tooth import write_phantom
 
     pixel_mm, lights = (QUICK_PIXEL_MM, QUICK_LIGHTS) if quick else (PIXEL_MM, LIGHTS)
     folder = CACHE / f"tooth-scale-{pixel_mm:g}-{lights}"

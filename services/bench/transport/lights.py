@@ -16,9 +16,9 @@ import numpy as np
 
 from services.bench import Row
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
-from services.fit.anatomy.rig import dome_cameras
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View
+from services.phantom.dome_rig import dome_cameras
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.blend import dentin_blend_shape
 from services.bench.transport.gradient_rows import Estimate, GradientRow, of_parts
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
-from services.fit.anatomy.blend import dentin_blend_shape
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.blend import dentin_blend_shape
+from services.anatomy.templates.incisor import build_incisor
 from services.bench import Row
 from services.core.geometry import Camera, Mesh
-from services.fit.anatomy.blend import dentin_blend_shape
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.rig import dome_cameras, dome_lights
 from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.phantom.dome_rig import dome_cameras, dome_lights
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

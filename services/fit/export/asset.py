@@ -25,11 +25,11 @@ from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.anatomy.stain_uv import ToothStains
 from services.fit.export.mitsuba_scene import nested_scene
 from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.export.scene_xml import SceneParameter, write_scene
 from services.fit.export.stains import write_textures
+from services.fit.inputs.stain_uv import ToothStains
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from services.core.records import Correlation, Estimate, Figure, FitReport, ToothReport
 from services.core.store import write_atomic
 from services.core.verdict import mean_figure, percent, verdict_of
-from services.fit.anatomy.thickness import ThicknessMap
+from services.fit.checks.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import (
     DIVERGING,

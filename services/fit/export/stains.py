@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
-from services.fit.anatomy.stain_uv import ToothStains, bilinear_texels
 from services.fit.export.pictures import png16_bytes
+from services.fit.inputs.stain_uv import ToothStains, bilinear_texels
 from services.fit.optics.parameters import Stain
 
 STAINS = "stains.npz"
@@ -43,7 +43,7 @@ def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
 
 def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.float64]:
     """a_t at the surface point that each pixel sees, (H, W, C) in the textures' order; NaN off the tooth."""
-    from services.fit.anatomy.rays import RayScene, pixel_rays
+    from services.fit.transport.rays import RayScene, pixel_rays
 
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
     width, height = camera.size

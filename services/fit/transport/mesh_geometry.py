@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import areas_mm2
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import areas_mm2
 from services.fit.optics.parameters import Stain
 from services.fit.transport.clearance import Clearance
 from services.fit.transport.geometry import RAY_EPSILON, Hit

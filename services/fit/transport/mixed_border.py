@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.core.geometry import Mesh
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 
 WIDTHS_PER_SCALE = 8.0
 """The border's width over s: l goes from 2 % to 98 % across it."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SurfaceDistance
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.distance import SurfaceDistance
 
 MOST_CHECKED = 64
 

@@ -10,23 +10,23 @@ from typing import Any
 
 import numpy as np
 
+from services.anatomy.blend import dentin_blend_shape
+from services.anatomy.scans.scan import read_scan
+from services.anatomy.scans.scanned_jaw import jaw_from_scan
+from services.anatomy.templates.dimensions import upper_tooth
+from services.anatomy.templates.jaw import build_jaw
 from services.core.errors import MeshError
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
-from services.fit.anatomy.blend import dentin_blend_shape
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.jaw import build_jaw
-from services.fit.anatomy.jaw_optics import GUMS_IOR, jaw_mouth
-from services.fit.anatomy.phantom import IOR
-from services.fit.anatomy.phantom_files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
-from services.fit.anatomy.phantom_render import Stack, render_engine, render_mitsuba
-from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.anatomy.scan import read_scan
-from services.fit.anatomy.scanned_jaw import jaw_from_scan
 from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
+from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
+from services.phantom.render import Stack, render_engine, render_mitsuba
+from services.phantom.tooth import IOR
 
 Painter = Callable[[Camera, int, int], Stack]
 """One channel's images of a camera, given paths per pixel and a seed."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Mesh
-from services.fit.anatomy.stain_uv import StainLayout, ToothStains, stain_layout
+from services.fit.inputs.stain_uv import StainLayout, ToothStains, stain_layout
 
 TEXEL_MM = 0.5
 STRENGTH = {"red": 0.6, "green": 1.0, "blue": 1.4}

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import compact
 from services.core.errors import MeshError
 from services.core.geometry import Mesh, Tooth
-from services.fit.anatomy.patches import compact
 
 
 @dataclass(frozen=True)

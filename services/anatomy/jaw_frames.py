@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.frame import ToothFrame
+from services.anatomy.scans.matching import CrownMatch
+from services.anatomy.scans.patches import areas_mm2
+from services.anatomy.templates.average_arch import arch_from_middles, is_upper, nominal_places
+from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Tooth
-from services.fit.anatomy.average_arch import arch_from_middles, is_upper, nominal_places
-from services.fit.anatomy.dimensions import upper_tooth
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.matching import CrownMatch
-from services.fit.anatomy.patches import areas_mm2
 
 Array = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import boundary_loops, harmonic_rows, ring_faces
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import boundary_loops, harmonic_rows, ring_faces
 
 COVER_MM = 1.5
 """Depth of gums beyond the deepest root and beyond the scan's rim."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import boundary_loops, compact, fill_holes, harmonic_rows, manifold_piece, neighbours, ring_faces, vector_area_mm2
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.patches import boundary_loops, compact, fill_holes, harmonic_rows, manifold_piece, neighbours, ring_faces, vector_area_mm2
 
 STUB_MM = 4.0
 """How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Camera, Mesh
 from services.core.records import Estimate
-from services.fit.anatomy.distance import SurfaceDistance
-from services.fit.anatomy.rays import RayScene, pixel_rays
+from services.fit.transport.rays import RayScene, pixel_rays
 from services.fit.transport.recipe import DentinShape
 
 LEAST_STEP = 0.01

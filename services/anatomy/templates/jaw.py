@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SurfaceDistance
+from services.anatomy.frame import ToothFrame
+from services.anatomy.templates.arch import Arch
+from services.anatomy.templates.crown import ToothSolid, build_tooth
+from services.anatomy.templates.dimensions import ToothDimensions, upper_tooth
+from services.anatomy.templates.gums import Socket, build_cavity, build_gums
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.arch import Arch
-from services.fit.anatomy.crown import ToothSolid, build_tooth
-from services.fit.anatomy.dimensions import ToothDimensions, upper_tooth
-from services.fit.anatomy.distance import SurfaceDistance
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.gums import Socket, build_cavity, build_gums
 
 RIGHT, LEFT = 10, 20
 """FDI numbers of the upper quadrants, before the place."""

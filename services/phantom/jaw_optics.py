@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.fit.anatomy.phantom import TRUE_TISSUE
-from services.fit.anatomy.reflection import GUM_REFLECTANCE
 from services.fit.optics.parameters import Medium, Mouth, Tissue
+from services.phantom.reflection import GUM_REFLECTANCE
+from services.phantom.tooth import TRUE_TISSUE
 
 GUMS_IOR = 1.33
 GUMS_MEAN_COSINE = 0.8

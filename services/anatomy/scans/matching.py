@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.templates.average_arch import side_of_front
+from services.anatomy.templates.crown import build_tooth
+from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Mesh
-from services.fit.anatomy.average_arch import side_of_front
-from services.fit.anatomy.crown import build_tooth
-from services.fit.anatomy.dimensions import upper_tooth
 
 Array = NDArray[np.float64]
 

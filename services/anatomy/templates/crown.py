@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.templates.dimensions import ToothDimensions
+from services.anatomy.templates.sections import cover_rings, superellipse
 from services.core.geometry import Mesh
-from services.fit.anatomy.dimensions import ToothDimensions
-from services.fit.anatomy.sections import cover_rings, superellipse
 
 Profile = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]
 """Half axes along x and y and the centre's y at heights above the cervical line, mm."""

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.frame import ToothFrame
+from services.anatomy.isosurface import surface_net
+from services.anatomy.templates.dimensions import ToothDimensions
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.anatomy.dimensions import ToothDimensions
-from services.fit.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.isosurface import surface_net
 from services.fit.transport.recipe import DentinShape
 
 MODES = ("buccal", "proximal", "occlusal")

@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
+from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import InputError
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.meshfiles import read_mesh, write_mapped_mesh, write_mesh
 from services.core.records import Boundary
-from services.fit.anatomy.incisor import build_incisor
-from services.fit.anatomy.phantom_files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
-from services.fit.anatomy.phantom_render import Stack, render_engine, render_mitsuba
-from services.fit.anatomy.reflection import ROUGHNESS, Reflection, reflect
-from services.fit.anatomy.rig import dome_cameras, dome_lights
-from services.fit.anatomy.stain_paint import painted_stains
-from services.fit.anatomy.stain_uv import ToothStains
-from services.fit.anatomy.subjects import subject_tissues
 from services.fit.export.stains import keep_stains, write_textures
+from services.fit.inputs.stain_uv import ToothStains
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.recipe import DentinShape, single_tooth
+from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
+from services.phantom.reflection import ROUGHNESS, Reflection, reflect
+from services.phantom.render import Stack, render_engine, render_mitsuba
+from services.phantom.stain_paint import painted_stains
+from services.phantom.subjects import subject_tissues
 
 FDI = 11
 """Of the procedural incisor."""

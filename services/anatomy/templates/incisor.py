@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.templates.sections import close_rings, superellipse
 from services.core.geometry import Mesh
-from services.fit.anatomy.sections import close_rings, superellipse
 
 Profile = tuple[NDArray[np.float64], ...]
 

@@ -154,7 +154,7 @@ def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -
 
 def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Mesh:
     """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly vanish."""
-    from services.fit.anatomy.distance import SurfaceDistance
+    from services.anatomy.distance import SurfaceDistance
 
     # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line ends at the scan's rim.
     across = neighbours(mesh.faces)

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import CaptureInputError
-from services.core.geometry import Mesh, Tooth
-from services.fit.anatomy.average_arch import nominal_places, side_of_front
-from services.fit.anatomy.frame import ToothFrame
-from services.fit.anatomy.patches import (
+from services.anatomy.frame import ToothFrame
+from services.anatomy.scans.patches import (
     areas_mm2,
     compact,
     fill_holes,
@@ -22,9 +19,12 @@ from services.fit.anatomy.patches import (
     vector_area_mm2,
     without_specks,
 )
-from services.fit.anatomy.roots import close_crown
-from services.fit.anatomy.scan import GINGIVA, LabelledScan
-from services.fit.anatomy.scanned_gums import gums_solid
+from services.anatomy.scans.roots import close_crown
+from services.anatomy.scans.scan import GINGIVA, LabelledScan
+from services.anatomy.scans.scanned_gums import gums_solid
+from services.anatomy.templates.average_arch import nominal_places, side_of_front
+from services.core.errors import CaptureInputError
+from services.core.geometry import Mesh, Tooth
 
 LARGEST_SHARE = 0.8
 """Of a tooth's area that has to be in one piece; the rest is taken for specks."""

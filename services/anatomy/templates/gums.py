@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.templates.arch import Arch
+from services.anatomy.templates.crown import ROOT_STUB_MM
+from services.anatomy.templates.sections import close_rings, superellipse
 from services.core.geometry import Mesh
-from services.fit.anatomy.arch import Arch
-from services.fit.anatomy.crown import ROOT_STUB_MM
-from services.fit.anatomy.sections import close_rings, superellipse
 
 MARGIN_MM = 0.7
 """Height of the gums' crest above the cervical line at a tooth's middle; the margin on the tooth is lower, where the crest rounds off."""

@@ -1,0 +1,1 @@
+"""Scans: reading them, parting them into teeth, and closing teeth by roots."""

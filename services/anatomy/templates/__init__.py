@@ -1,0 +1,1 @@
+"""Average teeth, arches and gums, built from published dimensions."""

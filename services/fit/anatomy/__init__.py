@@ -1,1 +1,0 @@
-"""The shape of teeth: procedural incisor, dentin blend modes."""

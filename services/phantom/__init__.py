@@ -1,0 +1,1 @@
+"""Virtual mouths, subjects and rigs: what simulated cameras look at."""

@@ -1,0 +1,35 @@
+"""The door of the phantoms: the stage that makes a demonstration's mouth."""
+
+from __future__ import annotations
+
+from services.core.records import FolderCapture, JobSpec
+from services.core.stage import StageContext, StageEvent
+from services.core.store import StageWriter, read_record
+from services.phantom.demo import DESCRIPTION, make_demo_mouth
+
+
+def run(spec: JobSpec, context: StageContext) -> FolderCapture:
+    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig looks at; ``spec.rig.mouth`` is where such mouths are kept, if anywhere.
+
+    Raises:
+        CrashError: it could not be rendered. JobCancelledError: in mid-kernel.
+    """
+    done = -1.0
+
+    def look(fraction: float) -> None:
+        nonlocal done
+        context.raise_if_cancelled()
+        if fraction > done:
+            done = fraction
+            context.report(StageEvent(stage="phantom", kind="progress", done=done, message="A virtual incisor is being rendered."))
+
+    context.report(StageEvent(stage="phantom", kind="started"))
+    context.raise_if_cancelled()
+    writer = StageWriter(context.root, "phantom", context.attempt)
+    kept_in = spec.rig.mouth if spec.rig is not None and not spec.is_demo else None
+    is_new = make_demo_mouth(writer.folder, kept_in, look)
+    description = read_record(writer.folder / DESCRIPTION, FolderCapture)
+    writer.publish(description)
+    how = "rendered" if is_new else "taken from an earlier demonstration"
+    context.report(StageEvent(stage="phantom", kind="finished", done=1.0, message=f"A virtual incisor was {how}."))
+    return description
