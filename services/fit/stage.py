@@ -39,7 +39,7 @@ def check() -> None:
     with suppress(ModuleNotFoundError):  # told as a package below
         import_renderer()
     require_packages(PACKAGES, "fit")
-    for module in ("services.fit.jaw_driver", "services.fit.export.report", "services.fit.transport.engine"):
+    for module in ("services.fit.jaw.driver", "services.fit.export.report", "services.fit.transport.engine"):
         importlib.import_module(module)
     require_renderer()
 
@@ -56,9 +56,9 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     Raises:
         CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError: between two steps.
     """
-    from services.fit.attempt import Attempt
-    from services.fit.driver import FitDriver
-    from services.fit.jaw_driver import JawDriver
+    from services.fit.execution.attempt import Attempt
+    from services.fit.jaw.driver import JawDriver
+    from services.fit.tooth.driver import FitDriver
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
@@ -82,11 +82,11 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     import numpy as np
 
     from services.core.meshfiles import read_mesh
-    from services.fit.driver import fitted_thickness
     from services.fit.export.asset import errors_json, parameters_json, write_asset
+    from services.fit.export.previews import read_pictures
     from services.fit.export.report import write_report
     from services.fit.export.stains import kept_stains
-    from services.fit.pictures import read_pictures
+    from services.fit.tooth.driver import fitted_thickness
 
     context.report(StageEvent(stage="export", kind="started"))
     context.raise_if_cancelled()
@@ -141,8 +141,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport) -> tuple[Tooth, ...]:
     """The teeth with the dentin surfaces the fit ended with."""
     from services.core.meshfiles import read_teeth
-    from services.fit.driver import dentin_shape
-    from services.fit.jaw_driver import jaw_dentins
+    from services.fit.jaw.driver import jaw_dentins
+    from services.fit.tooth.driver import dentin_shape
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":

@@ -29,8 +29,8 @@ from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.checks.thickness import thickness_image
 from services.fit.optics.parameters import Tissue
-from services.fit.schedule import ChannelSchedule
 from services.fit.stage import fitted_teeth, run
+from services.fit.tooth.schedule import ChannelSchedule
 from services.fit.transport.platform import prepare_device
 from tests.support.truths import SIDE_LIGHTS, Truth, read, write_capture
 

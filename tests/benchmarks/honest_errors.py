@@ -29,11 +29,11 @@ from services.core.meshfiles import read_teeth
 from services.core.records import JobSpec, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.driver import fitted_thickness
 from services.fit.optics.domain import to_natural
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import COSINE, WEAK
 from services.fit.stage import ENGINE, run
+from services.fit.tooth.driver import fitted_thickness
 from services.fit.transport.platform import prepare_device
 from tests.support.fake_engine import DirectFakeEngine
 from tests.support.prepared import write_prepared

@@ -30,7 +30,7 @@ from services.bench.fits.tooth_capture import PreparedTooth
 from services.core.records import FitReport, JobSpec, PreparedManifest
 from services.core.store import open_stage
 from services.fit.checks.thickness import enamel_thickness_mm
-from services.fit.jaw_views import showing
+from services.fit.jaw.views import showing
 from services.fit.optics.parameters import Mouth
 from services.fit.stage import fitted_teeth
 from tests.benchmarks.fit_table import Figure

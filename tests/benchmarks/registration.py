@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from services.fit.alignment import LOOKED_AT, Offset, told_offset
+from services.fit.checks.alignment import LOOKED_AT, Offset, told_offset
 from services.fit.transport.platform import prepare_device
 from tests.support.registered_phantoms import Noise, Phantom, Place, rendered_phantom
 

@@ -17,10 +17,10 @@ from distributed import Client, LocalCluster, get_worker
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
-from services.fit.blocks import StoredFile, write_recipe
-from services.fit.engine_host import CancellableHost, ChildHost, EngineHost
-from services.fit.engine_process import memory_kills
-from services.fit.executors import DaskExecutor
+from services.fit.execution.blocks import StoredFile, write_recipe
+from services.fit.execution.engine_host import CancellableHost, ChildHost, EngineHost
+from services.fit.execution.engine_process import memory_kills
+from services.fit.execution.executors import DaskExecutor
 from services.fit.transport.recipe import single_tooth
 
 BROKEN = "tests.support.broken_engine:BrokenEngine"
@@ -98,7 +98,7 @@ def test_a_crash_is_told_by_its_signal_after_a_second_try(host: ChildHost, recip
 def test_a_kill_that_the_system_counts_as_one_for_memory_is_told_as_that(host: ChildHost, recipe: StoredFile, monkeypatch: pytest.MonkeyPatch) -> None:
     # The system's counter moves while the process is killed; nothing in the process differs from any other kill.
     counted = iter([7, 8])
-    monkeypatch.setattr("services.fit.engine_process.memory_kills", lambda: next(counted))
+    monkeypatch.setattr("services.fit.execution.engine_process.memory_kills", lambda: next(counted))
     with pytest.raises(MemoryKillError, match="lack of memory"):
         host.call("die", recipe, int(signal.SIGKILL))
 

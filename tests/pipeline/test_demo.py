@@ -22,8 +22,8 @@ from services.core.records import DEMO_MOUTH, FolderCapture, JobSpec
 from services.core.settings import job_from_tree, read_job
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
-from services.phantom.stage import run as phantom
 from services.phantom import demo as demo_mouth
+from services.phantom.stage import run as phantom
 from tests.support.live_server import toy_server
 from tests.support.toy_stages import DOORS
 

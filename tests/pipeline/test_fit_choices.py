@@ -10,7 +10,7 @@ import pytest
 
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.fit.journal import read_entries
+from services.fit.execution.journal import read_entries
 from services.fit.stage import run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 

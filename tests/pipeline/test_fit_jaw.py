@@ -14,7 +14,7 @@ from services.core.records import FitReport, JobSpec, PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.checks.thickness import enamel_thickness_mm
-from services.fit.jaw_schedule import TIED_SD
+from services.fit.jaw.schedule import TIED_SD
 from services.fit.optics.priors import SHAPE
 from services.fit.stage import ENGINE, export, fitted_teeth, run
 from services.fit.transport.platform import prepare_device

@@ -14,8 +14,8 @@ from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.identifiability import NOTHING
-from services.fit.numerics import NUMERICS, numerics_name
+from services.fit.checks.identifiability import NOTHING
+from services.fit.execution.numerics import NUMERICS, numerics_name
 from services.fit.stage import export, run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
@@ -186,7 +186,7 @@ def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(finished: tu
 def test_a_checkpoint_of_other_numerics_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_prepared(tmp_path)
     fit(tmp_path, max_steps=1)
-    monkeypatch.setattr("services.fit.attempt.numerics_name", lambda: numerics_name(NUMERICS + 1))
+    monkeypatch.setattr("services.fit.execution.attempt.numerics_name", lambda: numerics_name(NUMERICS + 1))
     events: list[StageEvent] = []
     fit(tmp_path, attempt=2, events=events, max_steps=1)
     assert [event for event in events if "starts anew" in event.message]

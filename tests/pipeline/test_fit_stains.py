@@ -12,9 +12,9 @@ import pytest
 from services.core.meshfiles import read_mesh
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
+from services.fit.execution.journal import read_entries
 from services.fit.export.stains import kept_stains
 from services.fit.inputs.stain_uv import StainLayout, stain_layout, texel_edge_mm
-from services.fit.journal import read_entries
 from services.fit.optics.parameters import Tissue
 from services.fit.stage import export, run
 from services.fit.transport.recipe import ToothSurfaces, View, single_tooth

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from services.core.geometry import Camera
-from services.fit.blocks import Block, read_recipe, write_block, write_recipe
-from services.fit.engine_host import InProcessHost
-from services.fit.executors import LocalExecutor
-from services.fit.next_capture import LIGHTS, VIEWS, Candidate, Sensor, advice, probes_of, sentence, turned
-from services.fit.passes import Passes, StackProblem
-from services.fit.schedule import media_domain
-from services.fit.seeds import Seeds
+from services.fit.checks.next_capture import LIGHTS, VIEWS, Candidate, Sensor, advice, probes_of, sentence, turned
+from services.fit.execution.blocks import Block, read_recipe, write_block, write_recipe
+from services.fit.execution.engine_host import InProcessHost
+from services.fit.execution.executors import LocalExecutor
+from services.fit.execution.passes import Passes, StackProblem
+from services.fit.execution.seeds import Seeds
 from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
 from services.fit.solve.information import Addition, covariance_with
+from services.fit.tooth.schedule import media_domain
 from services.fit.transport.recipe import DentinShape, SceneRecipe, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere

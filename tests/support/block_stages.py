@@ -9,7 +9,7 @@ from pathlib import Path
 from services.core.placement import WEIGHTS
 from services.core.records import AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext
-from services.fit.executors import executor
+from services.fit.execution.executors import executor
 from tests.support import toy_stages
 
 capture, prepare, export = toy_stages.capture, toy_stages.prepare, toy_stages.export

@@ -10,9 +10,9 @@ from typing import Any
 from services.core.records import AssetManifest, CaptureManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext
 from services.core.store import read_record
-from services.fit.blocks import StoredFile, write_recipe
-from services.fit.engine_host import EngineHost
-from services.fit.executors import executor
+from services.fit.execution.blocks import StoredFile, write_recipe
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.executors import executor
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import SceneRecipe

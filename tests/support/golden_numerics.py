@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from services.core.records import Boundary, JobSpec
 from services.core.stage import LocalContext
-from services.fit.journal import read_entries
-from services.fit.numerics import NUMERICS
+from services.fit.execution.journal import read_entries
+from services.fit.execution.numerics import NUMERICS
 from services.fit.stage import run
 from tests.support.prepared import FAKE, write_prepared
 
@@ -73,7 +73,7 @@ def _numbers(value: Any) -> Iterator[float]:
 def main() -> None:
     """Store what this tree gives, unless its number stands for other numbers already."""
     if STORED.exists() and int(np.load(STORED)["numerics"]) >= NUMERICS:
-        sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.numerics.NUMERICS first.")
+        sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.execution.numerics.NUMERICS first.")
     np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]
     print(f"{STORED}: {STORED.stat().st_size} bytes")
 

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Camera, Light, Mesh
-from services.fit.evaluate import error_sums
-from services.fit.offset import REACH_MM, Comparison
+from services.fit.checks.evaluate import error_sums
+from services.fit.checks.offset import REACH_MM, Comparison
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, single_tooth

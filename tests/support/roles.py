@@ -30,7 +30,14 @@ class Role:
 
 
 _COMMANDS = ("services.__main__:build_app",)
-_WORKER = (*_COMMANDS, "services.dask_command", "services.api.pipeline", "services.preprocess.stage", "services.fit.stage", "services.fit.engine_host")
+_WORKER = (
+    *_COMMANDS,
+    "services.dask_command",
+    "services.api.pipeline",
+    "services.preprocess.stage",
+    "services.fit.stage",
+    "services.fit.execution.engine_host",
+)
 _WORKER += ("services.fit.transport.engine", "services.api.worker_setup", "services.api.worker_check")
 
 ROLES: Mapping[str, Role] = {

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from services.bench.fits.jaw import Judge, mouth_of, picture, tooth_off
-from services.fit.evaluate import ErrorSums
+from services.fit.checks.evaluate import ErrorSums
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 TRUTH = Mouth((Tissue(Medium(4.0, 0.99, g1=0.8), Medium(12.0, 0.98, g1=0.75)), Tissue(Medium(5.0, 0.98), Medium(5.0, 0.98))), Medium(7.0, 0.95, g1=0.8), 0.4)

@@ -9,7 +9,7 @@ import pytest
 
 from services.bench.fits.tooth import PEER, Judge, ToothRow, picture, summary
 from services.bench.fits.tooth_capture import tissue_of
-from services.fit.evaluate import ErrorSums
+from services.fit.checks.evaluate import ErrorSums
 from services.fit.optics.parameters import Medium, Tissue
 
 

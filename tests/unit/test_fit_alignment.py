@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import create_array
-from services.fit.alignment import Offset, clearest_offset, offsets_told
-from services.fit.blocks import PixelParts
-from services.fit.evaluate import ErrorSums, Evaluation
-from services.fit.observations import Observations, ViewStack
+from services.fit.checks.alignment import Offset, clearest_offset, offsets_told
+from services.fit.checks.evaluate import ErrorSums, Evaluation
+from services.fit.execution.blocks import PixelParts
+from services.fit.inputs.observations import Observations, ViewStack
 from tests.support.prepared import lights, sphere
 
 SIZE, PIXEL_MM, RADIUS_PX = 40, 0.4, 10

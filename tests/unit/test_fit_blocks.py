@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from services.core.records import Device
-from services.fit.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
-from services.fit.derivatives import Differentiation
-from services.fit.evaluate import evaluate_task
+from services.fit.checks.evaluate import evaluate_task
+from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.execution.derivatives import Differentiation
+from services.fit.execution.passes import compare_task, image_task, jacobian_task, orders_task
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.passes import compare_task, image_task, jacobian_task, orders_task
 from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 

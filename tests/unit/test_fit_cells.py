@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.blocks import PixelParts
-from services.fit.observations import CELL_EDGE, LEAST_CELLS, ViewStack, comparison_cells, on_coarse_grid
+from services.fit.execution.blocks import PixelParts
+from services.fit.inputs.observations import CELL_EDGE, LEAST_CELLS, ViewStack, comparison_cells, on_coarse_grid
 from services.phantom.dome_rig import dome_cameras
 
 

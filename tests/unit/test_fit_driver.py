@@ -7,9 +7,9 @@ import numpy as np
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Tooth
 from services.core.records import JobSpec
-from services.fit.driver import fitted_thickness, shape_covariance
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
+from services.fit.tooth.driver import fitted_thickness, shape_covariance
 from services.phantom.dome_rig import dome_cameras
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.core.records import Correlation, Estimate
-from services.fit.identifiability import correlation, told
+from services.fit.checks.identifiability import correlation, told
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
 

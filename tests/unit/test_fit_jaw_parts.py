@@ -14,11 +14,11 @@ from services.anatomy.templates.dimensions import upper_tooth
 from services.core.errors import CaptureInputError, InputError, JobCancelledError, MeshError
 from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec
-from services.fit.closing import _with_cosine
-from services.fit.jaw_driver import jaw_dentins
-from services.fit.jaw_schedule import JawSchedule
-from services.fit.jaw_starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
-from services.fit.neighbours import Neighbours, arch_place
+from services.fit.execution.closing import _with_cosine
+from services.fit.jaw.driver import jaw_dentins
+from services.fit.jaw.neighbours import Neighbours, arch_place
+from services.fit.jaw.schedule import JawSchedule
+from services.fit.jaw.starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
 from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue

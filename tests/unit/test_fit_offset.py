@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.alignment import told_offset
-from services.fit.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.checks.alignment import told_offset
+from services.fit.checks.offset import Comparison, FoundOffset, Slide, best_offset
 
 Array = NDArray[np.float64]
 SIZE, PIXEL_MM, RADIUS_PX = 40, 0.5, 9.0

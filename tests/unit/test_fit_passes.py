@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from services.core.geometry import Camera
-from services.fit.blocks import BlockTask, PixelParts, StoredFile
-from services.fit.derivatives import REACH, SCORES_SHARE, Differentiation
-from services.fit.neighbours import Neighbours
+from services.fit.execution.blocks import BlockTask, PixelParts, StoredFile
+from services.fit.execution.derivatives import REACH, SCORES_SHARE, Differentiation
+from services.fit.execution.passes import StackProblem
+from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Coordinate, Domain, natural_derivative, to_dual
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.passes import StackProblem
 from services.fit.transport.recipe import View
 
 TISSUE = Tissue(Medium(5.0, 0.997, g1=0.72), Medium(14.0, 0.995, g1=0.8))

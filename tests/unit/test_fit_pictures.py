@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.pictures import spacing
+from services.fit.export.previews import spacing
 
 
 @pytest.mark.parametrize("every", [1, 2, 5])

@@ -11,7 +11,7 @@ import pytest
 from services.fit.optics.domain import HELD_G, similar_medium
 from services.fit.optics.parameters import Medium
 from services.fit.optics.priors import LEAST_SD, LITERATURE_TABLE, WEAK, literature, priors_of, towards
-from services.fit.schedule import media_domain, shared_domain
+from services.fit.tooth.schedule import media_domain, shared_domain
 from tests.support.shared_data import shared_path
 
 

@@ -15,15 +15,15 @@ from services.bench.figures.cases import job_of
 from services.bench.fits.tooth_capture import tissue_of
 from services.core.records import FitReport, JobSpec
 from services.core.store import open_stage
-from services.fit.driver import dentin_shape
-from services.fit.evaluate import ErrorSums, error_sums
+from services.fit.checks.evaluate import ErrorSums, error_sums
 from services.fit.export.asset import mouth_of
 from services.fit.export.pictures import Picture
 from services.fit.export.stains import kept_stains
-from services.fit.jaw_driver import known_dentins
-from services.fit.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
+from services.fit.inputs.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
+from services.fit.jaw.driver import known_dentins
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.stage import fitted_teeth
+from services.fit.tooth.driver import dentin_shape
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import DentinShape, View
 

@@ -128,9 +128,9 @@ def write_photographs(folder: Path, case: Case) -> None:
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel shows."""
-    from services.fit.jaw_driver import jaw_dentins
-    from services.fit.jaw_views import label_views
-    from services.fit.observations import channel_scene, read_channel, read_observations
+    from services.fit.inputs.observations import channel_scene, read_channel, read_observations
+    from services.fit.jaw.driver import jaw_dentins
+    from services.fit.jaw.views import label_views
     from services.fit.transport.engine import Engine
 
     if not is_published(job, "prepared"):
@@ -143,8 +143,8 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
 
 def timed_fit(judge: Judge) -> FitReport:
     """The product's own fit stage in this process, judged after every joint step and at its end."""
-    from services.fit.attempt import Attempt
-    from services.fit.jaw_driver import JawDriver
+    from services.fit.execution.attempt import Attempt
+    from services.fit.jaw.driver import JawDriver
     from services.fit.stage import ENGINE
 
     paused, step = 0.0, 0

@@ -111,9 +111,9 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
 def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothRow]:
     """The product's own fit stage in this process, judged after every step of its solver and at its end."""
     from services.core.store import StageWriter
-    from services.fit.attempt import Attempt
-    from services.fit.driver import FitDriver
+    from services.fit.execution.attempt import Attempt
     from services.fit.stage import ENGINE
+    from services.fit.tooth.driver import FitDriver
 
     rows: list[ToothRow] = []
     paused = 0.0

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.core.store import is_published
-from services.fit.evaluate import ErrorSums, error_sums
-from services.fit.observations import Observations, ViewStack, read_channel, read_observations
+from services.fit.checks.evaluate import ErrorSums, error_sums
+from services.fit.inputs.observations import Observations, ViewStack, read_channel, read_observations
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.recipe import View, single_tooth
@@ -108,7 +108,7 @@ def prepare(job: Path, spec: JobSpec) -> None:
 
 def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
     """Prepare a capture below ``job``, unless that is done, and build its scene."""
-    from services.fit.driver import dentin_shape
+    from services.fit.tooth.driver import dentin_shape
     from services.fit.transport.platform import prepare_device
 
     prepare_device()

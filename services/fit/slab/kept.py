@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from services.core.geometry import Record
 from services.core.slab_folder import read_folder
 from services.core.store import write_atomic, write_record
-from services.fit.numerics import numerics_name
+from services.fit.execution.numerics import numerics_name
 from services.fit.slab.fit import SlabOptions, Wavelength
 from services.fit.slab.result import SlabFit
 

@@ -30,7 +30,7 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     Raises:
         CaptureInputError: the folder cannot be read. JobCancelledError: between two blocks of paths.
     """
-    from services.fit.executors import executor
+    from services.fit.execution.executors import executor
     from services.fit.slab.fit import SlabOptions
     from services.fit.slab.images import read_images
     from services.fit.slab.kept import IMAGES, read_kept

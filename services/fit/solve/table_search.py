@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import Block
+from services.fit.execution.blocks import Block
 from services.fit.optics.domain import to_natural
 
 Array = NDArray[np.float64]

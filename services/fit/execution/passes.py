@@ -20,14 +20,14 @@ from typing import Any, Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import Block, BlockTask, StoredFile, read_block
-from services.fit.derivatives import Differentiation, differentiation, slopes
-from services.fit.engine_host import EngineHost
-from services.fit.executors import Executor
-from services.fit.neighbours import Neighbours
+from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block
+from services.fit.execution.derivatives import Differentiation, differentiation, slopes
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.executors import Executor
+from services.fit.execution.seeds import Seeds
+from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
-from services.fit.seeds import Seeds
 from services.fit.solve.adam import Gradient
 from services.fit.solve.normal_equations import LossChange, NormalEquations, Region, loss_change, normal_equations
 from services.fit.transport.recipe import StackEstimate

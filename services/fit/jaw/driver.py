@@ -11,16 +11,12 @@ from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
-from services.fit.attempt import Attempt
-from services.fit.blocks import GUMS
-from services.fit.driver import blend_shape, viewpoints_mm
-from services.fit.executors import Executor
-from services.fit.jaw_report import JawFit, report
-from services.fit.jaw_schedule import JawSchedule
-from services.fit.jaw_starts import GUMS_START, LEAST_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
-from services.fit.jaw_views import fitted_pixels, label_views, showing, without
-from services.fit.journal import Journal
-from services.fit.observations import (
+from services.fit.execution.attempt import Attempt
+from services.fit.execution.blocks import GUMS
+from services.fit.execution.executors import Executor
+from services.fit.execution.journal import Journal
+from services.fit.export.previews import shown_images
+from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
     ViewStack,
@@ -30,10 +26,14 @@ from services.fit.observations import (
     require_signal,
     write_channel,
 )
+from services.fit.jaw.report import JawFit, report
+from services.fit.jaw.schedule import JawSchedule
+from services.fit.jaw.starts import GUMS_START, LEAST_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
+from services.fit.jaw.views import fitted_pixels, label_views, showing, without
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import SHAPE
-from services.fit.pictures import shown_images
-from services.fit.schedule import ChannelSchedule
+from services.fit.tooth.driver import blend_shape, viewpoints_mm
+from services.fit.tooth.schedule import ChannelSchedule
 from services.fit.transport.recipe import DentinShape
 
 START_STEPS = 4

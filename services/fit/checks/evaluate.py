@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import BlockTask, read_block
-from services.fit.engine_host import EngineHost
+from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.passes import Passes, TraceRow, trace_row
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.passes import Passes, TraceRow, trace_row
 
 Array = NDArray[np.float64]
 

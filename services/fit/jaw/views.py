@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.fit.blocks import CAVITY, GUMS, PixelParts
-from services.fit.observations import Observations, ViewStack
+from services.fit.execution.blocks import CAVITY, GUMS, PixelParts
+from services.fit.inputs.observations import Observations, ViewStack
 from services.fit.transport.rays import RayScene
 
 

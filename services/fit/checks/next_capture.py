@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera
 from services.core.records import Estimate
-from services.fit.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
-from services.fit.derivatives import Differentiation
-from services.fit.engine_host import EngineHost
-from services.fit.identifiability import QUANTITIES, in_words
+from services.fit.checks.identifiability import QUANTITIES, in_words
+from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.execution.derivatives import Differentiation
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_with
 from services.fit.transport.recipe import SceneRecipe, View

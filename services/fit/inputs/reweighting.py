@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import Loss
-from services.fit.blocks import BlockTask, StoredFile, read_block, write_block
-from services.fit.engine_host import EngineHost
-from services.fit.journal import Journal
+from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_block
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.journal import Journal
+from services.fit.execution.passes import Passes, TraceRow, trace_row
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import Passes, TraceRow, trace_row
 from services.fit.solve.losses import weights
 from services.fit.transport.recipe import StackEstimate
 

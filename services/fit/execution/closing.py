@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import BlockTask, read_block
-from services.fit.derivatives import Differentiation
-from services.fit.engine_host import EngineHost
+from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.derivatives import Differentiation
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.optics.domain import similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
-from services.fit.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]

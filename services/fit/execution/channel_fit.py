@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import JobSpec
-from services.fit.closing import Held, measure_closing
-from services.fit.evaluate import Evaluation, Shown, evaluate
-from services.fit.journal import Journal
-from services.fit.observations import ChannelFiles, Level
+from services.fit.checks.evaluate import Evaluation, Shown, evaluate
+from services.fit.execution.closing import Held, measure_closing
+from services.fit.execution.journal import Journal
+from services.fit.execution.passes import Passes, StackProblem
+from services.fit.inputs.observations import ChannelFiles, Level
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
-from services.fit.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
 from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening

@@ -28,20 +28,20 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.fit.closing import Held
+from services.fit.checks.next_capture import Sensor, advice
+from services.fit.execution.channel_fit import ChannelFit, Stages
+from services.fit.execution.closing import Held
+from services.fit.execution.passes import StackProblem, orders_task
+from services.fit.execution.stain_passes import StainStage
+from services.fit.inputs.observations import COARSE_PIXELS
+from services.fit.inputs.reweighting import reweighted
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.next_capture import Sensor, advice
-from services.fit.observations import COARSE_PIXELS
 from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
-from services.fit.passes import StackProblem, orders_task
-from services.fit.reweighting import reweighted
 from services.fit.solve import adam, table_search
 from services.fit.solve.gauss_newton import Options, Solution
 from services.fit.solve.losses import is_reweighted
-from services.fit.stages import ChannelFit, Stages
-from services.fit.stain_passes import StainStage
 
 ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
 SIMILAR_G = 0.0

@@ -9,17 +9,17 @@ import numpy as np
 
 from services.core.records import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
-from services.fit.alignment import offsets_told
-from services.fit.attempt import judge, standard_errors, worst_error
+from services.fit.checks.alignment import offsets_told
+from services.fit.checks.evaluate import ErrorSums, Evaluation
+from services.fit.checks.identifiability import told
 from services.fit.checks.thickness import thickness_map
-from services.fit.driver import shape_covariance
-from services.fit.evaluate import ErrorSums, Evaluation
-from services.fit.identifiability import told
-from services.fit.jaw_starts import ToothStart
-from services.fit.observations import Observations, ViewStack
+from services.fit.execution.attempt import judge, standard_errors, worst_error
+from services.fit.execution.channel_fit import ChannelFit
+from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
-from services.fit.stages import ChannelFit
+from services.fit.tooth.driver import shape_covariance
 from services.fit.transport.recipe import DentinShape
 
 STATES = ("fitted", "tied", "failed")

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from services.core.records import MaskBit
 from services.core.store import StoredArray
-from services.fit.evaluate import Evaluation
-from services.fit.observations import Observations, ViewStack
-from services.fit.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.checks.evaluate import Evaluation
+from services.fit.checks.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.inputs.observations import Observations, ViewStack
 
 LOOKED_AT = 0.05
 """Relative image error above which a fit asks for its offset: what is explained better shows no shift that matters."""

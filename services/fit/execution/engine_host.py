@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from services.core.errors import JobCancelledError, ResourceError, WorkerLostError
-from services.fit.blocks import StoredFile, read_recipe
-from services.fit.engine_process import EngineProcess
+from services.fit.execution.blocks import StoredFile, read_recipe
+from services.fit.execution.engine_process import EngineProcess
 
 ENGINE = "services.fit.transport.engine:Engine"
 """Default engine, as ``module:class``; imported only where it runs."""
@@ -75,7 +75,7 @@ class ChildHost:
     """
 
     def __init__(self, factory: str = ENGINE, threads: int | None = None, memory_bytes: int | None = None) -> None:
-        self._command = [sys.executable, "-m", "services.fit.engine_host"], [factory, str(threads or 0)]
+        self._command = [sys.executable, "-m", "services.fit.execution.engine_host"], [factory, str(threads or 0)]
         self._memory_bytes = memory_bytes
         self._lock, self._is_closed = threading.Lock(), threading.Event()
         self._process: EngineProcess | None = None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.average_arch import is_upper
-from services.fit.blocks import PixelParts
+from services.fit.execution.blocks import PixelParts
 from services.fit.optics.domain import Domain
 
 COLOURS = 3

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, Protocol
 
 from distributed import WorkerPlugin
 
-from services.fit.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
-from services.fit.shares import Board, Share
+from services.fit.execution.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
+from services.fit.execution.shares import Board, Share
 
 Task = Callable[..., Any]
 TASKS_AHEAD = 2

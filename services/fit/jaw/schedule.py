@@ -26,15 +26,15 @@ from functools import partial
 
 import numpy as np
 
-from services.fit.closing import Held
-from services.fit.jaw_starts import ToothStart, typical
-from services.fit.neighbours import Neighbours
+from services.fit.execution.channel_fit import ChannelFit, Stages
+from services.fit.execution.closing import Held
+from services.fit.execution.passes import StackProblem
+from services.fit.jaw.neighbours import Neighbours
+from services.fit.jaw.starts import ToothStart, typical
 from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
-from services.fit.passes import StackProblem
-from services.fit.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
-from services.fit.stages import ChannelFit, Stages
+from services.fit.tooth.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 
 TIED_SD = {"sigma": 0.2, "alpha": 0.15}
 """Spread of one mouth's teeth about their median, in the unbounded domain: 20 % of sigma, 35 % of 1 - alpha."""

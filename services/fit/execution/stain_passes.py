@@ -18,13 +18,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import BlockTask, read_block
-from services.fit.engine_host import EngineHost
+from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.engine_host import EngineHost
+from services.fit.execution.journal import Journal
+from services.fit.execution.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.journal import Journal
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
-from services.fit.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.solve.normal_equations import LossChange
 from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
 from services.fit.transport.recipe import StackEstimate, StainGradient

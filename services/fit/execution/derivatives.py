@@ -14,9 +14,9 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.blocks import BlockTask, PixelParts
-from services.fit.engine_host import EngineHost
-from services.fit.neighbours import Neighbours
+from services.fit.execution.blocks import BlockTask, PixelParts
+from services.fit.execution.engine_host import EngineHost
+from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, kind_of, natural_derivative, similar_tissue, to_natural
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.transport.recipe import JacobianEstimate, View

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import PreparedManifest
 from services.core.store import write_atomic
+from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.thickness import ThicknessMap
-from services.fit.evaluate import Evaluation
+from services.fit.execution.channel_fit import StepReport
 from services.fit.export.pictures import RESIDUAL_OF_WHITE, Picture, enlarge, png_bytes, signed_map, tone_map, white_level
 from services.fit.export.report import ReportPictures
 from services.fit.export.stains import stain_image
+from services.fit.inputs.observations import ViewStack
 from services.fit.inputs.stain_uv import ToothStains
-from services.fit.observations import ViewStack
-from services.fit.stages import StepReport
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"

@@ -16,15 +16,15 @@ from services.core.records import JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.core.verdict import MAX_ERROR
-from services.fit.evaluate import ErrorSums, Evaluation
-from services.fit.executors import Executor, executor
-from services.fit.journal import Journal
-from services.fit.numerics import numerics_name
-from services.fit.observations import ChannelFiles, Observations, ViewStack
-from services.fit.passes import Passes, TraceRow
-from services.fit.pictures import write_pictures, write_preview
-from services.fit.seeds import Seeds
-from services.fit.stages import ChannelFit, StepReport, history_key
+from services.fit.checks.evaluate import ErrorSums, Evaluation
+from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key
+from services.fit.execution.executors import Executor, executor
+from services.fit.execution.journal import Journal
+from services.fit.execution.numerics import numerics_name
+from services.fit.execution.passes import Passes, TraceRow
+from services.fit.execution.seeds import Seeds
+from services.fit.export.previews import write_pictures, write_preview
+from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 
 CHECKPOINT = "fit-checkpoint"
 PREVIEW_EVERY = 3

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
-from services.fit.alignment import offsets_told
-from services.fit.attempt import Attempt, judge, standard_errors, worst_error
+from services.fit.checks.alignment import offsets_told
+from services.fit.checks.identifiability import NOTHING, correlation, told
 from services.fit.checks.thickness import ThicknessMap, thickness_map
-from services.fit.executors import Executor
+from services.fit.execution.attempt import Attempt, judge, standard_errors, worst_error
+from services.fit.execution.channel_fit import ChannelFit
+from services.fit.execution.executors import Executor
+from services.fit.execution.journal import Journal
+from services.fit.export.previews import shown_images
 from services.fit.export.stains import keep_stains
-from services.fit.identifiability import NOTHING, correlation, told
+from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
-from services.fit.journal import Journal
-from services.fit.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
 from services.fit.optics.parameters import Tissue
-from services.fit.pictures import shown_images
-from services.fit.schedule import ChannelSchedule
 from services.fit.solve.covariance import Uncertainty, estimates
-from services.fit.stages import ChannelFit
+from services.fit.tooth.schedule import ChannelSchedule
 from services.fit.transport.recipe import DentinShape
 
 
