@@ -21,7 +21,7 @@ from services.anatomy.isosurface import surface_net
 from services.anatomy.templates.dimensions import ToothDimensions
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 
 MODES = ("buccal", "proximal", "occlusal")
 """Order of the blend weights c."""

@@ -19,7 +19,7 @@ from services.core.verdict import VERDICT, verdict_of
 
 if TYPE_CHECKING:
     from services.core.geometry import Tooth
-    from services.fit.transport.recipe import DentinShape
+    from services.fit.transport.scene.recipe import DentinShape
 
 ENGINE = "services.fit.transport.engine:Engine"
 

@@ -21,7 +21,7 @@ from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 if TYPE_CHECKING:
     from services.fit.export.mitsuba_scene import SceneDict

@@ -18,7 +18,7 @@ from services.fit.export.stains import keep_stains, write_textures
 from services.fit.inputs.stain_uv import ToothStains
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
 from services.phantom.reflection import ROUGHNESS, Reflection, reflect

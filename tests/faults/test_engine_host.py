@@ -21,7 +21,7 @@ from services.fit.execution.blocks import StoredFile, write_recipe
 from services.fit.execution.engine_host import CancellableHost, ChildHost, EngineHost
 from services.fit.execution.engine_process import memory_kills
 from services.fit.execution.executors import DaskExecutor
-from services.fit.transport.recipe import single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 
 BROKEN = "tests.support.broken_engine:BrokenEngine"
 MIB = 2**20

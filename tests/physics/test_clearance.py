@@ -23,7 +23,7 @@ def test_bounds_hold_and_tell_something_as_surfaces_move() -> None:
     prepare_device()
     import mitsuba as mi
 
-    from services.fit.transport.clearance import Clearance
+    from services.fit.transport.scene.clearance import Clearance
 
     box = trimesh.creation.box(EDGE_MM).subdivide_to_size(1.0)
     outer = Mesh(np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int32))

@@ -20,7 +20,7 @@ from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import require_llvm
-from services.fit.transport.recipe import SceneRecipe, ToothSurfaces, View, single_tooth
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View, single_tooth
 from tests.support.small_mouth import MOUTH, mouth_recipe, wall
 from tests.support.small_tooth import LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view
 
@@ -43,7 +43,7 @@ def engine() -> Engine:
 @pytest.fixture
 def no_kernel(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
     """Fails the test if a walk is traced."""
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.paths.walk import Walk
 
     def refuse(*_: Any) -> None:
         raise AssertionError("a kernel ran")
@@ -261,7 +261,7 @@ def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("derivative", [False, True])
 def test_a_result_that_is_not_finite_raises_with_its_pixels(engine: Engine, monkeypatch: pytest.MonkeyPatch, wrong: float, derivative: bool) -> None:
-    from services.fit.transport.tally import Tally
+    from services.fit.transport.paths.tally import Tally
 
     view, broken = whole_view(camera_at((0, 1, 0))), [5, 11, 40, 63]
     honest = Tally.arrays

@@ -82,5 +82,5 @@ def slab_operations(**options: Any) -> int:
 def test_a_slab_pays_only_for_what_is_asked_of_it(feature: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = slab_operations(**SLAB_FEATURES[feature])
     # What is never built is in no kernel, whatever the counts say.
-    monkeypatch.delattr("services.fit.transport.walk.Exits")
+    monkeypatch.delattr("services.fit.transport.paths.walk.Exits")
     assert slab_operations() < asked

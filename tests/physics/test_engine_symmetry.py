@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.small_tooth import CAMERA_DISTANCE_MM, camera_at, recipe, sphere, whole_view
 from tests.support.z_scores import LARGEST_Z
 

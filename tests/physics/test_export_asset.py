@@ -22,7 +22,7 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.stain_paint import painted_depth
 

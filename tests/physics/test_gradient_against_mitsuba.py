@@ -17,7 +17,7 @@ from services.core.meshfiles import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
 TISSUE = Tissue(Medium(1.5, 0.9, 0.7, 0.6, -0.3), Medium(0.7, 0.7, g1=0.5))

@@ -153,7 +153,7 @@ def test_a_dark_image_is_as_sure_as_it_gets(engine: Engine) -> None:
     ],
 )
 def test_what_cannot_be_reached_is_refused(engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], named: tuple[str, ...]) -> None:
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.paths.walk import Walk
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel was started"))
     for call in (lambda: engine.images(TISSUE, VIEW, seed=1, **asked), lambda: engine.jacobian(TISSUE, VIEW, NAMES, seed=1, **asked)):

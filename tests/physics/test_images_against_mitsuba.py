@@ -19,7 +19,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_b
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view

@@ -24,7 +24,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_d
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
@@ -56,7 +56,7 @@ def table(height_mm: float, reflectance: float | SceneDict) -> SceneDict:
 def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the small tooth's two surfaces; the plug-in is registered."""
     prepare_device()
-    from services.fit.transport.integrator import register_integrator
+    from services.fit.plugin.integrator import register_integrator
 
     register_integrator()
     folder = tmp_path_factory.mktemp("tooth")
@@ -80,7 +80,7 @@ def variant(name: str) -> Iterator[None]:
 
 def properties(*tissues: Tissue, **others: Any) -> SceneDict:
     """The integrator, matched unless told otherwise, for tissues of one or three channels."""
-    from services.fit.transport.integrator import medium_properties
+    from services.fit.plugin.integrator import medium_properties
 
     media = {k: v for part in ("enamel", "dentin") for k, v in medium_properties(part, tuple(getattr(t, part) for t in tissues or (TISSUE,))).items()}
     return {"type": "dentine", "enamel": "outer_11", "dentin": "dentin_11", "boundary": "matched"} | media | others
@@ -158,7 +158,7 @@ def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
 
 def test_each_colour_has_its_own_media(tooth: Path) -> None:
     # Each channel against the engine, which knows one channel at a time.
-    from services.fit.transport.integrator import register_integrator
+    from services.fit.plugin.integrator import register_integrator
 
     tissues = (TISSUE, Tissue(Medium(0.8, 0.99, g1=0.3), Medium(6.0, 0.5, g1=0.1)), Tissue(Medium(3.0, 0.6, g1=-0.4), Medium(1.0, 0.99, 0.5, 0.7, -0.2)))
     scene = scene_dict(tooth)
@@ -253,7 +253,7 @@ def sentence(problem: BaseException) -> str:
 def test_impossible_properties_are_refused(tooth: Path, given: SceneDict, words: str) -> None:
     import mitsuba as mi
 
-    from services.fit.transport.integrator import read_properties
+    from services.fit.plugin.integrator import read_properties
 
     wrong = {name: value for name, value in (properties() | given).items() if name != "type"}
     with pytest.raises(InputError) as refused:
@@ -289,7 +289,7 @@ def test_impossible_scenes_are_refused(tooth: Path, tmp_path: Path) -> None:
 
 
 def test_a_variant_without_arrays_is_refused(tooth: Path) -> None:
-    from services.fit.transport.integrator import register_integrator
+    from services.fit.plugin.integrator import register_integrator
 
     with variant("scalar_rgb"), pytest.raises(PlatformError, match="not scalar_rgb"):
         register_integrator()

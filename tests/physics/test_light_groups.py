@@ -25,7 +25,7 @@ def test_a_light_is_chosen_as_often_as_it_is_bright(lights: int) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.light_groups import LightGroups
+    from services.fit.transport.lighting.light_groups import LightGroups
 
     rig = dome_lights(lights, ("green",), seed=1)
     positions, intensities = np.array([light.position_mm for light in rig]), np.random.default_rng(2).uniform(0.1, 1, lights)
@@ -58,7 +58,7 @@ def test_no_light_of_no_brightness_is_chosen() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.light_groups import LightGroups
+    from services.fit.transport.lighting.light_groups import LightGroups
 
     # Seven lights fill three groups with two places to spare; those on the left are behind the vertex.
     positions = np.array([light.position_mm for light in dome_lights(7, ("green",), seed=1)])

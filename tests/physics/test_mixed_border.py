@@ -22,10 +22,10 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_b
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
-from services.fit.transport.mixed_border import MixedBorder
+from services.fit.transport.paths.scores import Scores
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, single_tooth
-from services.fit.transport.scores import Scores
+from services.fit.transport.scene.mixed_border import MixedBorder
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view

@@ -14,7 +14,7 @@ import pytest
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import load_scene, render_batches
 from services.fit.transport.engine import Engine
-from services.fit.transport.mouth_maps import MouthMaps
+from services.fit.transport.lighting.mouth_maps import MouthMaps
 from services.fit.transport.platform import prepare_device
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import LIGHTS_MM, MOUTH, mouth_recipe, stock_mouth
@@ -40,7 +40,7 @@ def test_coarser_tables_of_larger_scenes_change_the_noise_alone(monkeypatch: pyt
     view = whole_view(camera_at((0.1, 1, 0.2), size=12, span_mm=15.0))
     fine = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=5, batches=BATCHES)
     monkeypatch.setattr(MouthMaps, "MOST_BYTES", 2**14)
-    monkeypatch.setattr("services.fit.transport.clearance.MOST_CELLS", 2000)
+    monkeypatch.setattr("services.fit.transport.scene.clearance.MOST_CELLS", 2000)
     coarse = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=6, batches=BATCHES)
     # One pixel is independent of the next; its two lights are not.
     spread = np.sqrt(sum(image.variance.sum(axis=1) for image in (fine, coarse)))

@@ -172,7 +172,7 @@ def test_free_flight_functions_do_not_cancel() -> None:
 def test_albedos_near_one_keep_their_absorption() -> None:
     import drjit as dr
 
-    from services.fit.transport.media import Media
+    from services.fit.transport.scene.media import Media
 
     # alpha^k as the walk carries it, for as many scatters as it takes to notice.
     for absorbed in (1e-7, 1e-6, 1e-4, 0.01, 0.5, 0.9):

@@ -20,7 +20,7 @@ from services.fit.optics.phase_table import PhaseTable, tent_weights
 from services.fit.slab.simulate import Layer, simulate_slab
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from tests.support.exit_tables import angular_cases
 from tests.support.phase_tables import TENT_SPACING_RAD, cumulative, density, henyey_greenstein, over_equal_angles, over_equal_cosines
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
@@ -81,7 +81,7 @@ def test_a_dictionary_of_tents_adds_up() -> None:
 def test_values_in_a_kernel(name: str) -> None:
     import mitsuba as mi
 
-    from services.fit.transport.tables import PhaseTables
+    from services.fit.transport.scene.tables import PhaseTables
 
     table = TABLES[name]
     rng = np.random.default_rng(5)
@@ -102,7 +102,7 @@ def test_values_in_a_kernel(name: str) -> None:
 def test_nodes_closer_than_single_precision_stay_finite() -> None:
     import mitsuba as mi
 
-    from services.fit.transport.tables import PhaseTables
+    from services.fit.transport.scene.tables import PhaseTables
 
     kernel = PhaseTables([PhaseTable((0.0, math.pi / 2 - 1e-9, math.pi / 2 + 1e-9, math.pi), (1.0, 2.0, 2.0, 1.0))])
     sideways = kernel.density(mi.UInt32(1), mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0))
@@ -114,7 +114,7 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.tables import PhaseTables
+    from services.fit.transport.scene.tables import PhaseTables
 
     table = TABLES[name]
     rng = mi.PCG32(SAMPLES, initstate=3)

@@ -17,9 +17,9 @@ from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab, specular_share
 from services.fit.transport.engine import Engine
-from services.fit.transport.nesting import winding_number
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import DentinShape, SceneRecipe, single_tooth
+from services.fit.transport.scene.nesting import winding_number
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, single_tooth
 from tests.support.slab_tables import total_cases
 from tests.support.small_tooth import LIGHTS_MM, camera_at, whole_view
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
@@ -65,10 +65,10 @@ def test_the_walk_holds_in_every_corner(corners: Corners) -> None:
 
 @pytest.mark.parametrize("boundary", [MATCHED, THIN, SMOOTH])
 def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, boundary: int) -> None:
-    from services.fit.transport.geometry import SlabGeometry
-    from services.fit.transport.media import Media
-    from services.fit.transport.starts import SlabStart
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.paths.starts import SlabStart
+    from services.fit.transport.paths.walk import Walk
+    from services.fit.transport.scene.geometry import SlabGeometry
+    from services.fit.transport.scene.media import Media
 
     lanes = trace(corners, paths=4, most_steps=STEPS, seed=5)
     brightest = lanes.totals[:, :2].min(axis=1) * corners.diffuse * (corners.boundary == boundary) * (corners.beta < 1).any(axis=0)
@@ -130,7 +130,7 @@ def test_slivers_leave_the_surface_where_it_was() -> None:
 
 
 def test_sets_out_of_range_are_refused(corners: Corners, monkeypatch: pytest.MonkeyPatch) -> None:
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.paths.walk import Walk
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel ran"))
     wrong = {
@@ -153,9 +153,9 @@ def test_black_layers_end_and_tell_what_albedo_would_bring() -> None:
     # Between two media that scatter nothing the border's secondary walk had no direction and never ended.
     import mitsuba as mi
 
-    from services.fit.transport.border import BorderScattering, no_crossing
-    from services.fit.transport.geometry import SlabGeometry
-    from services.fit.transport.media import Media
+    from services.fit.transport.gradients.border import BorderScattering, no_crossing
+    from services.fit.transport.scene.geometry import SlabGeometry
+    from services.fit.transport.scene.media import Media
 
     crossing = no_crossing(1)
     crossing.before, crossing.after = mi.UInt32(1), mi.UInt32(2)
@@ -197,7 +197,7 @@ def test_dentin_has_room_inside_enamel() -> None:
 
 def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100 times too bright.
-    monkeypatch.setattr("services.fit.transport.mesh_geometry.require_nested", lambda *_: None)
+    monkeypatch.setattr("services.fit.transport.scene.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     known = DentinShape.known(outer)
     enamel, dentin, view = Medium(3, 0.99, g1=0.8), Medium(8, 0.98, g1=0.7), whole_view(camera_at((0, 1, 0)))

@@ -17,7 +17,7 @@ from services.fit.export.stains import kept_stains
 from services.fit.inputs.stain_uv import StainLayout, stain_layout, texel_edge_mm
 from services.fit.optics.parameters import Tissue
 from services.fit.stage import export, run
-from services.fit.transport.recipe import ToothSurfaces, View, single_tooth
+from services.fit.transport.scene.recipe import ToothSurfaces, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere, write_prepared
 

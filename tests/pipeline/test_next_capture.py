@@ -18,7 +18,7 @@ from services.fit.execution.seeds import Seeds
 from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
 from services.fit.solve.information import Addition, covariance_with
 from services.fit.tooth.schedule import media_domain
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere
 

@@ -15,7 +15,7 @@ from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import executor
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import SceneRecipe
+from services.fit.transport.scene.recipe import SceneRecipe
 from tests.support import toy_stages
 from tests.support.small_tooth import camera_at, recipe, whole_view
 

@@ -21,7 +21,7 @@ from services.core.errors import NonFiniteError
 from services.fit.inputs.stain_uv import bilinear_texels
 from services.fit.optics.parameters import Stain, Tissue
 from services.fit.solve.table_search import bin_powers
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
+from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.recipe import SceneRecipe, View
+from services.fit.transport.scene.recipe import SceneRecipe, View
 from tests.support.fake_engine import FakeEngine, Slowly
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from services.fit.transport.platform import prepare_device
 def leave_out_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the scattering partner out of every border derivative for the rest of the test."""
     prepare_device()
-    from services.fit.transport import walk
+    from services.fit.transport.paths import walk
 
     class WithoutScattering(walk.Walk):
         def _start_secondary(self, walker: Any, ended: Any, tally: Any) -> Any:  # noqa: ARG002

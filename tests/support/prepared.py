@@ -14,7 +14,7 @@ from services.core.meshfiles import write_mesh
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 
 FAKE = "tests.support.fake_engine:FakeEngine"

@@ -23,7 +23,7 @@ from services.fit.checks.evaluate import error_sums
 from services.fit.checks.offset import REACH_MM, Comparison
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.reflection import reflect
 from services.phantom.render import render_engine

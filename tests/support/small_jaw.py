@@ -18,7 +18,7 @@ from services.core.records import JobSpec, MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 from tests.support.small_mouth import revolved
 from tests.support.small_tooth import camera_at
 

@@ -16,7 +16,7 @@ from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import boundary_dict, medium_dict, sensor_dict
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import INTENSITY
 
 AROUND, ALONG = 48, 24

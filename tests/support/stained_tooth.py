@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from services.core.records import Boundary
 from services.fit.optics.parameters import Stain
-from services.fit.transport.recipe import SceneRecipe, ToothSurfaces
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import SEMI_AXES_MM, ellipsoid, recipe
 
 HEIGHT, WIDTH = 6, 8

@@ -19,7 +19,7 @@ from services.core.geometry import Mesh
 from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 from tests.support.shared_data import shared_path
 
 GRID_ERROR_MM = 0.02

@@ -16,8 +16,8 @@ from services.anatomy.templates.jaw import GAP_MM, SHORT_OF_PLANE_MM, TILT_SPREA
 from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.nesting import require_nested
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.nesting import require_nested
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from tests.support.shared_data import shared_path
 

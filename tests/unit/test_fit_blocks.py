@@ -15,7 +15,7 @@ from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_blo
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.passes import compare_task, image_task, jacobian_task, orders_task
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
+from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 
 

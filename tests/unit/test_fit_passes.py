@@ -17,7 +17,7 @@ from services.fit.execution.passes import StackProblem
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Coordinate, Domain, natural_derivative, to_dual
 from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 TISSUE = Tissue(Medium(5.0, 0.997, g1=0.72), Medium(14.0, 0.995, g1=0.8))
 DOMAIN = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.cosine")))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 from tests.support.small_tooth import camera_at, recipe, whole_view
 
 

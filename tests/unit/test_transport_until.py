@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.transport.recipe import StackEstimate, relative_error
-from services.fit.transport.until import FIRST_ROUND, GROWTH, LEAST_GROWTH, Effort, trace_until
+from services.fit.transport.paths.until import FIRST_ROUND, GROWTH, LEAST_GROWTH, Effort, trace_until
+from services.fit.transport.scene.recipe import StackEstimate, relative_error
 
 PIXELS = 400
 

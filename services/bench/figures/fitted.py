@@ -25,7 +25,7 @@ from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.stage import fitted_teeth
 from services.fit.tooth.driver import dentin_shape
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, View
+from services.fit.transport.scene.recipe import DentinShape, View
 
 Image = tuple[str, str]
 """Camera and light."""

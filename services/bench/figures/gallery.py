@@ -128,7 +128,7 @@ def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDi
         dentin: the same, if any.
         exact: the media themselves instead of similar ones, which look alike and cost less.
     """
-    from services.fit.transport.integrator import medium_properties
+    from services.fit.plugin.integrator import medium_properties
 
     properties: SceneDict = {"type": "dentine", "boundary": "thin", "roughness": ROUGHNESS}
     for part, ids in (("enamel", enamel), ("dentin", dentin)):
@@ -206,8 +206,8 @@ def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, floa
     """
     import mitsuba as mi
 
-    from services.fit.transport.integrator import read_properties
-    from services.fit.transport.scene_teeth import SceneTeeth
+    from services.fit.plugin.integrator import read_properties
+    from services.fit.plugin.scene_teeth import SceneTeeth
 
     if not options.scene.is_file():
         raise InputError(f"Scene file {options.scene} does not exist; give a Mitsuba XML scene in millimetres.")
@@ -240,7 +240,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.samples < 1 or min(options.size) < 1:
             raise InputError("A picture needs at least one sample and one pixel; raise --samples or --size.")
         prepare_device(backend=options.variant, colours="rgb")
-        from services.fit.transport.integrator import register_integrator
+        from services.fit.plugin.integrator import register_integrator
 
         register_integrator()
         options.out.mkdir(parents=True, exist_ok=True)

@@ -60,7 +60,7 @@ def seen_under(
         roughness: of the mirror image in the enamel; None for none.
     """
     prepare_device()
-    from services.fit.transport.integrator import medium_properties, register_integrator
+    from services.fit.plugin.integrator import medium_properties, register_integrator
 
     register_integrator()
     parts = {"enamel": "outer"} | ({"dentin": "dentin"} if "dentin" in surfaces else {})

@@ -18,7 +18,7 @@ from services.fit.checks.evaluate import ErrorSums, error_sums
 from services.fit.inputs.observations import Observations, ViewStack, read_channel, read_observations
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View, single_tooth
+from services.fit.transport.scene.recipe import View, single_tooth
 
 REAL_TOOTH = Path("shared") / "data" / "tooth-ur1-truth"
 """A scanned incisor, where this data lies beside the checkout; elsewhere a phantom takes its place."""

@@ -15,7 +15,7 @@ from services.bench.stability.corners import REGIONS, SMOOTH, Corners
 from services.fit.optics import fresnel, phase
 from services.fit.optics.domain import BOUNDS, natural_derivative, to_dual, to_natural
 from services.fit.optics.free_flight import minus_log1m, one_minus_exp
-from services.fit.transport.media import Media
+from services.fit.transport.scene.media import Media
 
 Floats = NDArray[np.float64]
 ROUNDING = 2.0**-24

@@ -23,12 +23,12 @@ from services.bench.stability.formula_errors import FORMULAS, worst_by_region
 from services.fit.optics import fresnel
 from services.fit.optics.parameters import MEDIUM_FIELDS
 from services.fit.slab.simulate import specular_share
-from services.fit.transport.geometry import SlabGeometry
-from services.fit.transport.media import Media, Score
+from services.fit.transport.paths.scores import Plan
+from services.fit.transport.paths.starts import PathStart, SlabStart, stream
+from services.fit.transport.paths.walk import Walk
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scores import Plan
-from services.fit.transport.starts import PathStart, SlabStart, stream
-from services.fit.transport.walk import Walk
+from services.fit.transport.scene.geometry import SlabGeometry
+from services.fit.transport.scene.media import Media, Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -29,7 +29,7 @@ from services.bench.transport.stain_gradient import stain_rows
 from services.bench.transport.stock_gradient import StockGradient, shared_names
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 Array = NDArray[np.float64]
 

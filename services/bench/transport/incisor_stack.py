@@ -14,7 +14,7 @@ from services.core.geometry import Camera, Mesh
 from services.core.meshfiles import write_mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, SceneRecipe, View, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 
 TISSUE = Tissue(Medium(4.5, 0.997, 0.93, 0.82, -0.1), Medium(12.0, 0.9945, 1.0, 0.75))

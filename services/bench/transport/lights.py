@@ -17,7 +17,7 @@ import numpy as np
 from services.bench import Row
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 from services.phantom.dome_rig import dome_cameras
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ import mitsuba as mi
 
 from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.engine import Engine
-from services.fit.transport.lights import PointLights
-from services.fit.transport.media import Media, PhaseFunction
-from services.fit.transport.scores import Plan
-from services.fit.transport.starts import CameraStart
-from services.fit.transport.tally import Tally
-from services.fit.transport.walk import ROULETTE_WEIGHT, Flight, Walk, Walker
+from services.fit.transport.lighting.lights import PointLights
+from services.fit.transport.paths.scores import Plan
+from services.fit.transport.paths.starts import CameraStart
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.paths.walk import ROULETTE_WEIGHT, Flight, Walk, Walker
+from services.fit.transport.scene.media import Media, PhaseFunction
 
 
 class PlainEngine(Engine):

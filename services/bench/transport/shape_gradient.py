@@ -23,7 +23,7 @@ from services.bench.transport.gradient_rows import Estimate, GradientRow, of_par
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from services.core.geometry import Camera, Mesh
 from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import DentinShape, View, single_tooth
+from services.fit.transport.scene.recipe import DentinShape, View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from services.bench import Row
 from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
 from services.fit.transport.engine import Engine
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:

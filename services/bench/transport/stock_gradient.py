@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics.parameters import Tissue
-from services.fit.transport.recipe import View
+from services.fit.transport.scene.recipe import View
 
 
 def shared_names(tissue: Tissue) -> tuple[str, ...]:

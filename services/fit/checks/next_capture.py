@@ -20,7 +20,7 @@ from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_with
-from services.fit.transport.recipe import SceneRecipe, View
+from services.fit.transport.scene.recipe import SceneRecipe, View
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Camera, Mesh
 from services.core.records import Estimate
 from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 
 LEAST_STEP = 0.01
 """Least half step of a difference by a blend weight: some micrometres of dentin, far above rounding."""

@@ -18,7 +18,7 @@ from services.core.errors import CorruptStoreError
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from services.fit.execution.engine_host import EngineHost
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, kind_of, natural_derivative, similar_tissue, to_natural
 from services.fit.optics.parameters import Mouth, Optics, Tissue
-from services.fit.transport.recipe import JacobianEstimate, View
+from services.fit.transport.scene.recipe import JacobianEstimate, View
 
 Array = NDArray[np.float64]
 

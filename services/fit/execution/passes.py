@@ -30,7 +30,7 @@ from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.solve.adam import Gradient
 from services.fit.solve.normal_equations import LossChange, NormalEquations, Region, loss_change, normal_equations
-from services.fit.transport.recipe import StackEstimate
+from services.fit.transport.scene.recipe import StackEstimate
 
 Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]

@@ -27,7 +27,7 @@ from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.normal_equations import LossChange
 from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
-from services.fit.transport.recipe import StackEstimate, StainGradient
+from services.fit.transport.scene.recipe import StackEstimate, StainGradient
 
 RATIO_STEPS, PATTERN_STEPS = 2, 3
 """Before the media's first turn."""

@@ -16,7 +16,7 @@ from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import StoredArray, open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
 from services.fit.solve.losses import first_weights
-from services.fit.transport.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 

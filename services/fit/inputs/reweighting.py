@@ -15,7 +15,7 @@ from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, trace_row
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.losses import weights
-from services.fit.transport.recipe import StackEstimate
+from services.fit.transport.scene.recipe import StackEstimate
 
 
 @dataclass(frozen=True)

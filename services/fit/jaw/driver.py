@@ -34,7 +34,7 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import SHAPE
 from services.fit.tooth.driver import blend_shape, viewpoints_mm
 from services.fit.tooth.schedule import ChannelSchedule
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 
 START_STEPS = 4
 """About so many steps start one tooth, for the progress shown."""

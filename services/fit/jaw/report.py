@@ -20,7 +20,7 @@ from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
 from services.fit.tooth.driver import shape_covariance
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 
 STATES = ("fitted", "tied", "failed")
 

@@ -1,6 +1,6 @@
 """Total reflectance and transmittance of flat layers, with derivatives, to a requested error.
 
-Runs the fit's own walk (``services.fit.transport.walk``) between planes instead of meshes; light that leaves either face is
+Runs the fit's own walk (``services.fit.transport.paths.walk``) between planes instead of meshes; light that leaves either face is
 counted instead of connected to lamps.
 """
 
@@ -217,11 +217,11 @@ def accumulate(
     prepare_device()
     ior = _checked(layers, ior, boundary, source)
     _check_directions(source, mu_incident, exit_cosines, ring_edges_mm)
-    from services.fit.transport.geometry import SlabGeometry
-    from services.fit.transport.media import Media, Score
-    from services.fit.transport.scores import Plan
-    from services.fit.transport.starts import SlabStart
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.paths.scores import Plan
+    from services.fit.transport.paths.starts import SlabStart
+    from services.fit.transport.paths.walk import Walk
+    from services.fit.transport.scene.geometry import SlabGeometry
+    from services.fit.transport.scene.media import Media, Score
 
     names, scores = _derivatives(layers) if gradient else ((), ())
     border = gradient and len(layers) == 2
@@ -265,7 +265,7 @@ def _checked(layers: tuple[Layer, ...], ior: float, boundary: str, source: str) 
         raise InputError(f"ior = {ior:g} must lie in 1 to 4; enamel has 1.631.")
     if not layers:
         raise InputError("The slab has no layer; give at least one.")
-    from services.fit.transport.media import require_medium
+    from services.fit.transport.scene.media import require_medium
 
     for number, layer in enumerate(layers, 1):
         require_medium(f"layer {number}", _medium(layer))

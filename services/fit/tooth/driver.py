@@ -27,7 +27,7 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_m
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.tooth.schedule import ChannelSchedule
-from services.fit.transport.recipe import DentinShape
+from services.fit.transport.scene.recipe import DentinShape
 
 
 @dataclass

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.checks import require_cotangent, require_finite, require_finite_gradient, require_lights, require_surfaces, require_view
-from services.fit.transport.names import media_of, parameter_names, whitened
+from services.fit.transport.paths.until import MOST_SAMPLES, Effort, Sums, trace_until
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, StainGradient, View
-from services.fit.transport.until import MOST_SAMPLES, Effort, Sums, trace_until
+from services.fit.transport.scene.checks import require_cotangent, require_finite, require_finite_gradient, require_lights, require_surfaces, require_view
+from services.fit.transport.scene.names import media_of, parameter_names, whitened
+from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, StainGradient, View
 
 if TYPE_CHECKING:
-    from services.fit.transport.lights import PointLights
-    from services.fit.transport.media import Media
-    from services.fit.transport.scores import Plan
-    from services.fit.transport.shape_gradient import ShapeGradients
-    from services.fit.transport.starts import CameraStart
-    from services.fit.transport.walk import Walk
+    from services.fit.transport.gradients.shape_gradient import ShapeGradients
+    from services.fit.transport.lighting.lights import PointLights
+    from services.fit.transport.paths.scores import Plan
+    from services.fit.transport.paths.starts import CameraStart
+    from services.fit.transport.paths.walk import Walk
+    from services.fit.transport.scene.media import Media
 
 WIDEST_BORDER_MM = 5.0
 LANE_BUDGET = 24_000_000
@@ -47,10 +47,10 @@ class Engine:
         if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
             raise InputError(f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it.")
         prepare_device(threads, recipe.device)
-        from services.fit.transport.light_maps import LightMaps
-        from services.fit.transport.lights import PointLights
-        from services.fit.transport.mesh_geometry import MeshGeometry
-        from services.fit.transport.mouth_maps import MouthMaps
+        from services.fit.transport.lighting.light_maps import LightMaps
+        from services.fit.transport.lighting.lights import PointLights
+        from services.fit.transport.lighting.mouth_maps import MouthMaps
+        from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
@@ -90,7 +90,7 @@ class Engine:
             InputError: a parameter is outside its physical range, the view lists no pixel, or not exactly one of ``samples`` and ``rel_error`` is given.
             NonFiniteError: a result is NaN or infinite.
         """
-        from services.fit.transport.scores import Plan
+        from services.fit.transport.paths.scores import Plan
 
         def summarise(tables: Sums) -> StackEstimate:
             mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
@@ -121,8 +121,8 @@ class Engine:
         Raises:
             As ``images``; InputError also for a name the scene does not have.
         """
-        from services.fit.transport.media import Score
-        from services.fit.transport.scores import Plan
+        from services.fit.transport.paths.scores import Plan
+        from services.fit.transport.scene.media import Score
 
         known = parameter_names(self.recipe)
         unknown = [name for name in names if name not in known]
@@ -174,7 +174,7 @@ class Engine:
             InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not finite.
             NonFiniteError: the result is NaN or infinite.
         """
-        from services.fit.transport.shape_gradient import ShapeGradients
+        from services.fit.transport.gradients.shape_gradient import ShapeGradients
 
         cotangent = np.asarray(cotangent, dtype=np.float64)
         if not 0 <= tooth < len(self.recipe.teeth) or self._geometry.modes_of[tooth] == 0:
@@ -203,7 +203,7 @@ class Engine:
 
         An image is a polynomial in a common albedo with these as coefficients; paths end at the last edge.
         """
-        from services.fit.transport.scores import Plan
+        from services.fit.transport.paths.scores import Plan
 
         white = whitened(tissue)
         plan, bins = Plan(order_edges=tuple(int(edge) for edge in bin_edges)), len(bin_edges) - 1
@@ -223,9 +223,9 @@ class Engine:
         Raises:
             As ``images``; InputError also for a cotangent of another shape, or a scene without stains.
         """
-        from services.fit.transport.scores import Plan
-        from services.fit.transport.stains import StainTally
-        from services.fit.transport.starts import CameraStart
+        from services.fit.transport.gradients.stains import StainTally
+        from services.fit.transport.paths.scores import Plan
+        from services.fit.transport.paths.starts import CameraStart
 
         media, lights = self._prepare(tissue, view)
         require_cotangent(cotangent, view, self.recipe)
@@ -245,7 +245,7 @@ class Engine:
 
     def _prepare(self, tissue: Tissue | Mouth, view: View) -> tuple[Media, PointLights]:
         """Check a request, put surfaces and stains in their places, and give the media and lights of its kernel."""
-        from services.fit.transport.media import Media
+        from services.fit.transport.scene.media import Media
 
         require_view(view, self.recipe)
         mouth = tissue if isinstance(tissue, Mouth) else Mouth((tissue,))
@@ -258,7 +258,7 @@ class Engine:
 
     def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
         """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
-        from services.fit.transport.starts import CameraStart
+        from services.fit.transport.paths.starts import CameraStart
 
         media, lights = self._prepare(tissue, view)
         bins = max(len(plan.order_edges) - 1, 1)
@@ -285,13 +285,13 @@ class Engine:
         return whole
 
     def _walk(self, media: Media, lights: PointLights, start: CameraStart, plan: Plan) -> Walk:
-        from services.fit.transport.walk import Walk
+        from services.fit.transport.paths.walk import Walk
 
         return Walk(self._geometry, media, lights, start, plan, self._ior)
 
     def _lights_of(self, view: View) -> PointLights:
         """The lights that a view needs; none of the others is in its kernel."""
-        from services.fit.transport.lights import PointLights
+        from services.fit.transport.lighting.lights import PointLights
 
         if view.lights is None:
             return self._lights

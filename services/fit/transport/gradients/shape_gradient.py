@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics.parameters import Tissue
-from services.fit.transport.border_fields import CameraWalk, LightWalk, Texels, harmonics
-from services.fit.transport.border_series import BorderSeries, patches
-from services.fit.transport.media import Media
-from services.fit.transport.mesh_geometry import MeshGeometry
-from services.fit.transport.recipe import ShapeGradient, View
-from services.fit.transport.starts import CameraStart, LightStart
+from services.fit.transport.gradients.border_fields import CameraWalk, LightWalk, Texels, harmonics
+from services.fit.transport.gradients.border_series import BorderSeries, patches
+from services.fit.transport.paths.starts import CameraStart, LightStart
+from services.fit.transport.scene.media import Media
+from services.fit.transport.scene.mesh_geometry import MeshGeometry
+from services.fit.transport.scene.recipe import ShapeGradient, View
 
 Array = NDArray[np.float64]
 TEXELS = 130

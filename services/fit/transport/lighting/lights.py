@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
-from services.fit.transport.border import inverse_cosine
-from services.fit.transport.geometry import Geometry
-from services.fit.transport.light_groups import LightGroups
-from services.fit.transport.light_maps import DARK_DEPTH, LightMaps
-from services.fit.transport.media import Media
-from services.fit.transport.stains import FaceCrossing
+from services.fit.transport.gradients.border import inverse_cosine
+from services.fit.transport.gradients.stains import FaceCrossing
+from services.fit.transport.lighting.light_groups import LightGroups
+from services.fit.transport.lighting.light_maps import DARK_DEPTH, LightMaps
+from services.fit.transport.scene.geometry import Geometry
+from services.fit.transport.scene.media import Media
 
 CANDIDATES = 8
 """Stratified candidate lights per connection; 18 or 54 cost more than they gave."""

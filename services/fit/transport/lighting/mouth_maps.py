@@ -9,9 +9,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from services.fit.transport.geometry import Hit
-from services.fit.transport.light_maps import LightMaps, LightView, MapCell, MapRay
-from services.fit.transport.mesh_geometry import MeshGeometry
+from services.fit.transport.lighting.light_maps import LightMaps, LightView, MapCell, MapRay
+from services.fit.transport.scene.geometry import Hit
+from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 FIRST = 31
 """Bits of what a ray met: one more than the first thing's number, 0 for nothing ..."""

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.transport.media import Mixed
+from services.fit.transport.scene.media import Mixed
 
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""

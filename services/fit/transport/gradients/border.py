@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from services.fit.transport.geometry import Geometry, Hit
-from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.scene.geometry import Geometry, Hit
+from services.fit.transport.scene.media import Media, PhaseFunction
 
 COSINE_CLAMP = 1e-3
 """1/|omega . n| has a logarithmically divergent second moment. Crossings at cosine mu come with density ~ mu, so clamping

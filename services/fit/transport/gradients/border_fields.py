@@ -13,13 +13,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.transport.geometry import Hit
-from services.fit.transport.media import Media
-from services.fit.transport.mesh_geometry import MeshGeometry
-from services.fit.transport.scores import Plan
-from services.fit.transport.starts import CameraStart, LightStart
-from services.fit.transport.tally import Tally
-from services.fit.transport.walk import Flight, Walk, Walker
+from services.fit.transport.paths.scores import Plan
+from services.fit.transport.paths.starts import CameraStart, LightStart
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.paths.walk import Flight, Walk, Walker
+from services.fit.transport.scene.geometry import Hit
+from services.fit.transport.scene.media import Media
+from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 GRAZING_COSINE = 0.2
 """A crossing with less |n . w| counts with the mean of 1 / |n . w| below it, 2 / this, exact where radiance is constant there: 1 / |n . w| itself has a

@@ -13,16 +13,16 @@ import mitsuba as mi
 
 from services.fit.optics import fresnel
 from services.fit.optics.free_flight import minus_log1m, one_minus_exp
-from services.fit.transport.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
-from services.fit.transport.connections import Connections, Vertex
-from services.fit.transport.exits import Exits
-from services.fit.transport.geometry import Geometry, Hit, SlabGeometry
-from services.fit.transport.lights import PointLights, shadow
-from services.fit.transport.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
-from services.fit.transport.scores import Plan, Scatterings, Scores
-from services.fit.transport.stains import FaceCrossing
-from services.fit.transport.starts import CameraStart, LightStart, SlabStart
-from services.fit.transport.tally import Tally
+from services.fit.transport.gradients.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
+from services.fit.transport.gradients.stains import FaceCrossing
+from services.fit.transport.lighting.lights import PointLights, shadow
+from services.fit.transport.paths.connections import Connections, Vertex
+from services.fit.transport.paths.exits import Exits
+from services.fit.transport.paths.scores import Plan, Scatterings, Scores
+from services.fit.transport.paths.starts import CameraStart, LightStart, SlabStart
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.scene.geometry import Geometry, Hit, SlabGeometry
+from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 ROULETTE_WEIGHT = 0.1
 """Paths below this fraction of their first weight survive in proportion to it."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from services.core.errors import InputError
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Stain, Tissue
-from services.fit.transport.recipe import SceneRecipe, ToothSurfaces
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
     Raises:
         InputError: a part is missing or too many, or a parameter is outside its physical range.
     """
-    from services.fit.transport.media import require_medium
+    from services.fit.transport.scene.media import require_medium
 
     numbers, media = media_numbers(recipe), []
     if len(mouth.teeth) != len(recipe.teeth):

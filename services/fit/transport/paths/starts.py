@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
-from services.fit.transport.light_maps import aligned
-from services.fit.transport.recipe import View
+from services.fit.transport.lighting.light_maps import aligned
+from services.fit.transport.scene.recipe import View
 
 NEAR_MARGIN_MM = 1.0
 

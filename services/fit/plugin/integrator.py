@@ -31,10 +31,10 @@ import numpy as np
 
 from services.core.errors import InputError, PlatformError
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
-from services.fit.transport.channel_media import ToothOptics
-from services.fit.transport.media import require_medium
-from services.fit.transport.scene_path import ScenePaths
-from services.fit.transport.scene_teeth import SceneTeeth, ToothShapes
+from services.fit.plugin.channel_media import ToothOptics
+from services.fit.plugin.scene_path import ScenePaths
+from services.fit.plugin.scene_teeth import SceneTeeth, ToothShapes
+from services.fit.transport.scene.media import require_medium
 
 PLUGIN = "dentine"
 PARTS = ("enamel", "dentin")

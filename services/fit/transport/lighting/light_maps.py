@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics import fresnel
-from services.fit.transport.geometry import DENTIN, ENAMEL, Hit
-from services.fit.transport.media import Media
+from services.fit.transport.scene.geometry import DENTIN, ENAMEL, Hit
+from services.fit.transport.scene.media import Media
 
 if TYPE_CHECKING:
-    from services.fit.transport.mesh_geometry import MeshGeometry
+    from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 TEXEL_MM = 0.15
 """Spacing of the grid at the tooth."""

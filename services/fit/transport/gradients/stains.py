@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.optics.parameters import Stain
-from services.fit.transport.geometry import Hit
-from services.fit.transport.tally import Tally
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.scene.geometry import Hit
 
 
 @dataclass

@@ -13,8 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics.parameters import Medium
-from services.fit.transport.geometry import DENTIN
-from services.fit.transport.media import Media, PhaseFunction
+from services.fit.transport.scene.geometry import DENTIN
+from services.fit.transport.scene.media import Media, PhaseFunction
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.transport.light_maps import aligned
+from services.fit.transport.lighting.light_maps import aligned
 
 
 class LightGroups:

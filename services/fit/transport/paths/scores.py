@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from services.core.errors import InputError
 from services.fit.optics.free_flight import minus_log1m
-from services.fit.transport.media import Media, Mixed, Score
+from services.fit.transport.scene.media import Media, Mixed, Score
 
 NEARLY_ONE = 1 - 2.0**-24
 MOST_COUNTED = 3

@@ -15,13 +15,13 @@ import numpy as np
 
 from services.fit.optics import fresnel
 from services.fit.optics.free_flight import one_minus_exp
-from services.fit.transport.geometry import Hit, SlabGeometry
-from services.fit.transport.media import Media, PhaseFunction
-from services.fit.transport.scores import Plan
-from services.fit.transport.tally import Tally
+from services.fit.transport.paths.scores import Plan
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.scene.geometry import Hit, SlabGeometry
+from services.fit.transport.scene.media import Media, PhaseFunction
 
 if TYPE_CHECKING:
-    from services.fit.transport.walk import Walker
+    from services.fit.transport.paths.walk import Walker
 
 LEAST_RATE = 1e-6
 """Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand is constant."""

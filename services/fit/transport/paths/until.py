@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError
-from services.fit.transport.recipe import JacobianEstimate, StackEstimate
+from services.fit.transport.scene.recipe import JacobianEstimate, StackEstimate
 
 FIRST_ROUND = 4
 """Paths per batch in the first round."""

@@ -15,11 +15,11 @@ import mitsuba as mi
 
 from services.fit.optics import fresnel
 from services.fit.optics.free_flight import minus_log1m
-from services.fit.transport.channel_media import ChannelMedia, ToothOptics
-from services.fit.transport.geometry import ENAMEL
-from services.fit.transport.gloss import Gloss
-from services.fit.transport.scene_teeth import SceneTeeth
-from services.fit.transport.walk import ROULETTE_WEIGHT
+from services.fit.plugin.channel_media import ChannelMedia, ToothOptics
+from services.fit.plugin.gloss import Gloss
+from services.fit.plugin.scene_teeth import SceneTeeth
+from services.fit.transport.paths.walk import ROULETTE_WEIGHT
+from services.fit.transport.scene.geometry import ENAMEL
 
 CONNECTION_GAIN = 3.0
 CONNECTION_FLOOR = 0.02

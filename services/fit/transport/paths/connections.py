@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from services.fit.transport.geometry import Geometry
-from services.fit.transport.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
-from services.fit.transport.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
-from services.fit.transport.scores import Plan, Scatterings, Scores
-from services.fit.transport.stains import FaceCrossing, StainTally
-from services.fit.transport.tally import Tally
+from services.fit.transport.gradients.stains import FaceCrossing, StainTally
+from services.fit.transport.lighting.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
+from services.fit.transport.paths.scores import Plan, Scatterings, Scores
+from services.fit.transport.paths.tally import Tally
+from services.fit.transport.scene.geometry import Geometry
+from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 MAP_DOUBT = 0.1
 """Relative error that a light map is trusted not to exceed where it is certain: the share of a connection that shadow rays check."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.core.geometry import Mesh
-from services.fit.transport.clearance import CELL_MM, Clearance
-from services.fit.transport.geometry import DENTIN, ENAMEL
+from services.fit.transport.scene.clearance import CELL_MM, Clearance
+from services.fit.transport.scene.geometry import DENTIN, ENAMEL
 
 CLEARANCE_CELLS = 4_000_000
 """A distance grid of more cells takes longer to build than it saves."""

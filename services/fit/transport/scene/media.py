@@ -13,7 +13,7 @@ import numpy as np
 from services.core.errors import InputError
 from services.fit.optics import phase
 from services.fit.optics.parameters import Medium
-from services.fit.transport.tables import PhaseTables
+from services.fit.transport.scene.tables import PhaseTables
 
 LOBE_FIELDS = frozenset({"beta", "g1", "g2"})
 MOST_SELECTED = 3

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError, NonFiniteError
-from services.fit.transport.recipe import SceneRecipe, View
+from services.fit.transport.scene.recipe import SceneRecipe, View
 
 FARTHEST_MM = 1e12
 """A million kilometres; farther away, squares of distances leave what single precision holds."""

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from services.anatomy.scans.patches import areas_mm2
 from services.core.geometry import Mesh
 from services.fit.optics.parameters import Stain
-from services.fit.transport.clearance import Clearance
-from services.fit.transport.geometry import RAY_EPSILON, Hit
-from services.fit.transport.media import Mixed
-from services.fit.transport.mixed_border import MixedBorder
-from services.fit.transport.names import media_numbers
-from services.fit.transport.nesting import require_nested
-from services.fit.transport.recipe import DentinShape, SceneRecipe
-from services.fit.transport.stains import StainTextures
+from services.fit.transport.gradients.stains import StainTextures
+from services.fit.transport.scene.clearance import Clearance
+from services.fit.transport.scene.geometry import RAY_EPSILON, Hit
+from services.fit.transport.scene.media import Mixed
+from services.fit.transport.scene.mixed_border import MixedBorder
+from services.fit.transport.scene.names import media_numbers
+from services.fit.transport.scene.nesting import require_nested
+from services.fit.transport.scene.recipe import DentinShape, SceneRecipe
 
 Shapes = tuple[tuple[float, ...], ...]
 """Blend weights of each tooth's dentin."""
