@@ -205,7 +205,7 @@ def phantom(
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
-    from services.core.folders import require_folder
+    from services.core.files.folders import require_folder
 
     require_folder(out, "--out")
     of_jaw = {"--scan": scan is not None}

@@ -61,7 +61,7 @@ def require_apart(spec: JobSpec, out: Path) -> None:
     Raises:
         InputError: names both folders.
     """
-    from services.core.folders import require_outside
+    from services.core.files.folders import require_outside
 
     require_outside(out, spec.capture, "--out")
     if spec.rig is not None and not spec.is_demo:
@@ -72,7 +72,7 @@ def require_apart(spec: JobSpec, out: Path) -> None:
 def cancelling_on_signals(out: Path) -> Iterator[None]:
     """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
     from services.api.pipeline import request_cancel, withdraw_cancel
-    from services.core.folders import require_folder
+    from services.core.files.folders import require_folder
 
     require_folder(out, "Folder")
     asked = False

@@ -9,8 +9,8 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from services.api.image_headers import declared
-from services.api.image_metadata import metadata_fault
+from services.core.files.image_headers import declared
+from services.core.files.image_metadata import metadata_fault
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
 from services.core.slab_folder import SlabFolder

@@ -9,7 +9,7 @@ import sqlalchemy as sql
 
 from services.api.database import metadata, parse_database_url, with_password_file, writing
 from services.core.errors import SettingsError
-from services.core.private_files import write_private
+from services.core.files.private import write_private
 from services.core.store import write_atomic
 
 FILE = "folder.id"

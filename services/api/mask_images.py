@@ -7,7 +7,7 @@ import zlib
 from typing import TYPE_CHECKING
 
 from services.api.errors import MaskError
-from services.api.image_headers import PNG_SIGNATURE, PngHeader, png_header
+from services.core.files.image_headers import PNG_SIGNATURE, PngHeader, png_header
 from services.core.geometry import Camera
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from services.api.pipeline import DOORS
 from services.api.runner import RunJob
 from services.api.setup_links import SetupLinks, setup_address
 from services.core.errors import PlatformError
-from services.core.private_files import PRIVATE
+from services.core.files.private import PRIVATE
 from services.core.redaction import redacted
 from services.core.settings import ServerSettings
 from services.core.stage import StageName

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from services.api.errors import UnauthenticatedError
 from services.api.tokens import Token
-from services.core.private_files import write_private
+from services.core.files.private import write_private
 
 COOKIE = "dentine-session"
 KEY_FILE = "session.key"

@@ -17,8 +17,8 @@ from services.api.capture_paths import path_fault, require_paths
 from services.api.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
 from services.api.errors import UploadError
 from services.api.exchange import Ask, Flow, Pause, Work, answer, error_in
-from services.api.image_metadata import metadata_fault
 from services.core.errors import CaptureInputError, PlatformError
+from services.core.files.image_metadata import metadata_fault
 from services.core.geometry import Record
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     from services.capture.preflight import preflight
     from services.capture.rig import PlannedRig
     from services.capture.sequence import capture_frames
-    from services.core.meshfiles import read_teeth
+    from services.core.files.meshes import read_teeth
 
     if spec.rig is None:
         raise SettingsError("The capture stage needs option [rig]; add it, or give 'capture' and start from the prepare stage.")

@@ -81,7 +81,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     """
     import numpy as np
 
-    from services.core.meshfiles import read_mesh
+    from services.core.files.meshes import read_mesh
     from services.fit.export.asset import errors_json, parameters_json, write_asset
     from services.fit.export.previews import read_pictures
     from services.fit.export.report import write_report
@@ -140,7 +140,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport) -> tuple[Tooth, ...]:
     """The teeth with the dentin surfaces the fit ended with."""
-    from services.core.meshfiles import read_teeth
+    from services.core.files.meshes import read_teeth
     from services.fit.jaw.driver import jaw_dentins
     from services.fit.tooth.driver import dentin_shape
 

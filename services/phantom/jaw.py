@@ -16,8 +16,8 @@ from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
 from services.core.errors import MeshError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device

@@ -11,8 +11,8 @@ import numpy as np
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import InputError
+from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.meshfiles import read_mesh, write_mapped_mesh, write_mesh
 from services.core.records import Boundary
 from services.fit.export.stains import keep_stains, write_textures
 from services.fit.inputs.stain_uv import ToothStains

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
-from services.core.meshfiles import read_mesh, read_teeth
 from services.preprocess.projection import Footprint, project
 
 NOTHING = -1

@@ -25,7 +25,7 @@ from typing import Protocol
 
 import numpy as np
 
-from services.core.meshfiles import read_teeth
+from services.core.files.meshes import read_teeth
 from services.core.records import JobSpec, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from services.anatomy.templates.jaw import build_jaw
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import write_mesh
 from services.phantom.tooth import write_phantom
 from tests.support.truths import FOLDER, pack
 

@@ -13,7 +13,7 @@ from scipy import stats
 from services.bench.transport.gradient import our_gradient
 from services.bench.transport.gradient_rows import of_parts
 from services.bench.transport.stock_gradient import StockGradient
-from services.core.meshfiles import write_mesh
+from services.core.files.meshes import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine

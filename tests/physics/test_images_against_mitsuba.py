@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.core.meshfiles import read_teeth, write_mesh
+from services.core.files.meshes import read_teeth, write_mesh
 from services.core.records import Boundary, FolderCapture
 from services.core.store import read_record
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches

@@ -17,8 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.errors import DentineError, InputError, MeshError, PlatformError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
 from services.fit.optics.parameters import Medium, Tissue

@@ -16,8 +16,8 @@ from scipy import stats
 
 from services.anatomy.distance import SurfaceDistance
 from services.core.errors import InputError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.phase_table import PhaseTable

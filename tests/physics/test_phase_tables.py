@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.core.errors import InputError
-from services.core.meshfiles import write_mesh
+from services.core.files.meshes import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.phase_table import PhaseTable, tent_weights

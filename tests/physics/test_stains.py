@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.core.errors import InputError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
 from services.fit.optics.parameters import Medium, Stain, Tissue

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
-from services.core.meshfiles import read_mesh
+from services.core.files.meshes import read_mesh
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.fit.export.stains import kept_stains

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.meshfiles import read_mesh
+from services.core.files.meshes import read_mesh
 from services.core.records import FitReport, JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.fit.execution.journal import read_entries

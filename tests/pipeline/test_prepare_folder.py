@@ -14,8 +14,8 @@ import trimesh
 import zarr
 
 from services.core.errors import CaptureInputError, DentineError, MeshError, SettingsError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import write_mesh
 from services.core.records import JobSpec, MaskBit, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage

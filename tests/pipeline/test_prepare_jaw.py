@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from services.__main__ import build_app
 from services.core.errors import CaptureInputError, MeshError
+from services.core.files.meshes import read_mesh, read_teeth, write_mesh
 from services.core.geometry import Camera, Mesh
-from services.core.meshfiles import read_mesh, read_teeth, write_mesh
 from services.core.records import FolderCapture, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import read_record

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
-from services.core.meshfiles import write_mesh
 from services.core.records import FolderCapture, ImageEntry
 from services.core.store import write_record
 

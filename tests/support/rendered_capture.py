@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light
-from services.core.meshfiles import write_mesh
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Tissue

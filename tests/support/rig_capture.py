@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, teeth_folder
-from services.core.meshfiles import write_mesh
 from services.core.records import CaptureManifest, FolderCapture, FrameRecord
 from services.core.store import StageWriter, create_array
 

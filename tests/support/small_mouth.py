@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import boundary_dict, medium_dict, sensor_dict
 from services.fit.optics.parameters import Medium, Mouth, Tissue

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.fits.tooth_capture import photograph
+from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Mesh, teeth_folder
-from services.core.meshfiles import read_mesh, write_mesh
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "truths"
 SIDE_LIGHTS = ("l2", "l4", "l6")

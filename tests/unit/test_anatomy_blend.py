@@ -15,8 +15,8 @@ from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.incisor import build_incisor
 from services.anatomy.templates.jaw import build_jaw
 from services.core.errors import MeshError
+from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.transport.scene.recipe import DentinShape

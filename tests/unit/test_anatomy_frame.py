@@ -10,8 +10,8 @@ from services.anatomy.frame import ToothFrame, estimate_frame
 from services.anatomy.templates.crown import build_tooth
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.incisor import build_incisor
+from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from tests.support.shared_data import shared_path

@@ -14,8 +14,8 @@ from services.anatomy.templates.crown import build_tooth
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import Jaw, build_jaw
 from services.core.errors import CaptureInputError
+from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh, Tooth
-from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from tests.support.shared_data import shared_path

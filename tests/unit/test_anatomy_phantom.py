@@ -11,7 +11,7 @@ import pytest
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import InputError
-from services.core.meshfiles import read_mesh, read_teeth, write_mesh
+from services.core.files.meshes import read_mesh, read_teeth, write_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.phantom.tooth import write_phantom

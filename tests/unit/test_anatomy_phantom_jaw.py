@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from services.__main__ import build_app
 from services.anatomy.distance import SurfaceDistance
 from services.core.errors import CaptureInputError, InputError
-from services.core.meshfiles import read_teeth
+from services.core.files.meshes import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.optics.parameters import Medium

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from services.anatomy.templates.incisor import build_incisor
+from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import read_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.fit.checks.thickness import enamel_thickness_mm, thickness_image, thickness_map, uncertain_thickness

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.api.capture_contents import content_fault
-from services.api.image_headers import declared
+from services.core.files.image_headers import declared
 from services.core.settings import UploadLimits
 from tests.support.uploading import contents_of, write_capture
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.core.meshfiles import read_teeth
+from services.core.files.meshes import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from tests.support.jaw_truth import CAMERAS, HELD_OUT, LIGHTS, NOISE_FLOOR, NOISE_RELATIVE, JawTruth, _of_neighbours, pack, read_jaw_truth, write_jaw_capture

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from services.api.errors import MaskError
-from services.api.image_headers import PNG_SIGNATURE
 from services.api.mask_images import require_mask
+from services.core.files.image_headers import PNG_SIGNATURE
 from services.core.geometry import Camera
 
 AHEAD = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))

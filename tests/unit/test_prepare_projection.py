@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from services.core.files.meshes import read_teeth
 from services.core.geometry import Camera, Mesh
-from services.core.meshfiles import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from services.preprocess.projection import project

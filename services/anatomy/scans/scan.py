@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, InputError
+from services.core.files.meshes import read_labelled_mesh
 from services.core.geometry import Mesh
-from services.core.meshfiles import read_labelled_mesh
 
 Numbering = Literal["universal", "fdi"]
 

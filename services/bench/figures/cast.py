@@ -11,7 +11,7 @@ import numpy as np
 
 from services.bench.figures.cases import Capture, Case
 from services.bench.figures.gallery import tooth_surfaces
-from services.core.meshfiles import write_mesh
+from services.core.files.meshes import write_mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from services.anatomy.frame import estimate_frame
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import DentineError, InputError, NonFiniteError
+from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Mesh, Vector3
-from services.core.meshfiles import read_mesh, write_mesh
 from services.core.store import write_atomic
 from services.fit.export.pictures import png_bytes, tone_map, white_level
 from services.fit.optics.domain import similar_medium

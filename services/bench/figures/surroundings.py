@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from services.bench.figures.gallery import render
 from services.core.errors import InputError
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.core.meshfiles import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, sensor_dict
 from services.fit.optics.parameters import Tissue
 from services.fit.transport.platform import prepare_device

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from services.bench.fits.tooth_capture import CHANNEL, PreparedTooth
-from services.core.meshfiles import write_mesh
+from services.core.files.meshes import write_mesh
 from services.fit.optics.domain import LN10, to_dual, to_natural
 from services.fit.optics.parameters import Medium, Tissue
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.incisor import build_incisor
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.core.meshfiles import write_mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, View, single_tooth

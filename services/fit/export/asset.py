@@ -20,8 +20,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from services.core.files.meshes import write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.meshfiles import write_mapped_mesh, write_mesh
 from services.core.records import Boundary, Estimate, FitReport
 from services.core.store import write_atomic
 from services.core.verdict import VERDICT, verdict_of

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from services.anatomy.scans.separation import separate
+from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh, Tooth
-from services.core.meshfiles import write_mesh
 from services.core.records import Boundary
 from services.fit.export.mitsuba_scene import SceneDict, boundary_dict, lit_scene, medium_dict, sensor_dict, surface_dict
 from services.fit.optics.parameters import Mouth

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, SettingsError
+from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
-from services.core.meshfiles import read_mesh, read_teeth
 from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import StoredArray, open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe

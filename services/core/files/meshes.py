@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, MeshError
+from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh, Tooth, teeth_folder
-from services.core.vtk_polydata import read_polydata
 
 FDI_NUMBERS = frozenset(10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6))
 """Permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""

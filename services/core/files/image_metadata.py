@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import BinaryIO
 
-from services.api.image_headers import HEADER_BYTES, PNG_SIGNATURE, exr_parts, tiff_layout
+from services.core.files.image_headers import HEADER_BYTES, PNG_SIGNATURE, exr_parts, tiff_layout
 
 _MOST_PARTS = 250_000
 _PNG_PLAIN = frozenset(
