@@ -178,7 +178,7 @@ def dome_sim(
     watchdog_s: Annotated[float, typer.Option(min=0.05, help="Seconds without a request until the dome goes dark.")] = 2.0,
 ) -> None:
     """Simulate a dome's Modbus controller."""
-    from services.capture.simulator import serve_dome
+    from services.capture.dome.simulator import serve_dome
 
     serve_dome(host, port, lights, watchdog_s)
 

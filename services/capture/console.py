@@ -19,10 +19,10 @@ import time
 from contextlib import ExitStack, suppress
 from functools import partial
 
-from services.capture.address import dome_address
-from services.capture.dome import ExposureBudget
-from services.capture.dome_controller import DomeObserver, all_off
-from services.capture.dome_modbus import ModbusDome
+from services.capture.dome.address import dome_address
+from services.capture.dome.controller import DomeObserver, all_off
+from services.capture.dome.driver import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
 from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigError, RigStoppedError, SettingsError
 from services.core.settings import DomeSettings

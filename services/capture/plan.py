@@ -15,8 +15,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from services.capture.dome import ExposureBudget
-from services.capture.registers import FULL_SCALE, level_word
+from services.capture.dome.protocol import ExposureBudget
+from services.capture.dome.registers import FULL_SCALE, level_word
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import MAX_ON_TIME_S, RigSpec

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from services.capture.camera import Cameras
-from services.capture.dome import Dome
+from services.capture.cameras.protocol import Cameras
+from services.capture.dome.protocol import Dome
 from services.capture.plan import PlannedFrame, preflight_frames
 from services.capture.sequence import CLIPPED_FRACTION, clipped_fraction, expose
 from services.core.errors import RigError

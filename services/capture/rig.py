@@ -7,14 +7,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.capture.address import dome_address
-from services.capture.camera import Cameras
-from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import ModbusDome
-from services.capture.motion import SubjectMotion
+from services.capture.cameras.motion import SubjectMotion
+from services.capture.cameras.protocol import Cameras
+from services.capture.cameras.simulated import PlaybackCameras, SimulatedCameras
+from services.capture.cameras.stills import Stills
+from services.capture.dome.address import dome_address
+from services.capture.dome.driver import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
 from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
-from services.capture.simulated_cameras import PlaybackCameras, SimulatedCameras
-from services.capture.stills import Stills
 from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError, RigError, SettingsError
 from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.capture.camera import Cameras
-from services.capture.dome import Dome, Rgb
+from services.capture.cameras.protocol import Cameras
+from services.capture.dome.protocol import Dome, Rgb
 from services.capture.frames import FrameStore
 from services.capture.plan import PlannedFrame
 from services.core.records import FrameRecord

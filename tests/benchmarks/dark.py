@@ -41,8 +41,8 @@ from typing import Any
 
 import httpx
 
-from services.capture.dome_controller import DomeObserver
-from services.capture.simulator import simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.simulator import simulated_dome
 from services.core.store import write_atomic
 from tests.benchmarks.dark_loads import LOADS, allow_many_connections, loaded
 from tests.browser.chromium import ARGUMENTS

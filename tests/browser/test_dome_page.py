@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from services.api.app import STATIC, create_app
-from services.capture.simulator import simulated_dome
+from services.capture.dome.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings
 from tests.browser.contrast import contrast_failures
 from tests.support.live_server import serving

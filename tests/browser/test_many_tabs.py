@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
 from services.api.app import STATIC, create_app
-from services.capture.simulator import simulated_dome
+from services.capture.dome.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings
 from tests.browser.chromium import PATIENCE_MS
 from tests.browser.contrast import contrast_failures

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from services.capture.dome import Dome, ExposureBudget
-from services.capture.dome_controller import DomeObserver
-from services.capture.dome_modbus import HANG_MARGIN_S, ModbusDome
-from services.capture.registers import FULL_SCALE
-from services.capture.simulator import simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.driver import HANG_MARGIN_S, ModbusDome
+from services.capture.dome.protocol import Dome, ExposureBudget
+from services.capture.dome.registers import FULL_SCALE
+from services.capture.dome.simulator import simulated_dome
 from services.core.errors import ExposureLimitError, RigError
 
 LIGHTS = 50

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from services.capture import registers as reg
-from services.capture.dome import ExposureBudget
-from services.capture.dome_controller import DomeObserver
-from services.capture.dome_modbus import ModbusDome
-from services.capture.registers import FaultKind
-from services.capture.simulator import order_fault, serve_dome, simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.driver import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
+from services.capture.dome.protocol import registers as reg
+from services.capture.dome.registers import FaultKind
+from services.capture.dome.simulator import order_fault, serve_dome, simulated_dome
 from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError
 from tests.support.dome_proxy import Proxy
 
@@ -193,8 +193,8 @@ SIGNALLED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
-from services.capture.dome import ExposureBudget
-from services.capture.dome_modbus import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
+from services.capture.dome.driver import ModbusDome
 with ModbusDome("127.0.0.1", int(sys.argv[1]), ExposureBudget(1e3, 1e3), watchdog_s=60.0) as dome:
     dome.light(3, 0.5, 50.0)
     print("lit", flush=True)

@@ -14,9 +14,9 @@ import numpy as np
 import zarr
 
 from services.capture import stage
-from services.capture.dome_controller import DomeObserver
-from services.capture.registers import FaultBit
-from services.capture.simulator import simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.registers import FaultBit
+from services.capture.dome.simulator import simulated_dome
 from services.core.records import JobSpec, RigSpec, SimulatedCameraSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import is_published

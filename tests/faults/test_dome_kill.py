@@ -14,9 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.capture.dome_controller import DomeObserver
-from services.capture.registers import FaultBit
-from services.capture.simulator import simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.registers import FaultBit
+from services.capture.dome.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings
 from tests.support.live_server import connect
 

@@ -23,7 +23,7 @@ from services.api.app import create_app
 from services.api.bodies import MAX_FAULTS
 from services.api.jobs import Jobs
 from services.api.repository import Repository
-from services.capture.simulator import simulated_dome
+from services.capture.dome.simulator import simulated_dome
 from services.core.errors import DentineError
 from services.core.settings import DomeSettings, ServerSettings
 from tests.support.live_server import serving

@@ -15,17 +15,17 @@ import zarr
 from numpy.typing import NDArray
 
 from services.capture import stage
-from services.capture.dome import ExposureBudget
-from services.capture.dome_controller import DomeObserver
-from services.capture.dome_modbus import ModbusDome
+from services.capture.cameras.motion import SubjectMotion
+from services.capture.cameras.simulated import SimulatedCameras
+from services.capture.cameras.stills import Stills
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.driver import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
+from services.capture.dome.registers import FaultKind
+from services.capture.dome.simulator import order_fault, simulated_dome
 from services.capture.frames import FrameStore
-from services.capture.motion import SubjectMotion
 from services.capture.plan import PlannedFrame, plan_capture
 from services.capture.preflight import preflight
-from services.capture.registers import FaultKind
-from services.capture.simulated_cameras import SimulatedCameras
-from services.capture.simulator import order_fault, simulated_dome
-from services.capture.stills import Stills
 from services.core.errors import (
     CaptureInputError,
     DentineError,

@@ -20,14 +20,14 @@ from services.api.app import create_app
 from services.api.events import EventAddress
 from services.api.problems import status_of
 from services.api.tokens import Scope
-from services.capture import registers as reg
 from services.capture import stage
 from services.capture.console import Console
-from services.capture.dome import ExposureBudget
-from services.capture.dome_controller import DomeObserver
-from services.capture.dome_modbus import ModbusDome
-from services.capture.registers import FaultBit, FaultKind
-from services.capture.simulator import order_fault, simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.driver import ModbusDome
+from services.capture.dome.protocol import ExposureBudget
+from services.capture.dome.protocol import registers as reg
+from services.capture.dome.registers import FaultBit, FaultKind
+from services.capture.dome.simulator import order_fault, simulated_dome
 from services.core.dome import DomeAnswer, DomeCommand
 from services.core.errors import RigStoppedError, RigUnreachableError
 from services.core.records import JobSpec

@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from services.capture import registers as reg
 from services.capture.console import Console
-from services.capture.dome_controller import DomeObserver
-from services.capture.modbus_link import ModbusLink
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.modbus_link import ModbusLink
+from services.capture.dome.protocol import registers as reg
+from services.capture.dome.simulator import simulated_dome
 from services.capture.preflight import preflight
 from services.capture.rig import PlannedRig
-from services.capture.simulator import simulated_dome
 from services.core.dome import DomeAnswer, DomeCommand
 from services.core.errors import RigStoppedError
 from services.core.records import RigSpec

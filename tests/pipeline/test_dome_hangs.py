@@ -13,8 +13,8 @@ import pytest
 
 from services.api.dome import Dome, LightRequest
 from services.api.jobs import Jobs
-from services.capture.dome_controller import DomeObserver
-from services.capture.simulator import simulated_dome
+from services.capture.dome.controller import DomeObserver
+from services.capture.dome.simulator import simulated_dome
 from services.core.errors import RigUnreachableError
 from services.core.settings import DomeSettings, ServerSettings
 

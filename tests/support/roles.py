@@ -45,7 +45,7 @@ ROLES: Mapping[str, Role] = {
     "scheduler": Role((), (*_COMMANDS, "services.dask_command")),
     "worker": Role(("worker",), _WORKER),
     "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
-    "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.simulator")),
+    "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.dome.simulator")),
     "client": Role((), (*_COMMANDS, "services.client_commands")),
 }
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.capture.motion import SubjectMotion, resample
+from services.capture.cameras.motion import SubjectMotion, resample
 
 
 @given(motion_px=st.floats(0.1, 5.0), seed=st.integers(0, 1000), frame=st.integers(0, 40), camera=st.integers(0, 3))

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.capture.dome.registers import FULL_SCALE, MAX_LIGHTS
 from services.capture.plan import plan_capture, preflight_frames
-from services.capture.registers import FULL_SCALE, MAX_LIGHTS
 from services.capture.rig import PlannedRig
 from services.core.errors import ExposureLimitError, SettingsError
 from services.core.records import RigSpec

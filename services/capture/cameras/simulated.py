@@ -10,10 +10,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from services.capture.dome_controller import DomeObserver
-from services.capture.motion import SubjectMotion, resample
+from services.capture.cameras.motion import SubjectMotion, resample
+from services.capture.cameras.stills import Stills
+from services.capture.dome.controller import DomeObserver
 from services.capture.plan import PlannedFrame
-from services.capture.stills import Stills
 from services.core.errors import RigError
 from services.core.records import RigSpec, SimulatedCameraSpec
 

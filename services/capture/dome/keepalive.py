@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 
-from services.capture.modbus_link import LinkError, ModbusLink
-from services.capture.registers import ALL_OFF, KEEPALIVE
+from services.capture.dome.modbus_link import LinkError, ModbusLink
+from services.capture.dome.registers import ALL_OFF, KEEPALIVE
 from services.core.errors import RigError
 
 FEEDS_PER_WATCHDOG = 5

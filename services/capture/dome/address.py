@@ -17,7 +17,7 @@ def dome_address(address: str, lights: int, watchdog_s: float) -> Iterator[tuple
         SettingsError: neither 'simulated' nor host:port.
     """
     if address == SIMULATED_DOME:
-        from services.capture.simulator import simulated_dome
+        from services.capture.dome.simulator import simulated_dome
 
         with simulated_dome(lights, watchdog_s) as place:
             yield place

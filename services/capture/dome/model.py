@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from services.capture import registers as reg
-from services.capture.registers import FaultBit, FaultKind, Register, Space
+from services.capture.dome.protocol import registers as reg
+from services.capture.dome.registers import FaultBit, FaultKind, Register, Space
 
 ILLEGAL_VALUE = 3
 DEVICE_FAILURE = 4

@@ -16,7 +16,7 @@ from typing import Any
 from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from services.capture.registers import Register
+from services.capture.dome.registers import Register
 
 MAX_READ = 125
 MAX_WRITE = 123

@@ -19,10 +19,10 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from services.capture import registers as reg
-from services.capture.dome_model import DomeModel
-from services.capture.modbus_link import UNIT, LinkError, ModbusLink
-from services.capture.registers import FaultKind, Space
+from services.capture.dome.modbus_link import UNIT, LinkError, ModbusLink
+from services.capture.dome.model import DomeModel
+from services.capture.dome.protocol import registers as reg
+from services.capture.dome.registers import FaultKind, Space
 from services.core.errors import RigError
 
 START_TIMEOUT_S = 30.0
@@ -54,7 +54,7 @@ def serve_dome(host: str, port: int, lights: int, watchdog_s: float, announce: C
 @contextmanager
 def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1") -> Iterator[tuple[str, int]]:
     """A simulated dome in a process of its own on a free port; yields its address. It ends when this process does."""
-    command = [sys.executable, "-m", "services.capture.simulator", json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s})]
+    command = [sys.executable, "-m", "services.capture.dome.simulator", json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s})]
     # A session of its own: Ctrl-C must reach the driver, which still needs the dome to go dark.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as process:  # noqa: S603
         assert process.stdin is not None
