@@ -3,7 +3,7 @@ r"""dentine: a capture of a person's teeth becomes a measured, renderable asset.
 One house, data walks through it once::
 
     capture -> preprocess -> fit -> export        each stage reads and writes stores (services.core.store)
-        \\________ services.api.pipeline ________/  and passes only small records (services.core.records)
+        \\________ services.pipeline.stages ________/  and passes only small records (services.core.records)
 
 Rooms, and who may enter which (import-linter keeps it, see pyproject.toml):
 

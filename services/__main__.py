@@ -141,17 +141,17 @@ def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the 
 
 def export(out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a job whose fit is published.")]) -> None:
     """Write the asset and report of a finished fit again."""
-    from services.api.pipeline import JOB_FILE
     from services.core.records import JobSpec
     from services.core.store import read_record
+    from services.pipeline.stages import JOB_FILE
 
     _run_some(("export",), read_record(out / JOB_FILE, JobSpec), out, again=True)
     print(f"report: {out / 'report.html'}")
 
 
 def _run_some(stages: Any, spec: Any, out: Path, *, again: bool) -> None:
-    from services.api.pipeline import run_stages
     from services.api.progress import ProgressView
+    from services.pipeline.stages import run_stages
     from services.run_command import cancelling_on_signals
 
     with cancelling_on_signals(out), ProgressView() as view:

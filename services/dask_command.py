@@ -39,12 +39,12 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
         """
         require_scheduler_named(context.args, os.environ)
         claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
-        _become("worker", [*_claiming(context.args, claims), "--preload", "services.api.worker_setup"], tls_folder())
+        _become("worker", [*_claiming(context.args, claims), "--preload", "services.pipeline.worker_setup"], tls_folder())
 
     @app.command("worker-health")
     def worker_health() -> None:
         """Say whether this machine's workers are connected and can work; for the health check of a container."""
-        from services.api.worker_health import main
+        from services.pipeline.worker_health import main
 
         raise typer.Exit(main())
 
@@ -77,10 +77,10 @@ def require_scheduler_named(arguments: Sequence[str], environment: Mapping[str, 
 
 
 def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], folder: Path | None) -> NoReturn:
-    from services.api.dask_tls import Certificates, scheduler_address
+    from services.pipeline.dask_tls import Certificates, scheduler_address
 
     certificates = Certificates.of(folder) if folder is not None else None
     secured = [scheduler_address(argument, certificates) for argument in arguments]
-    command = [sys.executable, "-m", "dask", part, *secured, "--preload", "services.api.close_http", *(certificates.arguments() if certificates else ())]
+    command = [sys.executable, "-m", "dask", part, *secured, "--preload", "services.pipeline.close_http", *(certificates.arguments() if certificates else ())]
     os.umask(PRIVATE)  # which what is started here inherits: a worker writes captures of people, too
     os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

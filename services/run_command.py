@@ -21,9 +21,9 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     Raises:
         typer.Exit: the fit did not converge.
     """
-    from services.api.pipeline import run_job
     from services.api.progress import ProgressView
     from services.client_commands import require_converged
+    from services.pipeline.stages import run_job
 
     require_apart(spec, out)
     with cancelling_on_signals(out), ProgressView() as view:
@@ -71,8 +71,8 @@ def require_apart(spec: JobSpec, out: Path) -> None:
 @contextmanager
 def cancelling_on_signals(out: Path) -> Iterator[None]:
     """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
-    from services.api.pipeline import request_cancel, withdraw_cancel
     from services.core.files.folders import require_folder
+    from services.pipeline.stages import request_cancel, withdraw_cancel
 
     require_folder(out, "Folder")
     asked = False

@@ -73,10 +73,10 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
 
 @contextmanager
 def _tokens(data: Path | None, default_url: Callable[[], str]) -> Iterator[Tokens]:
-    from services.api.database import open_database
     from services.api.migrations import upgrade
     from services.api.tokens import Tokens
     from services.core.settings import ServerSettings
+    from services.pipeline.database import open_database
 
     engine = open_database(default_url() if data is None else ServerSettings(data=data).database_url)
     try:

@@ -9,7 +9,6 @@ from pydantic import Field, SecretStr
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
 from services.api.bodies import Sent
-from services.api.database import MOST_ID
 from services.api.errors import SetupLinkError, UnauthenticatedError
 from services.api.guard import needs
 from services.api.problems import refusals
@@ -18,6 +17,7 @@ from services.api.setup_links import SetupLinks
 from services.api.tokens import NAME, Caller, IssuedToken, Scope, Token
 from services.core.geometry import Record
 from services.core.records import Number
+from services.pipeline.database import MOST_ID
 
 
 class TokenRequest(Record):

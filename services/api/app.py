@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from services.api.dask_tls import Certificates
-from services.api.events import EventAddress
 from services.api.jobs import Jobs
-from services.api.pipeline import DOORS, first_stage, run_job
 from services.api.runner import RunJob
-from services.api.workers import Workers
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
+from services.pipeline.dask_tls import Certificates
+from services.pipeline.event_log import EventAddress
+from services.pipeline.stages import DOORS, first_stage, run_job
+from services.pipeline.workers import Workers
 
 if TYPE_CHECKING:
     from fastapi import FastAPI

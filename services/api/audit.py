@@ -10,9 +10,9 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import metadata, writing
 from services.core.geometry import Record
 from services.core.redaction import redacted
+from services.pipeline.database import metadata, writing
 
 ID_LENGTH = 500
 """More of an artifact's path is not kept: whoever asks for it could make it long."""

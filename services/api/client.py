@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from pydantic import SecretStr
 
 from services.api.downloads import telling_lost, whole_file
-from services.api.events import JobEvent
 from services.api.exchange import RECONNECT_S, Ask, EventCursor, Exchange, Flow, Pause, Work, error_in
 from services.core.records import JobSpec
+from services.pipeline.event_log import JobEvent
 
 if TYPE_CHECKING:
     from services.api.uploader import UploadProgress, UploadResult

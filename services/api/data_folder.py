@@ -7,10 +7,10 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from services.api.database import metadata, parse_database_url, with_password_file, writing
 from services.core.errors import SettingsError
 from services.core.files.private import write_private
 from services.core.store import write_atomic
+from services.pipeline.database import metadata, parse_database_url, with_password_file, writing
 
 FILE = "folder.id"
 """In the data folder, with a number drawn when it was first used; a copy of the folder is the folder."""

@@ -15,9 +15,9 @@ from urllib.parse import quote
 from pydantic import SecretStr
 
 from services.api.errors import JobStateError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
-from services.api.events import JobEvent
 from services.core.errors import DentineError, InputError, PlatformError
 from services.core.records import JobSpec
+from services.pipeline.event_log import JobEvent
 
 if TYPE_CHECKING:
     from services.api.uploader import UploadProgress, UploadResult

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import Field
 
-from services.api.events import EventLog, JobEvent, Told
 from services.core.geometry import Record
 from services.core.stage import StageName
+from services.pipeline.event_log import EventLog, JobEvent, Told
 
 PICTURES = ("render", "photo", "residual")
 ENTRY_BYTES = 512

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import metadata
 from services.api.errors import UnknownJobError
 from services.api.lifecycle import JobState
 from services.api.owners import DEFAULT_GROUP, Viewer
 from services.core.geometry import Record
 from services.core.records import KindName
+from services.pipeline.database import metadata
 
 job_table = sql.Table(
     "job",

@@ -17,13 +17,10 @@ from services.api.captures import Captures, is_uploaded
 from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.erasure import erase, forget_listing
 from services.api.errors import JobStateError, UnknownJobError
-from services.api.events import EventAddress, JobEvent
 from services.api.job_table import JobFilter
 from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.light_limits import LightLimits
-from services.api.machine_class import machine_class
 from services.api.owners import LOCAL_VIEWER, Viewer
-from services.api.pipeline import request_cancel, stages_of
 from services.api.reading import ReadApart
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
@@ -36,6 +33,9 @@ from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
 from services.core.store import is_published
+from services.pipeline.event_log import EventAddress, JobEvent
+from services.pipeline.machine_class import machine_class
+from services.pipeline.stages import request_cancel, stages_of
 
 DAY_S = 86400.0
 MOST_RUNNING = 1000

@@ -13,12 +13,12 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from services.api.events import event_table
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
 from services.api.readiness import Readiness
 from services.api.webhook_tables import DeliveryState, delivery_table
 from services.core.stage import StageName
+from services.pipeline.event_log import event_table
 
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 STAGES: tuple[StageName, ...] = get_args(StageName)

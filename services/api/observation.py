@@ -7,7 +7,6 @@ from collections.abc import Callable
 from fastapi import FastAPI
 
 from services.api.clerks import Clerks
-from services.api.dask_tls import Certificates
 from services.api.deliveries import Deliveries
 from services.api.health_routes import build_health_router
 from services.api.jobs import Jobs
@@ -20,6 +19,7 @@ from services.api.webhook_routes import build_webhook_router
 from services.api.webhook_sender import WebhookSender
 from services.api.webhooks import Webhooks
 from services.core.settings import ServerSettings
+from services.pipeline.dask_tls import Certificates
 
 
 class Observation:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 import sqlalchemy as sql
 
 from services.api.capture_table import capture_table, unknown_capture
-from services.api.database import Query
 from services.api.job_table import deletion_table, job_table, unknown_deletion, unknown_job
 from services.core.errors import DentineError
+from services.pipeline.database import Query
 
 MAX_KNOWN = 20_000
 """Owners that are kept as they were read, as they never change; some 4 MB."""

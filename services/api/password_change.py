@@ -7,10 +7,10 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from services.api.database import open_database, parse_database_url, read_password, with_password_file
 from services.api.deployment_secrets import PASSWORD_BYTES, write_password
 from services.core.errors import PlatformError, SettingsError
 from services.core.files.private import write_private
+from services.pipeline.database import open_database, parse_database_url, read_password, with_password_file
 
 
 def change_database_password(url: str, file: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import metadata, writing
-from services.api.events import EventLog, JobEvent, event_table
 from services.api.job_size import JobSize
 from services.api.lifecycle import JobState, Trigger
 from services.core.geometry import Record
 from services.core.stage import StageName
+from services.pipeline.database import metadata, writing
+from services.pipeline.event_log import EventLog, JobEvent, event_table
 
 NEWEST = 40
 """Runs that are learned from: enough for a range, few enough to follow a machine that changes."""

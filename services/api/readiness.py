@@ -13,12 +13,12 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.admission import KEPT_FREE_BYTES
-from services.api.dask_tls import Certificates
-from services.api.database import writing
-from services.api.events import event_table
-from services.api.workers import require_scheduler
 from services.core.errors import DentineError, PlatformError, StoreError
 from services.core.geometry import Record
+from services.pipeline.dask_tls import Certificates
+from services.pipeline.database import writing
+from services.pipeline.event_log import event_table
+from services.pipeline.workers import require_scheduler
 
 PROBE_S = 1.0
 """How long the database may take to grant a write."""

@@ -17,9 +17,7 @@ from typing import Any, Self
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import Query, open_database, writing
 from services.api.errors import JobStateError
-from services.api.events import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
 from services.api.job_table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
@@ -32,6 +30,8 @@ from services.core.errors import DentineError, FencedError
 from services.core.geometry import Record
 from services.core.records import JobName, JobSpec, Verdict
 from services.core.stage import StageName
+from services.pipeline.database import Query, open_database, writing
+from services.pipeline.event_log import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
 
 KNOWN_JOBS = 1024
 """Jobs, and their options, that are kept as they were read."""

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from starlette.datastructures import Headers, MutableHeaders
 
-from services.api.logs import bind_request
 from services.api.metrics import METHODS, RequestMetrics
+from services.pipeline.logs import bind_request
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send

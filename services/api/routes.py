@@ -12,7 +12,6 @@ from services.api.answers import in_json
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
 from services.api.bodies import Sent
 from services.api.clerks import Clerks
-from services.api.database import MOST_ID
 from services.api.feed import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
 from services.api.guard import Asker, needs, require
 from services.api.job_table import JobFilter
@@ -25,6 +24,7 @@ from services.api.time_ranges import TimeRange
 from services.api.tokens import Scope
 from services.core.geometry import Record
 from services.core.records import JobName, JobSpec, KindName
+from services.pipeline.database import MOST_ID
 
 LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""

@@ -10,17 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from services.api.admission import Admission, turn
-from services.api.database import patiently
 from services.api.errors import JobStateError
-from services.api.events import EventAddress
 from services.api.lifecycle import JobState, Trigger
-from services.api.logs import log_context
-from services.api.pipeline import first_stage, request_cancel, withdraw_cancel
 from services.api.repository import Failure, Job, Lease, Repository
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 from services.core.stage import StageName
 from services.core.store import telling_disk_faults
+from services.pipeline.database import patiently
+from services.pipeline.event_log import EventAddress
+from services.pipeline.logs import log_context
+from services.pipeline.stages import first_stage, request_cancel, withdraw_cancel
 
 RunJob = Callable[[JobSpec, Path, EventAddress], object]
 """Runs a job in a folder to its end, events to the given table; raises what a stage raises."""

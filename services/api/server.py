@@ -17,10 +17,6 @@ from typing import TYPE_CHECKING
 
 from services.api.access import refuse_open_network
 from services.api.app import create_app, is_dashboard_built
-from services.api.collector import leave_alone_what_is_loaded
-from services.api.database import open_database
-from services.api.logs import configure_logs
-from services.api.pipeline import DOORS
 from services.api.runner import RunJob
 from services.api.setup_links import SetupLinks, setup_address
 from services.core.errors import PlatformError
@@ -28,6 +24,10 @@ from services.core.files.private import PRIVATE
 from services.core.redaction import redacted
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
+from services.pipeline.database import open_database
+from services.pipeline.garbage_collection import leave_alone_what_is_loaded
+from services.pipeline.logs import configure_logs
+from services.pipeline.stages import DOORS
 
 if TYPE_CHECKING:
     from types import FrameType

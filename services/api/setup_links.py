@@ -16,10 +16,10 @@ import sqlalchemy as sql
 from pydantic import SecretStr
 
 from services.api.audit import Deed
-from services.api.database import metadata, writing
 from services.api.errors import SetupLinkError
 from services.api.tokens import IssuedToken, Scope, insert_token, token_table
 from services.core.settings import ServerSettings
+from services.pipeline.database import metadata, writing
 
 LIFETIME_S = 3600.0
 """How long a link holds: long enough to find it in the log, too short to be found in an old one."""

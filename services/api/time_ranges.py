@@ -14,16 +14,16 @@ from pydantic import Field
 
 from services.api.admission import turn
 from services.api.descriptions import Describe, describe
-from services.api.events import Begun, EventLog, JobEvent
 from services.api.forecast import LEAST, Observation, foresee
 from services.api.job_size import method_of, size_of
 from services.api.lifecycle import JobState
 from services.api.past_runs import TENTHS, PastRun, tenth_of
-from services.api.pipeline import stages_of
 from services.api.repository import Job, Repository
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
+from services.pipeline.event_log import Begun, EventLog, JobEvent
+from services.pipeline.stages import stages_of
 
 SIZE_SLOPE = 0.5
 """Expected growth of a duration's logarithm with that of each size: between none and proportion."""

@@ -26,12 +26,12 @@ import sqlalchemy as sql
 from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
 from services.api.audit import Deed
-from services.api.database import Query, metadata, writing
 from services.api.ended_sessions import EndedSessions
 from services.api.errors import UnauthenticatedError, UnknownTokenError
 from services.api.owners import LOCAL_VIEWER, Viewer, owner_of_token
 from services.core.errors import InputError
 from services.core.geometry import Record
+from services.pipeline.database import Query, metadata, writing
 
 TRUSTED_S = 1.0
 """How long a server goes on trusting a token that it has looked up; one that is revoked at this server ends at once."""

@@ -13,10 +13,10 @@ import sqlalchemy as sql
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from services.api.events import event_table
 from services.api.lifecycle import JobState
 from services.core.records import Verdict
 from services.core.verdict import VERDICT
+from services.pipeline.event_log import event_table
 
 if TYPE_CHECKING:
     from services.api.repository import Job

@@ -12,9 +12,9 @@ from typing import Any
 
 import sqlalchemy as sql
 
-from services.api.events import event_table
 from services.api.lifecycle import JobState
 from services.api.webhook_tables import DeliveryState, cursor_table, delivery_table, webhook_table
+from services.pipeline.event_log import event_table
 
 DAY_S = 86_400.0
 TRY_FOR_S = DAY_S

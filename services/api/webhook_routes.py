@@ -7,12 +7,12 @@ from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
 from services.api.bodies import Sent
-from services.api.database import MOST_ID
 from services.api.deliveries import Deliveries, Delivery
 from services.api.guard import needs
 from services.api.problems import refusals
 from services.api.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
 from services.core.geometry import Record
+from services.pipeline.database import MOST_ID
 
 DeliveryId = Annotated[int, Path(ge=1, le=MOST_ID)]
 

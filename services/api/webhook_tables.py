@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import sqlalchemy as sql
 
-from services.api.database import metadata
+from services.pipeline.database import metadata
 
 webhook_table = sql.Table(
     "webhook",

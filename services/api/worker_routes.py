@@ -7,7 +7,7 @@ from services.api.guard import Asker, needs
 from services.api.problems import refusals
 from services.api.repository import Repository
 from services.api.worker_states import WorkerList, list_workers
-from services.api.workers import Workers
+from services.pipeline.workers import Workers
 
 
 def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:

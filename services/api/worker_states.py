@@ -10,15 +10,15 @@ from typing import Any, get_args
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.database import Query
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
 from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.repository import Repository
-from services.api.workers import NOT_STARTED, TOLD, Workers
 from services.core.geometry import Record
 from services.core.placement import DOME, STAGES
 from services.core.stage import StageName
+from services.pipeline.database import Query
+from services.pipeline.workers import NOT_STARTED, TOLD, Workers
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 _TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}(-.*)?")

@@ -71,7 +71,7 @@ class Cost:
 
 def fit(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int) -> tuple[JobSpec, FitReport, Cost]:
     """Fit the truth with sensor noise, on local workers."""
-    from services.api.pipeline import run_job
+    from services.pipeline.stages import run_job
 
     write_jaw_capture(folder / "capture", truth, seed=1)
     spec = JobSpec.model_validate({"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | options)

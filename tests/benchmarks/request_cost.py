@@ -19,9 +19,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from services.api.app import create_app
-from services.api.logs import configure_logs
 from services.api.tokens import Scope
 from services.core.settings import ServerSettings
+from services.pipeline.logs import configure_logs
 from tests.load.bare_server import build
 from tests.load.library import fill
 from tests.load.mix import Ask, Mix

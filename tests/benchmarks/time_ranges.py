@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from services.api.client import Client
-from services.api.machine_class import machine_class
 from services.core.records import JobSpec
+from services.pipeline.machine_class import machine_class
 from tests.support.live_server import running_server, toy_server
 from tests.support.uploading import write_capture
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import Page
 
-from services.api.events import EventAddress
 from services.core.errors import DentineError
 from services.core.records import Estimate, JobSpec, Verdict
 from services.core.stage import StageEvent
 from services.core.verdict import VERDICT
+from services.pipeline.event_log import EventAddress
 
 STEPS = 6
 

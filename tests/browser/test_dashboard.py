@@ -13,13 +13,13 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.database import sqlite_url
-from services.api.events import EventLog
 from services.api.repository import Repository
 from services.core.errors import CaptureInputError, DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
+from services.pipeline.database import sqlite_url
+from services.pipeline.event_log import EventLog
 from tests.browser.contrast import contrast_failures
 from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving

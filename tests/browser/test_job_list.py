@@ -9,11 +9,11 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.database import sqlite_url
 from services.api.lifecycle import Trigger
 from services.api.repository import Repository
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE, ServerSettings
+from services.pipeline.database import sqlite_url
 from tests.support.live_server import serving
 
 pytestmark = pytest.mark.browser

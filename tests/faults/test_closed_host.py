@@ -23,8 +23,8 @@ import pytest
 
 from services import dask_command
 from services.api.connections import Crowd
-from services.api.workers import Workers
 from services.core.settings import ConnectionLimits
+from services.pipeline.workers import Workers
 from tests.support.live_server import toy_server
 from tests.support.uploading import contents_of, upload_capture, write_capture
 

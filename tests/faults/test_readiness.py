@@ -24,11 +24,11 @@ from pydantic import SecretStr
 from services.api import readiness as readiness_module
 from services.api.admission import KEPT_FREE_BYTES
 from services.api.app import create_app
-from services.api.database import open_database, sqlite_url
 from services.api.jobs import Jobs
 from services.api.migrations import upgrade
 from services.api.readiness import Readiness
 from services.core.settings import DATABASE_FILE, ServerSettings
+from services.pipeline.database import open_database, sqlite_url
 from tests.support.live_server import serving
 from tests.support.postgres import new_database, postgres_server
 from tests.support.small_system import free_port

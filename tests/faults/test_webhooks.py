@@ -17,7 +17,6 @@ import pytest
 from standardwebhooks.webhooks import Webhook as Verifier
 
 from services.api.app import create_app
-from services.api.database import sqlite_url
 from services.api.deliveries import CLAIM_S, DISABLE_AFTER_S, KEEP_S, Attempt, Deliveries, Delivery
 from services.api.errors import JobStateError, WebhookAddressError
 from services.api.lifecycle import JobState, Trigger
@@ -28,6 +27,7 @@ from services.api.webhook_sender import FIRST_RETRY_S, WebhookSender, retry_s
 from services.api.webhooks import NewWebhook, WebhookChange, WebhookRequest, Webhooks
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.pipeline.database import sqlite_url
 from tests.support.live_server import serving
 from tests.support.receiver import Receiver, receiving, wait_until
 

@@ -15,13 +15,13 @@ from typing import Any
 import httpx
 import pytest
 
-from services.api.worker_check import fault_of
-from services.api.worker_health import Sign, require_healthy_workers
 from services.capture import stage as capture_stage
 from services.core.errors import PlatformError
 from services.core.placement import DOME, STAGES
 from services.dask_command import _claiming
 from services.fit import stage as fit_stage
+from services.pipeline.worker_check import fault_of
+from services.pipeline.worker_health import Sign, require_healthy_workers
 from services.preprocess import stage as preprocess_stage
 from tests.support.live_server import toy_server
 from tests.support.small_system import PATIENCE_S, ROOT, free_port
@@ -53,7 +53,7 @@ def process(log: Path, env: dict[str, str], *arguments: str) -> Iterator[None]:
 
 
 def worker_health(env: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "services.api.worker_health"]
+    command = [sys.executable, "-m", "services.pipeline.worker_health"]
     return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
 
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.api.database import writing
-from services.api.events import insert_event
 from services.api.lifecycle import Trigger
 from services.api.repository import Repository
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
+from services.pipeline.database import writing
+from services.pipeline.event_log import insert_event
 from tests.support.uploading import write_capture
 
 PICTURE_BYTES = 2**18

@@ -13,11 +13,11 @@ import pytest
 from httpx import Client
 
 from services.api.app import create_app
-from services.api.database import open_database, sqlite_url
-from services.api.events import EventAddress
 from services.core.errors import CaptureInputError, DentineError, DiskFullError, MemoryKillError
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE, ServerSettings
+from services.pipeline.database import open_database, sqlite_url
+from services.pipeline.event_log import EventAddress
 from tests.support.live_server import serving
 
 

@@ -16,11 +16,11 @@ import pytest
 from services.api.app import create_app
 from services.api.client import AsyncClient, Client
 from services.api.errors import JobStateError, UnknownJobError
-from services.api.events import EventAddress, JobEvent
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
+from services.pipeline.event_log import EventAddress, JobEvent
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import serving
 from tests.support.uploading import contents_of, write_capture

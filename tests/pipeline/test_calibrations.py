@@ -15,12 +15,12 @@ import pytest
 from services.api.app import create_app
 from services.api.client import Client
 from services.api.errors import UnknownCalibrationError
-from services.api.events import EventAddress
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
 from services.core.store import open_stage
+from services.pipeline.event_log import EventAddress
 from services.preprocess import stage
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth

@@ -11,9 +11,9 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.events import EventAddress
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings, UploadLimits
+from services.pipeline.event_log import EventAddress
 from tests.support.live_server import serving
 from tests.support.told_images import told_png
 from tests.support.uploading import announce, contents_of, create_upload, entry, manifest_of, patch, send, write_capture

@@ -13,9 +13,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from services.api.dask_tls import Certificates
-from services.api.workers import Workers, require_scheduler
 from services.core.errors import SchedulerLostError, SettingsError
+from services.pipeline.dask_tls import Certificates
+from services.pipeline.workers import Workers, require_scheduler
 from tests.support.certificates import certificates
 from tests.support.live_server import toy_server
 from tests.support.small_system import free_port
@@ -69,7 +69,7 @@ def await_ready(client: httpx.Client) -> None:
 @pytest.mark.slow
 @pytest.mark.attack("Dask and files as another user", "a scheduler by TLS, without a certificate")
 def test_a_job_runs_by_tls_and_strangers_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.workers.CONNECT_S", 2.0)
+    monkeypatch.setattr("services.pipeline.workers.CONNECT_S", 2.0)
     ours, theirs, address = certificates(tmp_path / "ours"), certificates(tmp_path / "theirs"), f"tcp://127.0.0.1:{free_port()}"
     with (
         part(tmp_path, ours, "scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2]),

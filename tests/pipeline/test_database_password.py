@@ -11,12 +11,12 @@ import pytest
 import sqlalchemy as sql
 from pydantic import SecretStr
 
-from services.api.database import open_database
 from services.api.jobs import Jobs
 from services.api.password_change import change_database_password
 from services.core.errors import PlatformError, SettingsError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings, read_settings
+from services.pipeline.database import open_database
 from tests.support.postgres import PostgresServer, new_database, postgres_server
 from tests.support.uploading import write_capture
 

@@ -15,7 +15,6 @@ import pytest
 
 from services.api.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, LEAST_DISK_BYTES, predict
 from services.api.job_size import size_of
-from services.api.pipeline import run_stages, stages_of
 from services.api.presets import find_preset
 from services.core.errors import CrashError, JobCancelledError, SettingsError
 from services.core.records import DEMO_MOUTH, FolderCapture, JobSpec
@@ -24,6 +23,7 @@ from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.phantom import demo as demo_mouth
 from services.phantom.stage import run as phantom
+from services.pipeline.stages import run_stages, stages_of
 from tests.support.live_server import toy_server
 from tests.support.toy_stages import DOORS
 

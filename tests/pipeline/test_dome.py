@@ -17,7 +17,6 @@ import psutil
 import pytest
 
 from services.api.app import create_app
-from services.api.events import EventAddress
 from services.api.problems import status_of
 from services.api.tokens import Scope
 from services.capture import stage
@@ -33,6 +32,7 @@ from services.core.errors import RigStoppedError, RigUnreachableError
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
 from services.core.stage import LocalContext
+from services.pipeline.event_log import EventAddress
 from tests.support.guarded_server import guarded
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth

@@ -19,14 +19,14 @@ import zarr
 from numpy.typing import NDArray
 
 from services.api.app import create_app
-from services.api.events import EventAddress
 from services.api.mask_images import picture_of
-from services.api.pipeline import StageTask, run_stages
 from services.core.errors import CaptureInputError
 from services.core.masks import is_stale, mask_path
 from services.core.records import JobSpec, MaskBit
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
+from services.pipeline.event_log import EventAddress
+from services.pipeline.stages import StageTask, run_stages
 from services.preprocess import stage
 from tests.support import toy_stages
 from tests.support.live_server import serving
@@ -46,7 +46,7 @@ class InThisProcess:
 
     def __call__(self, spec: JobSpec, folder: Path, events: EventAddress) -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("services.api.pipeline._run_tasks", self._run)
+            patch.setattr("services.pipeline.stages._run_tasks", self._run)
             run_stages(spec, folder, ("prepare", "fit", "export"), events=events, doors=toy_stages.DOORS | {"prepare": "services.preprocess.stage:run"})
 
     def _run(self, _processes: object, _count: int, tasks: list[StageTask], *_: object) -> None:

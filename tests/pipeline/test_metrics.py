@@ -11,12 +11,12 @@ from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from services.api.app import create_app
-from services.api.events import EventAddress
 from services.api.jobs import Jobs
 from services.api.metrics import build_registry
 from services.api.readiness import Readiness
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.pipeline.event_log import EventAddress
 from tests.support.live_server import serving
 from tests.support.telling_job import STEPS, tell
 

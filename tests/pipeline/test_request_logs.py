@@ -13,9 +13,9 @@ import pytest
 
 from services.api.app import create_app
 from services.api.guard import needs
-from services.api.logs import configure_logs, log_context
-from services.api.machine_class import machine_class
 from services.core.settings import ServerSettings
+from services.pipeline.logs import configure_logs, log_context
+from services.pipeline.machine_class import machine_class
 from tests.support.live_server import serving, toy_server
 
 

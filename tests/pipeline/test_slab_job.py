@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.api.pipeline import run_job, stages_of
 from services.api.presets import find_preset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
 from services.core.records import AssetManifest, JobSpec
@@ -25,6 +24,7 @@ from services.fit.slab.rig import rig_of
 from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.slab.tabphase import tabphase_values
 from services.fit.transport.platform import prepare_device
+from services.pipeline.stages import run_job, stages_of
 from tests.support.small_slab import description, write_folder
 
 TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}

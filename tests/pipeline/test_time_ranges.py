@@ -14,12 +14,12 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.events import EventAddress
 from services.api.forecast import LEAST
-from services.api.machine_class import machine_class
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent, StageName
+from services.pipeline.event_log import EventAddress
+from services.pipeline.machine_class import machine_class
 from tests.support.live_server import serving
 from tests.support.past_runs import remember_runs
 from tests.support.uploading import write_capture

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 
 from services.__main__ import build_app
 from services.api.app import create_app
-from services.api.database import open_database
-from services.api.events import EventAddress
 from services.core.records import AssetManifest, FitReport, JobSpec, Verdict
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from services.core.verdict import NOT_CONVERGED_STATUS, VERDICT, verdict_of
+from services.pipeline.database import open_database
+from services.pipeline.event_log import EventAddress
 from tests.support.live_server import serving
 
 
@@ -116,7 +116,7 @@ def test_submit_tells_it_with_its_exit_status(server: httpx.Client, tmp_path: Pa
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_run_without_a_server_tells_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: Verdict | None, status: int, as_json: bool) -> None:
     asset = AssetManifest(files=(), held_out_error=0.2, converged=judged is not BAD, verdict=judged)
-    monkeypatch.setattr("services.api.pipeline.run_job", lambda *_: asset)
+    monkeypatch.setattr("services.pipeline.stages.run_job", lambda *_: asset)
     (job := tmp_path / "JOB.toml").write_text(f'capture = "{tmp_path / "capture"}"\n')
     found, told, said = dentine("run", str(job), "--out", str(tmp_path / "out"), *(("--json",) if as_json else ()))
     assert found == status, said

@@ -14,11 +14,11 @@ from distributed import LocalCluster
 
 from services.api.app import create_app
 from services.api.client import Client
-from services.api.events import EventAddress
-from services.api.workers import Workers
 from services.core.errors import SchedulerLostError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
+from services.pipeline.event_log import EventAddress
+from services.pipeline.workers import Workers
 from tests.support.live_server import serving
 from tests.support.uploading import write_capture
 
@@ -65,7 +65,7 @@ def test_workers_tell_what_they_do(tmp_path: Path, cluster: LocalCluster) -> Non
 
 
 def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_collected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.workers.CONNECT_S", 0.1)
+    monkeypatch.setattr("services.pipeline.workers.CONNECT_S", 0.1)
     workers, frozen = Workers("tcp://127.0.0.1:1"), []
     for _ in range(3):
         with pytest.raises(SchedulerLostError):

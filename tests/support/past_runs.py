@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from services.api.database import open_database, sqlite_url, writing
 from services.api.job_size import method_of, size_of
-from services.api.machine_class import machine_class
 from services.api.past_runs import Course, past_run_table
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE
+from services.pipeline.database import open_database, sqlite_url, writing
+from services.pipeline.machine_class import machine_class
 
 
 def remember_runs(data: Path, capture: str, totals_s: Iterable[float]) -> None:

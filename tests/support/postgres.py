@@ -16,7 +16,7 @@ import psutil
 import pytest
 import sqlalchemy as sql
 
-from services.api.database import open_database
+from services.pipeline.database import open_database
 from tests.support.network import Network
 
 USER = "postgres"

@@ -33,12 +33,12 @@ _COMMANDS = ("services.__main__:build_app",)
 _WORKER = (
     *_COMMANDS,
     "services.dask_command",
-    "services.api.pipeline",
+    "services.pipeline.stages",
     "services.preprocess.stage",
     "services.fit.stage",
     "services.fit.execution.engine_host",
 )
-_WORKER += ("services.fit.transport.engine", "services.api.worker_setup", "services.api.worker_check")
+_WORKER += ("services.fit.transport.engine", "services.pipeline.worker_setup", "services.pipeline.worker_check")
 
 ROLES: Mapping[str, Role] = {
     "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.token_command", DOME_AT_THE_SERVER)),

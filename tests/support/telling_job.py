@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.api.events import EventAddress, EventLog
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
+from services.pipeline.event_log import EventAddress, EventLog
 
 PICTURE = bytes(range(64))
 STEPS = 20

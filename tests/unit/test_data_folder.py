@@ -9,10 +9,10 @@ import pytest
 from pydantic import SecretStr
 
 from services.api.data_folder import FILE
-from services.api.database import sqlite_url
 from services.api.jobs import Jobs
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings
+from services.pipeline.database import sqlite_url
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sql
 
-from services.api.database import Query, open_database, patiently, sqlite_url, writing
+from services.pipeline.database import Query, open_database, patiently, sqlite_url, writing
 
 
 def test_a_file_that_cannot_be_opened_is_an_error_that_is_waited_out(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_a_file_that_cannot_be_opened_is_an_error_that_is_waited_out(tmp_path: P
 
 
 def test_a_writer_gives_up_on_one_of_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.database.TURN_S", 0.01)
+    monkeypatch.setattr("services.pipeline.database.TURN_S", 0.01)
     engine = open_database(sqlite_url(tmp_path / "some.sqlite"))
     with writing(engine), pytest.raises(sql.exc.OperationalError, match="have not ended"), writing(engine):
         pass

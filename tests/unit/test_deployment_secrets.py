@@ -11,9 +11,9 @@ import pytest
 from cryptography import x509
 
 from services.api import deployment_secrets
-from services.api.dask_tls import Certificates
 from services.api.deployment_secrets import make_missing
 from services.core.errors import SettingsError
+from services.pipeline.dask_tls import Certificates
 
 
 def mode(path: Path) -> int:

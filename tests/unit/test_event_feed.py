@@ -15,12 +15,12 @@ import pytest
 import sqlalchemy as sql
 
 from services.api import feed
-from services.api.database import sqlite_url
 from services.api.feed import EventFeed, Turn
 from services.api.lifecycle import Trigger
 from services.api.repository import Lease, Repository
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
+from services.pipeline.database import sqlite_url
 
 STREAMS, STEPS = 40, 60
 

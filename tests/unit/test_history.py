@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.api.events import EventLog, event_table, folder_events
 from services.api.history import Histories, History, read_history
 from services.core.stage import StageEvent
+from services.pipeline.event_log import EventLog, event_table, folder_events
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ import pytest
 
 from services.api import admission
 from services.api.admission import Needs
-from services.api.database import writing
 from services.api.jobs import Jobs
 from services.api.lifecycle import JobState
 from services.api.repository import Lease
@@ -19,6 +18,7 @@ from services.core.errors import DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import CANCEL_FLAG
+from services.pipeline.database import writing
 
 
 @pytest.fixture

@@ -13,15 +13,15 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from services.api import audit, capture_table, data_folder, ended_sessions, setup_links, tokens, webhook_tables
-from services.api.database import Query, metadata, open_database, patiently, sqlite_url, writing
 from services.api.errors import JobStateError, UnknownJobError
-from services.api.events import event_table
 from services.api.job_table import JobFilter, job_table
 from services.api.lifecycle import JobState, Trigger
 from services.api.migrations import FIRST, upgrade
 from services.api.repository import Failure, Repository
 from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec
+from services.pipeline.database import Query, metadata, open_database, patiently, sqlite_url, writing
+from services.pipeline.event_log import event_table
 from tests.support.postgres import PostgresServer, new_database, postgres_server
 
 SPEC = JobSpec(capture=Path("/mouth"))
@@ -256,7 +256,7 @@ def test_other_databases_are_refused_by_name(bad: str) -> None:
 
 
 def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.database.POSTGRES_SILENCE_S", 1)
+    monkeypatch.setattr("services.pipeline.database.POSTGRES_SILENCE_S", 1)
     silent, other = open_database(server.url("postgres")), open_database(server.url("postgres"))
     tries: list[int] = []
 
@@ -275,7 +275,7 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: Postg
 
 
 def test_writers_of_one_process_take_turns_before_they_ask_sqlite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.database.BUSY_MS", 0)  # so that whoever asks out of turn is refused at once
+    monkeypatch.setattr("services.pipeline.database.BUSY_MS", 0)  # so that whoever asks out of turn is refused at once
     engine = open_database(sqlite_url(tmp_path / "jobs.sqlite"))
     upgrade(engine)
     written: list[bool] = []

@@ -15,11 +15,11 @@ import pytest
 from starlette.requests import HTTPConnection
 
 from services.api.access import Access
-from services.api.database import open_database
 from services.api.sessions import Sessions
 from services.api.tokens import Scope, Tokens
 from services.api.webhook_address import AddressPolicy
 from services.core.settings import ServerSettings
+from services.pipeline.database import open_database
 from tests.support.guarded_server import make_token
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from services.api.database import writing
 from services.core.errors import PlatformError
+from services.pipeline.database import writing
 
 FIRST = "0001"
 """The tables that databases had before they were numbered."""

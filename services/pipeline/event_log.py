@@ -21,10 +21,10 @@ import sqlalchemy as sql
 from pydantic import Field
 from pydantic_core import from_json
 
-from services.api.database import Query, metadata, open_database, sqlite_url, writing
 from services.core.errors import FencedError
 from services.core.geometry import Record
 from services.core.stage import StageEvent, StageName
+from services.pipeline.database import Query, metadata, open_database, sqlite_url, writing
 
 PAGE = 1000
 """Events read at once."""

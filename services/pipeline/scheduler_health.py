@@ -1,4 +1,4 @@
-"""``python -m services.api.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a container's health check.
+"""``python -m services.pipeline.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a container's health check.
 
 A program of its own, as it is started every few seconds: it loads a tenth of what the ``dentine`` command does.
 """
@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from services.api.dask_tls import Certificates
-from services.api.workers import require_scheduler
 from services.core.errors import DentineError
+from services.pipeline.dask_tls import Certificates
+from services.pipeline.workers import require_scheduler
 
 
 def main(address: str, tls: str | None = None) -> int:

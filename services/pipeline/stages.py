@@ -26,10 +26,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from services.api.database import patiently
-from services.api.events import EventAddress, EventLog, JobEvent, folder_events
-from services.api.machine_class import machine_class
-from services.api.workers import Workers
 from services.core.errors import CorruptStoreError, InputError, JobCancelledError, MissingStageError, PlatformError, SchedulerLostError, WorkerLostError
 from services.core.job_kinds import JOB_KINDS
 from services.core.masks import is_stale
@@ -37,6 +33,10 @@ from services.core.placement import DOME, STAGES, rank
 from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
+from services.pipeline.database import patiently
+from services.pipeline.event_log import EventAddress, EventLog, JobEvent, folder_events
+from services.pipeline.machine_class import machine_class
+from services.pipeline.workers import Workers
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -199,7 +199,7 @@ class StageTask:
         """The worker's log lines, or silence."""
         if not self.is_logged:
             return nullcontext(lambda _event: None)
-        from services.api.logs import stage_logs
+        from services.pipeline.logs import stage_logs
 
         return stage_logs(self.stage, attempt, self.events)
 

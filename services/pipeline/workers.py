@@ -11,12 +11,12 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
-from services.api.collector import leave_alone_what_is_loaded
-from services.api.dask_tls import Certificates, scheduler_address
-from services.api.worker_check import OwnCheck
 from services.core.dask_config import DASK_CONFIG
 from services.core.errors import PlatformError, SchedulerLostError
 from services.core.placement import DOME, STAGES, UNLIMITED
+from services.pipeline.dask_tls import Certificates, scheduler_address
+from services.pipeline.garbage_collection import leave_alone_what_is_loaded
+from services.pipeline.worker_check import OwnCheck
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 SIGINT_IS_THE_PARENTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-CLOSE_HTTP = "services.api.close_http"
+CLOSE_HTTP = "services.pipeline.close_http"
 CONNECT_S = 10.0
 PROBE_S = 1.0
 LOOK_S = 3.0

@@ -16,7 +16,7 @@ from services.core.errors import DentineError
 from services.core.stage import StageEvent, StageName
 
 if TYPE_CHECKING:
-    from services.api.events import EventAddress
+    from services.pipeline.event_log import EventAddress
 
 
 def configure_logs(stream: TextIO) -> None:

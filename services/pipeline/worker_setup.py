@@ -1,4 +1,4 @@
-"""What ``dentine worker`` loads into each of its Dask workers (``--preload services.api.worker_setup``).
+"""What ``dentine worker`` loads into each of its Dask workers (``--preload services.pipeline.worker_setup``).
 
 A worker claims what it can do by Dask resources (``services.core.placement``). Before it takes tasks each claim is checked by
 a process of its own; what the machine does not bear out is withdrawn and told, in the log and to the scheduler, and no task
@@ -14,9 +14,9 @@ from typing import Any
 from distributed import WorkerPlugin
 from tornado.ioloop import PeriodicCallback
 
-from services.api.worker_check import CHECKS, fault_of
-from services.api.worker_health import SIGN_S, Sign
-from services.api.workers import TOLD
+from services.pipeline.worker_check import CHECKS, fault_of
+from services.pipeline.worker_health import SIGN_S, Sign
+from services.pipeline.workers import TOLD
 
 
 async def dask_setup(worker: Any) -> None:

@@ -1,7 +1,7 @@
 """Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads them.
 
 Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this
-machine's worker that works. ``python -m services.api.worker_health`` says the same and imports nothing large.
+machine's worker that works. ``python -m services.pipeline.worker_health`` says the same and imports nothing large.
 """
 
 from __future__ import annotations

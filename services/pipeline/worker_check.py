@@ -1,6 +1,6 @@
 """Whether a machine can do what a worker claims: imports what the stages need and renders a pixel, in a process of its own.
 
-``python -m services.api.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one sentence.
+``python -m services.pipeline.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one sentence.
 What breaks an interpreter, such as a library that aborts it, so breaks no worker.
 """
 
@@ -29,7 +29,7 @@ CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
     """The sentence that says why this machine cannot do what is claimed; empty if it can. Waits for a process."""
-    command = [sys.executable, "-m", "services.api.worker_check", *claims]
+    command = [sys.executable, "-m", "services.pipeline.worker_check", *claims]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
     except subprocess.TimeoutExpired:
