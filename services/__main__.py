@@ -150,7 +150,7 @@ def export(out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a 
 
 
 def _run_some(stages: Any, spec: Any, out: Path, *, again: bool) -> None:
-    from services.api.progress import ProgressView
+    from services.client.progress import ProgressView
     from services.pipeline.stages import run_stages
     from services.run_command import cancelling_on_signals
 

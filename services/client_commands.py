@@ -14,7 +14,7 @@ import typer
 from services.core.errors import InputError, JobCancelledError
 
 if TYPE_CHECKING:
-    from services.api.client import Client
+    from services.client.client import Client
     from services.core.records import Verdict
     from services.core.settings import Settings
 
@@ -30,7 +30,7 @@ def add_client_commands(app: typer.Typer, read: Callable[[], Settings]) -> None:
     """Add the commands; ``read`` gives the settings."""
 
     def connect(server: str | None) -> Client:
-        from services.api.client import Client
+        from services.client.client import Client
 
         settings = read()
         return Client(server or f"http://{settings.server.host}:{settings.server.port}", settings.client.token)
@@ -171,7 +171,7 @@ def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
     Raises:
         JobCancelledError: it was. typer.Exit: it failed, with the status of its own, or its fit did not converge.
     """
-    from services.api.progress import ProgressView
+    from services.client.progress import ProgressView
 
     with ProgressView(lambda: client.get(job_id)["remaining"]) as view:
         for event in client.events(job_id):

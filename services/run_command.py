@@ -21,7 +21,7 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     Raises:
         typer.Exit: the fit did not converge.
     """
-    from services.api.progress import ProgressView
+    from services.client.progress import ProgressView
     from services.client_commands import require_converged
     from services.pipeline.stages import run_job
 

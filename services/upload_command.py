@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from services.api.client import Client
-    from services.api.uploader import UploadResult
+    from services.client.client import Client
+    from services.client.uploader import UploadResult
     from services.core.records import JobSpec
 
 
 def upload_folder(client: Client, folder: Path, subject: str | None = None) -> UploadResult:
     """Upload a folder with its progress on standard error."""
-    from services.api.upload_progress import UploadView
+    from services.client.upload_progress import UploadView
 
     with UploadView() as view:
         uploaded = client.upload(folder, view, subject)

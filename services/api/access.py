@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from services.api.audit import AuditLog
 from services.api.clerks import Clerks
-from services.api.errors import UnauthenticatedError
 from services.api.sessions import COOKIE, Sessions, read_key
 from services.api.tokens import LOCAL, Caller, Tokens
+from services.client.errors import UnauthenticatedError
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings
 

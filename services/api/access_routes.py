@@ -9,12 +9,12 @@ from pydantic import Field, SecretStr
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
 from services.api.bodies import Sent
-from services.api.errors import SetupLinkError, UnauthenticatedError
 from services.api.guard import needs
 from services.api.problems import refusals
 from services.api.sessions import COOKIE, Sessions
 from services.api.setup_links import SetupLinks
 from services.api.tokens import NAME, Caller, IssuedToken, Scope, Token
+from services.client.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
 from services.core.records import Number
 from services.pipeline.database import MOST_ID

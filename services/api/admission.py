@@ -17,8 +17,8 @@ from pathlib import Path
 
 import psutil
 
-from services.api.errors import JobTooLargeError
 from services.api.repository import Job
+from services.client.errors import JobTooLargeError
 from services.core.errors import DentineError, DiskFullError, StoreError
 from services.core.placement import rank
 from services.core.records import JobSpec

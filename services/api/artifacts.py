@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from services.api.errors import RangeError, UnknownJobError
 from services.api.problems import refusals, response_of
+from services.client.errors import RangeError, UnknownJobError
 from services.core.geometry import Record
 from services.core.stage import CANCEL_FLAG
 

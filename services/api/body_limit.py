@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from starlette.responses import Response
 
-from services.api.errors import BodyTooLargeError
 from services.api.problems import MEDIA_TYPE, Problem, response_of
+from services.client.errors import BodyTooLargeError
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send

@@ -20,11 +20,11 @@ from pathlib import Path
 
 from pydantic import Field
 
-from services.api.errors import CalibrationTakenError, UnknownCalibrationError
-from services.api.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
+from services.client.errors import CalibrationTakenError, UnknownCalibrationError
 from services.core.calibration import Calibration, require_consistent
 from services.core.errors import SettingsError
 from services.core.geometry import Record
+from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
 from services.core.store import read_record, write_atomic, write_record
 

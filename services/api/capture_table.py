@@ -9,10 +9,10 @@ from typing import Any
 
 import sqlalchemy as sql
 
-from services.api.capture_records import Capture, CaptureState, ManifestFile, UploadManifest
-from services.api.errors import CaptureStateError, UnknownCaptureError
 from services.api.job_table import job_table
-from services.api.owners import DEFAULT_GROUP
+from services.client.capture_records import Capture, CaptureState, ManifestFile, UploadManifest
+from services.client.errors import CaptureStateError, UnknownCaptureError
+from services.core.owners import DEFAULT_GROUP
 from services.pipeline.database import metadata, writing
 
 capture_table = sql.Table(

@@ -19,16 +19,16 @@ from pathlib import Path, PurePosixPath
 import sqlalchemy as sql
 
 from services.api.blobs import Blobs, Write, sync_folders
-from services.api.capture_paths import TEXTS, require_paths
-from services.api.capture_records import CaptureDetail, CaptureFile, CapturePage, CaptureState, FileFault, UploadManifest
 from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
 from services.api.descriptions import CaptureReader, ReadHere
-from services.api.errors import CaptureStateError, CorruptUploadError, LockedError, TooLargeError, UnknownCaptureError
-from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.uploads import Uploads, upload_path
+from services.client.capture_paths import TEXTS, require_paths
+from services.client.capture_records import CaptureDetail, CaptureFile, CapturePage, CaptureState, FileFault, UploadManifest
+from services.client.errors import CaptureStateError, CorruptUploadError, LockedError, TooLargeError, UnknownCaptureError
 from services.core.calibration import Calibration
 from services.core.errors import DiskFullError, SettingsError
+from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
 from services.core.settings import UploadLimits
 

@@ -12,13 +12,13 @@ from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.api.bodies import Sent
-from services.api.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.api.captures import Captures
-from services.api.errors import IncompleteCaptureError
 from services.api.guard import Asker, needs
 from services.api.problems import MEDIA_TYPE, Problem, refusals
 from services.api.threads import in_thread
 from services.api.tus_routes import build_tus_router
+from services.client.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
+from services.client.errors import IncompleteCaptureError
 from services.pipeline.database import MOST_ID
 
 SWEEP_S = 600.0

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from services.api.errors import LockedError
+from services.client.errors import LockedError
 
 
 class Claims:

@@ -15,10 +15,10 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.errors import UnknownWebhookError
 from services.api.webhook_outbox import DAY_S, TRY_FOR_S, collect_changes, has_news, insert_delivery, message_body
 from services.api.webhook_tables import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.api.webhooks import find_webhook, switch_off
+from services.client.errors import UnknownWebhookError
 from services.core.geometry import Record
 from services.pipeline.database import writing
 

@@ -12,9 +12,9 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.dome_process import DomeProcess
-from services.api.errors import UnknownDomeError
 from services.api.jobs import Jobs
 from services.api.light_limits import LightLimits
+from services.client.errors import UnknownDomeError
 from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError
 from services.core.geometry import Record

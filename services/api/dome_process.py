@@ -12,7 +12,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
-from services.api.errors import error_of
+from services.client.errors import error_of
 from services.core.dome import DomeAnswer, DomeCommand
 from services.core.errors import DentineError, PlatformError, RigError
 from services.core.settings import DomeSettings

@@ -16,9 +16,9 @@ import sqlalchemy as sql
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
-from services.api.errors import UnknownJobError
 from services.api.lifecycle import JobState
 from services.api.repository import Repository
+from services.client.errors import UnknownJobError
 
 PERIOD_S = 0.2
 PING_S = 15.0

@@ -17,7 +17,6 @@ from starlette.responses import Response
 from services.api.access import Access
 from services.api.audit import AuditLog, Deed
 from services.api.clerks import Clerks
-from services.api.errors import RateError, ScopeError, UnauthenticatedError
 from services.api.guard import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
 from services.api.ownership import Ownership
 from services.api.problems import MEDIA_TYPE, Problem, database_lost, response_of
@@ -25,6 +24,7 @@ from services.api.rates import Rates, network_of
 from services.api.requests import method_of
 from services.api.shield import SAFE_METHODS
 from services.api.tokens import Caller, public_id
+from services.client.errors import RateError, ScopeError, UnauthenticatedError
 from services.core.errors import PlatformError
 
 if TYPE_CHECKING:

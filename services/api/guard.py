@@ -12,9 +12,9 @@ from fastapi.routing import iter_route_contexts
 from fastapi.security import HTTPBearer
 from starlette.routing import Mount
 
-from services.api.errors import ScopeError
-from services.api.owners import Viewer
 from services.api.tokens import Caller, Scope
+from services.client.errors import ScopeError
+from services.core.owners import Viewer
 
 if TYPE_CHECKING:
     from starlette.routing import BaseRoute

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.errors import UnknownJobError
 from services.api.lifecycle import JobState
-from services.api.owners import DEFAULT_GROUP, Viewer
+from services.client.errors import UnknownJobError
 from services.core.geometry import Record
+from services.core.owners import DEFAULT_GROUP, Viewer
 from services.core.records import KindName
 from services.pipeline.database import metadata
 

@@ -16,19 +16,19 @@ from services.api.calibrations import Calibrations, is_stored
 from services.api.captures import Captures, is_uploaded
 from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.erasure import erase, forget_listing
-from services.api.errors import JobStateError, UnknownJobError
 from services.api.job_table import JobFilter
 from services.api.lifecycle import Instruction, JobState, Trigger
 from services.api.light_limits import LightLimits
-from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.reading import ReadApart
 from services.api.repository import Creation, Deletion, Job, Repository
 from services.api.runner import RunJob, Runner
 from services.api.server_paths import ServerPaths
 from services.api.time_ranges import TimeRange, TimeRanges
+from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import SettingsError, StoreError
 from services.core.geometry import Record
 from services.core.masks import is_stale
+from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName

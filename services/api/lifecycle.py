@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 
-from services.api.errors import JobStateError
+from services.client.errors import JobStateError
 
 
 class JobState(StrEnum):

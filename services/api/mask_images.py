@@ -6,7 +6,7 @@ import struct
 import zlib
 from typing import TYPE_CHECKING
 
-from services.api.errors import MaskError
+from services.client.errors import MaskError
 from services.core.files.image_headers import PNG_SIGNATURE, PngHeader, png_header
 from services.core.geometry import Camera
 

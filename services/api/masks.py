@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from services.api.errors import JobStateError, UnknownMaskError
 from services.api.jobs import Jobs
 from services.api.lifecycle import JobState
 from services.api.mask_images import picture_of, require_mask
 from services.api.repository import Job
+from services.client.errors import JobStateError, UnknownMaskError
 from services.core.calibration import Calibration
 from services.core.files.image_metadata import plain_png
 from services.core.geometry import Camera, Record

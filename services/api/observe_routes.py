@@ -10,12 +10,12 @@ from services.api.answers import JSON, in_json
 from services.api.archive import stream_zip
 from services.api.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
 from services.api.clerks import Clerks
-from services.api.errors import UnknownJobError
 from services.api.guard import needs
 from services.api.history import Histories, History, LogPage, PreviewPage, read_log, read_previews
 from services.api.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
 from services.api.problems import refusals
+from services.client.errors import UnknownJobError
 from services.core.stage import StageName
 from services.pipeline.database import MOST_ID
 from services.pipeline.event_log import EventLog

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from pydantic import Field
 
-from services.api.errors import (
+from services.client.errors import (
     BodyTooLargeError,
     CalibrationTakenError,
     CaptureStateError,

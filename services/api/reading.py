@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from services.api.descriptions import MAX_DESCRIPTION_BYTES, Described
-from services.api.errors import error_of
+from services.client.errors import error_of
 from services.core.errors import CaptureInputError, DentineError, PlatformError
 from services.core.settings import UploadLimits
 

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from starlette.requests import ClientDisconnect
 
 from services.api.blobs import PartialFile
-from services.api.errors import ChecksumError, TooLargeError
 from services.api.threads import in_thread
-from services.api.tus import Checksum
 from services.api.uploads import Upload, Uploads
+from services.client.errors import ChecksumError, TooLargeError
+from services.client.tus import Checksum
 from services.core.errors import DentineError, DiskFullError
 
 BLOCK_BYTES = 2**20

@@ -17,17 +17,17 @@ from typing import Any, Self
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.errors import JobStateError
 from services.api.job_table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.lifecycle import JobState, Transition, Trigger, apply
 from services.api.migrations import upgrade
-from services.api.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.api.past_runs import PastRuns, past_run_table
 from services.api.server_paths import without_folders
 from services.api.verdicts import Verdicts
 from services.api.webhook_outbox import collect_changes
+from services.client.errors import JobStateError
 from services.core.errors import DentineError, FencedError
 from services.core.geometry import Record
+from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
 from services.core.records import JobName, JobSpec, Verdict
 from services.core.stage import StageName
 from services.pipeline.database import Query, open_database, writing

@@ -17,12 +17,12 @@ from services.api.guard import Asker, needs, require
 from services.api.job_table import JobFilter
 from services.api.jobs import Jobs, StageProgress
 from services.api.lifecycle import JobState
-from services.api.owners import Viewer
 from services.api.problems import refusals
 from services.api.repository import Deletion, Job
 from services.api.time_ranges import TimeRange
 from services.api.tokens import Scope
 from services.core.geometry import Record
+from services.core.owners import Viewer
 from services.core.records import JobName, JobSpec, KindName
 from services.pipeline.database import MOST_ID
 

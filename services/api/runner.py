@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from services.api.admission import Admission, turn
-from services.api.errors import JobStateError
 from services.api.lifecycle import JobState, Trigger
 from services.api.repository import Failure, Job, Lease, Repository
+from services.client.errors import JobStateError
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec
 from services.core.stage import StageName

@@ -18,8 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.api.errors import UnauthenticatedError
 from services.api.tokens import Token
+from services.client.errors import UnauthenticatedError
 from services.core.files.private import write_private
 
 COOKIE = "dentine-session"

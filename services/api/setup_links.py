@@ -16,8 +16,8 @@ import sqlalchemy as sql
 from pydantic import SecretStr
 
 from services.api.audit import Deed
-from services.api.errors import SetupLinkError
 from services.api.tokens import IssuedToken, Scope, insert_token, token_table
+from services.client.errors import SetupLinkError
 from services.core.settings import ServerSettings
 from services.pipeline.database import metadata, writing
 

@@ -27,10 +27,10 @@ from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
 from services.api.audit import Deed
 from services.api.ended_sessions import EndedSessions
-from services.api.errors import UnauthenticatedError, UnknownTokenError
-from services.api.owners import LOCAL_VIEWER, Viewer, owner_of_token
+from services.client.errors import UnauthenticatedError, UnknownTokenError
 from services.core.errors import InputError
 from services.core.geometry import Record
+from services.core.owners import LOCAL_VIEWER, Viewer, owner_of_token
 from services.pipeline.database import Query, metadata, writing
 
 TRUSTED_S = 1.0

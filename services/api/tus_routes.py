@@ -9,12 +9,12 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
-from services.api import tus
-from services.api.errors import UploadError
 from services.api.guard import Asker, needs
 from services.api.problems import refusals
 from services.api.receiving import SilenceError, receive
 from services.api.uploads import Upload, Uploads, upload_path
+from services.client import tus
+from services.client.errors import UploadError
 from services.pipeline.database import MOST_ID
 
 FileNumber = Annotated[int, Path(ge=0, le=MOST_ID, description="number of the file in the capture's manifest, from 0")]

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from services.api.blobs import Blobs, PartialFile
-from services.api.capture_records import CaptureState
 from services.api.capture_table import CaptureTable, FileRow, unknown_capture
 from services.api.claims import Claims
-from services.api.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
-from services.api.owners import LOCAL_VIEWER, Viewer
+from services.client.capture_records import CaptureState
+from services.client.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
+from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.settings import UploadLimits
 
 

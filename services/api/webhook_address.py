@@ -12,7 +12,7 @@ from functools import partial
 
 import httpx
 
-from services.api.errors import WebhookAddressError
+from services.client.errors import WebhookAddressError
 
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 

@@ -17,10 +17,10 @@ import httpx
 import sqlalchemy as sql
 
 from services.api.deliveries import Attempt, Claim, Deliveries
-from services.api.errors import WebhookAddressError
 from services.api.threads import in_thread
 from services.api.webhook_address import AddressPolicy
 from services.api.webhooks import KEY_PREFIX
+from services.client.errors import WebhookAddressError
 
 PERIOD_S = 0.5
 MOST_AT_ONCE = 16

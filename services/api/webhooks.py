@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.errors import JobStateError, UnknownWebhookError
 from services.api.lifecycle import JobState
 from services.api.webhook_address import AddressPolicy
 from services.api.webhook_outbox import collect_changes, states_of
 from services.api.webhook_tables import DeliveryState, attempt_table, delivery_table, webhook_table
+from services.client.errors import JobStateError, UnknownWebhookError
 from services.core.geometry import Record
 from services.pipeline.database import writing
 from services.pipeline.event_log import event_table

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from services.api.job_table import job_table
 from services.api.lifecycle import JobState
-from services.api.owners import LOCAL_VIEWER, Viewer
 from services.api.repository import Repository
 from services.core.geometry import Record
+from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.placement import DOME, STAGES
 from services.core.stage import StageName
 from services.pipeline.database import Query

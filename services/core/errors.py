@@ -1,4 +1,4 @@
-"""The exception tree: what more than one room raises. What the service alone raises is in ``services.api.errors``.
+"""The exception tree: what more than one room raises. What the service alone raises is in ``services.client.errors``.
 
 ::
 

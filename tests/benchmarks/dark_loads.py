@@ -73,7 +73,7 @@ def upload(address: str) -> None:
 
 
 def _send(client: httpx.Client, capture: str, number: int, path: str, body: bytes) -> None:
-    from services.api.tus import CHUNK_TYPE, VERSION, format_metadata
+    from services.client.tus import CHUNK_TYPE, VERSION, format_metadata
 
     metadata = format_metadata({"capture": capture, "path": path})
     client.post("/v1/uploads", headers={"Tus-Resumable": VERSION, "Upload-Length": str(len(body)), "Upload-Metadata": metadata})

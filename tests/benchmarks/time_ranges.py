@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from services.api.client import Client
+from services.client.client import Client
 from services.core.records import JobSpec
 from services.pipeline.machine_class import machine_class
 from tests.support.live_server import running_server, toy_server

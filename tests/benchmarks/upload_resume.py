@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from services.api.client import Client
+from services.client.client import Client
 from services.upload_command import upload_folder
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import toy_server

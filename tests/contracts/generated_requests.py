@@ -34,10 +34,10 @@ from schemathesis import Case, GenerationMode, Response
 from schemathesis.core.failures import FailureGroup
 from schemathesis.specs.openapi import checks
 
-from services.api.errors import error_of
 from services.api.problems import MEDIA_TYPE, Problem
 from services.api.tokens import Scope
-from services.api.tus import CHUNK_TYPE
+from services.client.errors import error_of
+from services.client.tus import CHUNK_TYPE
 from tests.contracts.living import Living
 from tests.contracts.witnesses import finish_job, leave_witnesses
 from tests.support.guarded_server import make_token

@@ -15,7 +15,7 @@ from schemathesis.core.parameters import ParameterLocation
 
 from services.api.mask_images import picture_of
 from services.api.presets import list_presets
-from services.api.tus import CHUNK_TYPE, format_metadata
+from services.client.tus import CHUNK_TYPE, format_metadata
 from services.core.geometry import Camera
 from tests.contracts.witnesses import Witnesses
 from tests.support.uploading import CAMERA, TUS, checksum, manifest_of

@@ -15,8 +15,8 @@ import httpx
 import numpy as np
 import pytest
 
-from services.api.capture_records import UploadManifest
 from services.api.captures import Captures
+from services.client.capture_records import UploadManifest
 from services.core.settings import UploadLimits
 from tests.support.live_server import toy_server
 from tests.support.uploading import announce, contents_of, create_upload, manifest_of, offset_of, patch, upgraded, write_capture

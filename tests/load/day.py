@@ -18,7 +18,7 @@ from typing import Any
 import aiohttp
 import numpy as np
 
-from services.api.client import Client
+from services.client.client import Client
 from services.core.errors import PlatformError
 from tests.load.library import Library, fill
 from tests.load.mix import Ask, Mix

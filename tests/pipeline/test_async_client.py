@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from services.api.app import create_app
-from services.api.client import AsyncClient, Client
-from services.api.errors import JobStateError, UnknownJobError
+from services.client.client import AsyncClient, Client
+from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -116,7 +116,7 @@ def test_several_jobs_are_followed_at_once(server: httpx.Client, job: Telling) -
 def test_events_survive_a_cut_connection_without_loss_or_repetition(
     server: httpx.Client, job: Telling, monkeypatch: pytest.MonkeyPatch, *, is_async: bool
 ) -> None:
-    monkeypatch.setattr("services.api.client.RECONNECT_S", 0.01)
+    monkeypatch.setattr("services.client.client.RECONNECT_S", 0.01)
     job.ends.set()
     created = server.post("/v1/jobs", json={"capture": "/"}).json()["id"]
 

@@ -13,8 +13,8 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.client import Client
-from services.api.errors import UnknownCalibrationError
+from services.client.client import Client
+from services.client.errors import UnknownCalibrationError
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec, PreparedManifest
 from services.core.settings import ServerSettings

@@ -161,7 +161,7 @@ def test_malformed_metadata_is_refused(client: httpx.Client, metadata: str) -> N
 
 
 def test_only_files_of_the_manifest_are_taken(client: httpx.Client) -> None:
-    from services.api.tus import format_metadata
+    from services.client.tus import format_metadata
 
     capture = announce(client, CONTENTS)["id"]
     other = client.post("/v1/uploads", headers=TUS | {"Upload-Length": "1", "Upload-Metadata": format_metadata({"capture": capture, "path": "b.npy"})})

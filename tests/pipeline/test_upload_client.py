@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from services.api.app import create_app
-from services.api.client import Client
-from services.api.errors import CorruptUploadError, IncompleteCaptureError, TooLargeError, UploadError
-from services.api.uploader import CHUNK_BYTES, Uploader, UploadProgress
+from services.client.client import Client
+from services.client.errors import CorruptUploadError, IncompleteCaptureError, TooLargeError, UploadError
+from services.client.uploader import CHUNK_BYTES, Uploader, UploadProgress
 from services.core.errors import CaptureInputError, DiskFullError, PlatformError
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.cutting_proxy import cutting
@@ -129,7 +129,7 @@ def test_a_file_that_changes_meanwhile_is_refused_by_name(server: httpx.Client, 
 
 
 def test_an_error_of_the_tree_is_found_by_its_code() -> None:
-    from services.api.exchange import error_in
+    from services.client.requests import error_in
 
     answer = httpx.Response(507, json={"detail": "The disk is full.", "code": "disk-full"})
     assert type(error_in(answer)) is DiskFullError

@@ -13,7 +13,7 @@ from distributed import Client as Dask
 from distributed import LocalCluster
 
 from services.api.app import create_app
-from services.api.client import Client
+from services.client.client import Client
 from services.core.errors import SchedulerLostError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

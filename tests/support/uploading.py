@@ -13,7 +13,7 @@ import numpy as np
 import sqlalchemy as sql
 
 from services.api.migrations import upgrade
-from services.api.tus import CHUNK_TYPE, VERSION, format_metadata
+from services.client.tus import CHUNK_TYPE, VERSION, format_metadata
 from services.pipeline.database import open_database, sqlite_url
 
 CAMERA = {"name": "c0", "size": [8, 6], "K": [[10, 0, 4], [0, 10, 3], [0, 0, 1]], "camera_from_world": np.eye(4).tolist()}

@@ -12,10 +12,10 @@ import sqlalchemy as sql
 
 from services.api import sessions, tokens
 from services.api.audit import AuditLog
-from services.api.errors import UnauthenticatedError, UnknownTokenError
 from services.api.migrations import upgrade
 from services.api.sessions import Sessions, read_key
 from services.api.tokens import DAY_S, LAST_USE_STEP_S, Caller, Scope, Tokens, token_table
+from services.client.errors import UnauthenticatedError, UnknownTokenError
 from services.core.errors import InputError
 from services.core.redaction import redacted
 from services.pipeline.database import open_database, sqlite_url

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.api.capture_paths import MOST_PARTS, MOST_PATH_BYTES, path_fault, require_paths
-from services.api.errors import UploadError
+from services.client.capture_paths import MOST_PARTS, MOST_PATH_BYTES, path_fault, require_paths
+from services.client.errors import UploadError
 
 names = st.text(st.sampled_from(["a", "B", "ß", "é", "\u0301", ".", " ", "/", "\\", "\0", "\n", "\u202e", "\u2028", "~", "c", "0"]), max_size=8)
 any_path = st.one_of(

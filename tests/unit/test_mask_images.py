@@ -9,8 +9,8 @@ import zlib
 import numpy as np
 import pytest
 
-from services.api.errors import MaskError
 from services.api.mask_images import require_mask
+from services.client.errors import MaskError
 from services.core.files.image_headers import PNG_SIGNATURE
 from services.core.geometry import Camera
 

@@ -13,11 +13,11 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 from services.api import audit, capture_table, data_folder, ended_sessions, setup_links, tokens, webhook_tables
-from services.api.errors import JobStateError, UnknownJobError
 from services.api.job_table import JobFilter, job_table
 from services.api.lifecycle import JobState, Trigger
 from services.api.migrations import FIRST, upgrade
 from services.api.repository import Failure, Repository
+from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec
 from services.pipeline.database import Query, metadata, open_database, patiently, sqlite_url, writing

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.api.errors import WebhookAddressError
 from services.api.webhook_address import AddressPolicy, is_public
+from services.client.errors import WebhookAddressError
 
 STRICT, PRIVATE = AddressPolicy(), AddressPolicy(allow_private=True)
 HIDDEN = (

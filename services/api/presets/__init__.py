@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import Field
 
-from services.api.errors import UnknownPresetError
+from services.client.errors import UnknownPresetError
 from services.core.geometry import Record
 
 

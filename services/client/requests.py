@@ -14,13 +14,13 @@ from urllib.parse import quote
 
 from pydantic import SecretStr
 
-from services.api.errors import JobStateError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
+from services.client.errors import JobStateError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
 from services.core.errors import DentineError, InputError, PlatformError
 from services.core.records import JobSpec
 from services.pipeline.event_log import JobEvent
 
 if TYPE_CHECKING:
-    from services.api.uploader import UploadProgress, UploadResult
+    from services.client.uploader import UploadProgress, UploadResult
 
 R = TypeVar("R")
 RECONNECT_S = 1.0
@@ -93,7 +93,7 @@ class Exchange:
 
     def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> Flow[UploadResult]:
         """Upload a folder capture and commit it."""
-        from services.api.uploader import Uploader
+        from services.client.uploader import Uploader
 
         return Uploader(self.server, progress).upload(folder, subject)
 

@@ -6,7 +6,7 @@ import sys
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from services.api.uploader import UploadProgress
+from services.client.uploader import UploadProgress
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from services.api.errors import UploadError
+from services.client.errors import UploadError
 
 MOST_PATH_BYTES = 240
 MOST_PARTS = 12

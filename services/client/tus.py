@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from email.utils import formatdate
 from types import MappingProxyType
 
-from services.api.errors import UploadError
+from services.client.errors import UploadError
 
 VERSION = "1.0.0"
 EXTENSIONS = "creation,termination,expiration,checksum"

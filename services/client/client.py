@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from pydantic import SecretStr
 
-from services.api.downloads import telling_lost, whole_file
-from services.api.exchange import RECONNECT_S, Ask, EventCursor, Exchange, Flow, Pause, Work, error_in
+from services.client.downloads import telling_lost, whole_file
+from services.client.requests import RECONNECT_S, Ask, EventCursor, Exchange, Flow, Pause, Work, error_in
 from services.core.records import JobSpec
 from services.pipeline.event_log import JobEvent
 
 if TYPE_CHECKING:
-    from services.api.uploader import UploadProgress, UploadResult
+    from services.client.uploader import UploadProgress, UploadResult
 
 R = TypeVar("R")
 

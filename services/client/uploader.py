@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
 from pydantic import Field
 
-from services.api.capture_paths import path_fault, require_paths
-from services.api.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
-from services.api.errors import UploadError
-from services.api.exchange import Ask, Flow, Pause, Work, answer, error_in
+from services.client.capture_paths import path_fault, require_paths
+from services.client.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
+from services.client.errors import UploadError
+from services.client.requests import Ask, Flow, Pause, Work, answer, error_in
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.files.image_metadata import metadata_fault
 from services.core.geometry import Record
@@ -107,7 +107,7 @@ class Uploader:
         return ManifestFile(path=path, bytes=size, sha256=content.hexdigest())
 
     def _send(self, source: Path, capture: str, file: CaptureFile) -> Flow[None]:
-        from services.api.tus import VERSION, format_metadata
+        from services.client.tus import VERSION, format_metadata
 
         url = file.upload.removeprefix("/v1")
         metadata = {"Upload-Length": str(file.bytes), "Upload-Metadata": format_metadata({"capture": capture, "path": file.path})}
@@ -135,7 +135,7 @@ class Uploader:
         self._tell("sending", file.path)
 
     def _append(self, url: str, offset: int, chunk: bytes, checksum: str) -> Flow[int]:
-        from services.api.tus import CHUNK_TYPE, VERSION
+        from services.client.tus import CHUNK_TYPE, VERSION
 
         headers = {"Tus-Resumable": VERSION, "Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE, "Upload-Checksum": checksum}
         self._sent_bytes += len(chunk)
@@ -187,7 +187,7 @@ class Uploader:
 
 def _read_chunk(stream: BinaryIO, start: int, size: int) -> tuple[bytes, str]:
     """Some bytes of a file, and their checksum as a header tells it."""
-    from services.api.tus import Checksum, format_checksum
+    from services.client.tus import Checksum, format_checksum
 
     stream.seek(start)
     chunk = stream.read(size)
