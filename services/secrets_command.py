@@ -25,7 +25,7 @@ def build_secrets_app(settings: Callable[[], ServerSettings]) -> typer.Typer:
         renew: Annotated[bool, typer.Option("--renew", help="Make the certificate of the parts anew in any case.")] = False,
     ) -> None:
         """Make what is absent or ends within 60 days; what is there stays."""
-        from services.api.deployment_secrets import make_missing
+        from services.api.deployment.secrets import make_missing
 
         made = make_missing(folder, renew=renew)
         print(f"made: {', '.join(made)}" if made else "everything was there already")
@@ -33,7 +33,7 @@ def build_secrets_app(settings: Callable[[], ServerSettings]) -> typer.Typer:
     @app.command("change-password")
     def change_password(folder: Folder) -> None:
         """Give the database a new password; the parts read it at their next connection, without a restart."""
-        from services.api.password_change import change_database_password
+        from services.api.deployment.password_change import change_database_password
 
         change_database_password(settings().database_url, folder / "database" / "password")
         print("the database has a new password")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from services.api.tokens import Tokens
+    from services.api.auth.tokens import Tokens
 
 Data = Annotated[Path | None, typer.Option(help="Folder of the server's SQLite database; default: the settings' database.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -33,8 +33,8 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
         as_json: Json = False,
     ) -> None:
         """Make a token and print it; it is not shown again."""
-        from services.api.audit import Deed
-        from services.api.tokens import Scope
+        from services.api.auth.audit import Deed
+        from services.api.auth.tokens import Scope
         from services.core.errors import InputError
 
         if unknown := [one for one in scope if one not in set(Scope)]:
@@ -62,7 +62,7 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
     @app.command()
     def revoke(token: Annotated[str, typer.Argument(metavar="ID", help="Id or name that list prints.")], data: Data = None) -> None:
         """End a token now."""
-        from services.api.audit import Deed
+        from services.api.auth.audit import Deed
 
         with _tokens(data, default_url) as tokens:
             ended = tokens.revoke(token, Deed("dentine token revoke", "command line", "local"))
@@ -73,8 +73,8 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
 
 @contextmanager
 def _tokens(data: Path | None, default_url: Callable[[], str]) -> Iterator[Tokens]:
+    from services.api.auth.tokens import Tokens
     from services.api.migrations import upgrade
-    from services.api.tokens import Tokens
     from services.core.settings import ServerSettings
     from services.pipeline.database import open_database
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from services.api.jobs import Jobs
-from services.api.runner import RunJob
+from services.api.jobs.jobs import Jobs
+from services.api.jobs.runner import RunJob
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
@@ -53,19 +53,20 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
 
-    from services.api import access, problems
-    from services.api.calibration_routes import build_calibrations_router
-    from services.api.captures_routes import build_captures_router
-    from services.api.clerks import Clerks
-    from services.api.dome import Dome
-    from services.api.dome_routes import build_dome_router
-    from services.api.feed import EventFeed
-    from services.api.mask_routes import build_masks_router
-    from services.api.masks import Masks
+    from services.api.auth import access
+    from services.api.auth.browser_protection import Shield
+    from services.api.calibrations.routes import build_calibrations_router
+    from services.api.captures.routes import build_captures_router
+    from services.api.dome.dome import Dome
+    from services.api.dome.routes import build_dome_router
+    from services.api.health.worker_routes import build_workers_router
+    from services.api.http import problems
+    from services.api.http.thread_pools import Clerks
+    from services.api.jobs.event_stream import EventFeed
+    from services.api.jobs.routes import build_router
+    from services.api.masks.masks import Masks
+    from services.api.masks.routes import build_masks_router
     from services.api.observation import Observation
-    from services.api.routes import build_router
-    from services.api.shield import Shield
-    from services.api.worker_routes import build_workers_router
 
     access.refuse_open_network(settings)
     certificates = Certificates.of(settings.tls) if settings.tls is not None else None

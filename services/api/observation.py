@@ -6,18 +6,18 @@ from collections.abc import Callable
 
 from fastapi import FastAPI
 
-from services.api.clerks import Clerks
-from services.api.deliveries import Deliveries
-from services.api.health_routes import build_health_router
-from services.api.jobs import Jobs
-from services.api.metrics import RequestMetrics, build_registry
-from services.api.observe_routes import build_observe_router
-from services.api.readiness import Readiness
-from services.api.requests import RequestLog
-from services.api.webhook_address import AddressPolicy
-from services.api.webhook_routes import build_webhook_router
-from services.api.webhook_sender import WebhookSender
-from services.api.webhooks import Webhooks
+from services.api.health.metrics import RequestMetrics, build_registry
+from services.api.health.readiness import Readiness
+from services.api.health.routes import build_health_router
+from services.api.http.request_log import RequestLog
+from services.api.http.thread_pools import Clerks
+from services.api.jobs.history_routes import build_observe_router
+from services.api.jobs.jobs import Jobs
+from services.api.webhooks.address import AddressPolicy
+from services.api.webhooks.deliveries import Deliveries
+from services.api.webhooks.routes import build_webhook_router
+from services.api.webhooks.sender import WebhookSender
+from services.api.webhooks.webhooks import Webhooks
 from services.core.settings import ServerSettings
 from services.pipeline.dask_tls import Certificates
 

@@ -15,10 +15,10 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from services.api.access import refuse_open_network
 from services.api.app import create_app, is_dashboard_built
-from services.api.runner import RunJob
-from services.api.setup_links import SetupLinks, setup_address
+from services.api.auth.access import refuse_open_network
+from services.api.auth.setup_links import SetupLinks, setup_address
+from services.api.jobs.runner import RunJob
 from services.core.errors import PlatformError
 from services.core.files.private import PRIVATE
 from services.core.redaction import redacted
@@ -47,7 +47,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
     try:
         import uvicorn
 
-        from services.api.connections import BoundedServer
+        from services.api.http.connections import BoundedServer
     except ModuleNotFoundError as problem:
         raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
 

@@ -32,8 +32,8 @@ import psutil
 import requests
 from requests.structures import CaseInsensitiveDict
 
-from services.api.descriptions import MAX_DESCRIPTION_BYTES
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
+from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
 from tests.contracts.generated_requests import Sender, served
 from tests.contracts.living import Living
 from tests.contracts.witnesses import Witnesses, leave_witnesses
@@ -81,7 +81,7 @@ def watched(process: psutil.Process) -> Iterator[Memory]:
         while not is_over.wait(SAMPLE_S):
             with suppress(psutil.Error):
                 own = process.memory_info().rss
-                readers = [one for one in process.children() if "services.api.reading_process" in one.cmdline()]
+                readers = [one for one in process.children() if "services.api.captures.reading_process" in one.cmdline()]
                 memory.server = max(memory.server, own)
                 memory.with_readers = max(memory.with_readers, own + sum(one.memory_info().rss for one in readers))
 

@@ -19,7 +19,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from services.api.app import create_app
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
 from services.core.settings import ServerSettings
 from services.pipeline.logs import configure_logs
 from tests.load.bare_server import build
@@ -63,7 +63,7 @@ async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
     app = create_app(settings, lambda *_: None)
     stream = (work / "log.jsonl").open("w")
     configure_logs(stream)
-    logging.getLogger("services.api.runner").setLevel(logging.CRITICAL)
+    logging.getLogger("services.api.jobs.runner").setLevel(logging.CRITICAL)
     async with app.router.lifespan_context(app):
         took_s = await _cost((bare, reads, {}), (app, asks, headers))
     stream.close()

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.repository import Repository
+from services.api.jobs.repository import Repository
 from services.core.errors import CaptureInputError, DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -241,7 +241,7 @@ def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: Scrip
 
 def test_a_queued_job_says_what_it_waits_for(page: Page, job: ScriptedJob, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=2**28, total=2**50))
-    monkeypatch.setattr("services.api.runner.ROUND_S", 0.2)
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.2)
     number = submit(page)
     page.goto(f"/#/{number}")
     expect(page.locator(".job header + p + p")).to_have_text(re.compile(r"Waits for disk: about [0-9.]+ GiB are needed and [0-9.]+ GiB are free\."))

@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.lifecycle import Trigger
-from services.api.repository import Repository
+from services.api.jobs.lifecycle import Trigger
+from services.api.jobs.repository import Repository
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE, ServerSettings
 from services.pipeline.database import sqlite_url
@@ -25,7 +25,7 @@ PAGE = 50
 def page(chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Page]:
     if not (STATIC / "app.js").exists():
         pytest.skip("the dashboard is not built; run make dashboard")
-    monkeypatch.setattr("services.api.runner.ROUND_S", 600.0)  # jobs that a test writes into the database stay queued
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 600.0)  # jobs that a test writes into the database stay queued
     with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
         page = chromium.new_page(base_url=str(client.base_url))
         broken: list[str] = []

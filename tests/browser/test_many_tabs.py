@@ -152,7 +152,7 @@ def test_all_off_is_answered_while_every_connection_is_held(context: BrowserCont
         bench.go_on.wait(60)
         return []
 
-    monkeypatch.setattr("services.api.observe_routes.list_artifacts", hang)
+    monkeypatch.setattr("services.api.jobs.history_routes.list_artifacts", hang)
     job = submit(dome)
     dome.evaluate("job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }", job)
     until(dome, lambda: len(asked) == CONNECTIONS)

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from services.api.app import create_app
-from services.api.setup_links import SetupLinks
+from services.api.auth.setup_links import SetupLinks
 from services.core.settings import ServerSettings
 from services.pipeline.database import open_database
 from tests.browser.pages import PHONE, WIDE, looked_at, watched_page

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC
-from services.api.sessions import COOKIE
-from services.api.tokens import Scope
+from services.api.auth.sessions import COOKIE
+from services.api.auth.tokens import Scope
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec
 from tests.browser.contrast import contrast_failures

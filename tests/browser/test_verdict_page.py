@@ -10,8 +10,8 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
-from services.api.admission import Machine
 from services.api.app import create_app
+from services.api.jobs.admission import Machine
 from services.core.records import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of
@@ -88,7 +88,7 @@ def test_a_job_without_a_verdict_shows_none(chromium: Browser, server: httpx.Cli
 
 def test_a_job_that_waits_for_disk_says_so_at_once(chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: ScriptedJob) -> None:
     """By an event and not by asking again: the page asks anew only after five seconds, and a round comes every ten."""
-    monkeypatch.setattr("services.api.runner.ROUND_S", 3600.0)
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 3600.0)
     with serving(create_app(ServerSettings(data=tmp_path), job)) as client, watched_page(chromium, address_of(client)) as page:
         page.clock.install()  # time stands still in the page, so that it asks for nothing by itself
         full = Machine(free_disk_bytes=2**20, disk_bytes=2**40, memory_bytes=2**40)

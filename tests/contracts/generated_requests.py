@@ -34,8 +34,8 @@ from schemathesis import Case, GenerationMode, Response
 from schemathesis.core.failures import FailureGroup
 from schemathesis.specs.openapi import checks
 
-from services.api.problems import MEDIA_TYPE, Problem
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
+from services.api.http.problems import MEDIA_TYPE, Problem
 from services.client.errors import error_of
 from services.client.tus import CHUNK_TYPE
 from tests.contracts.living import Living

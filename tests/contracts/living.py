@@ -13,7 +13,7 @@ import numpy as np
 from schemathesis import Case, Response
 from schemathesis.core.parameters import ParameterLocation
 
-from services.api.mask_images import picture_of
+from services.api.masks.images import picture_of
 from services.api.presets import list_presets
 from services.client.tus import CHUNK_TYPE, format_metadata
 from services.core.geometry import Camera

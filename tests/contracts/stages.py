@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.api.mask_images import picture_of
+from services.api.masks.images import picture_of
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light
 from services.core.masks import digest_of, read_masks

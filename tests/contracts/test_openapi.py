@@ -7,8 +7,8 @@ import json
 
 import pytest
 
+from services.api.http.problems import MEDIA_TYPE, Problem
 from services.api.openapi import STORED, describe
-from services.api.problems import MEDIA_TYPE, Problem
 
 
 def test_the_stored_description_is_current() -> None:

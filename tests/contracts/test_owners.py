@@ -11,8 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
-from services.api.guard import LIVENESS, SETUP, guarded_routes
-from services.api.tokens import Scope
+from services.api.auth.scopes import LIVENESS, SETUP, guarded_routes
+from services.api.auth.tokens import Scope
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec
 from services.core.settings import RateSettings

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from services.api import server
-from services.api.capture_contents import content_fault
+from services.api.captures.contents import content_fault
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings, UploadLimits
 from services.dask_command import require_scheduler_named

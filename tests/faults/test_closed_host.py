@@ -22,7 +22,7 @@ import psutil
 import pytest
 
 from services import dask_command
-from services.api.connections import Crowd
+from services.api.http.connections import Crowd
 from services.core.settings import ConnectionLimits
 from services.pipeline.workers import Workers
 from tests.support.live_server import toy_server

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
 from services.core.settings import RateSettings
 from tests.support.guarded_server import guarded
 

@@ -21,12 +21,12 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from services.api import readiness as readiness_module
-from services.api.admission import KEPT_FREE_BYTES
 from services.api.app import create_app
-from services.api.jobs import Jobs
+from services.api.health import readiness as readiness_module
+from services.api.health.readiness import Readiness
+from services.api.jobs.admission import KEPT_FREE_BYTES
+from services.api.jobs.jobs import Jobs
 from services.api.migrations import upgrade
-from services.api.readiness import Readiness
 from services.core.settings import DATABASE_FILE, ServerSettings
 from services.pipeline.database import open_database, sqlite_url
 from tests.support.live_server import serving
@@ -139,7 +139,7 @@ def test_a_runner_that_died_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
         assert bad_checks(client) == {}
-        monkeypatch.setattr("services.api.admission.Admission.holds", die)
+        monkeypatch.setattr("services.api.jobs.admission.Admission.holds", die)
         job = client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
         while client.get("/v1/health/ready").status_code == 200:
             pass

@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 
-from services.api.captures import Captures
+from services.api.captures.captures import Captures
 from services.client.capture_records import UploadManifest
 from services.core.settings import UploadLimits
 from tests.support.live_server import toy_server
@@ -133,7 +133,9 @@ def die(*_: object, **__: object) -> None:
     raise Death
 
 
-@pytest.mark.parametrize("step", ["services.api.captures.sync_folders", "pathlib.Path.rename", "services.api.capture_table.CaptureTable.change_state"])
+@pytest.mark.parametrize(
+    "step", ["services.api.captures.captures.sync_folders", "pathlib.Path.rename", "services.api.captures.table.CaptureTable.change_state"]
+)
 def test_a_commit_that_died_anywhere_is_invisible_or_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     contents = contents_of(write_capture(tmp_path / "mine"))
     with captures_of(tmp_path) as captures:
@@ -152,7 +154,7 @@ def test_a_commit_that_died_anywhere_is_invisible_or_complete(tmp_path: Path, mo
     assert [path.name for path in (tmp_path / "captures").iterdir()] == [capture]
 
 
-@pytest.mark.parametrize("step", ["shutil.rmtree", "services.api.blobs.Blobs.remove", "services.api.capture_table.CaptureTable.delete_files"])
+@pytest.mark.parametrize("step", ["shutil.rmtree", "services.api.captures.blobs.Blobs.remove", "services.api.captures.table.CaptureTable.delete_files"])
 def test_a_deletion_that_died_anywhere_is_completed_by_the_next_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     contents = contents_of(write_capture(tmp_path / "mine"))
     with captures_of(tmp_path) as captures:
@@ -175,7 +177,7 @@ def test_what_a_dead_server_received_whole_but_never_verified_is_verified_at_the
     with captures_of(tmp_path) as captures:
         capture = captures.create(UploadManifest.model_validate(manifest_of(contents))).capture.id
         with monkeypatch.context() as dead:
-            dead.setattr("services.api.uploads.Uploads.finish", lambda *_: None)
+            dead.setattr("services.api.captures.uploads.Uploads.finish", lambda *_: None)
             receive_all(captures, contents, damaged)
     with captures_of(tmp_path) as captures:
         assert captures.get(capture).missing_bytes == 0

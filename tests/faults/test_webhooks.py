@@ -17,13 +17,13 @@ import pytest
 from standardwebhooks.webhooks import Webhook as Verifier
 
 from services.api.app import create_app
-from services.api.deliveries import CLAIM_S, DISABLE_AFTER_S, KEEP_S, Attempt, Deliveries, Delivery
-from services.api.lifecycle import JobState, Trigger
-from services.api.repository import Failure, Repository
-from services.api.webhook_address import AddressPolicy
-from services.api.webhook_outbox import DAY_S
-from services.api.webhook_sender import FIRST_RETRY_S, WebhookSender, retry_s
-from services.api.webhooks import NewWebhook, WebhookChange, WebhookRequest, Webhooks
+from services.api.jobs.lifecycle import JobState, Trigger
+from services.api.jobs.repository import Failure, Repository
+from services.api.webhooks.address import AddressPolicy
+from services.api.webhooks.deliveries import CLAIM_S, DISABLE_AFTER_S, KEEP_S, Attempt, Deliveries, Delivery
+from services.api.webhooks.outbox import DAY_S
+from services.api.webhooks.sender import FIRST_RETRY_S, WebhookSender, retry_s
+from services.api.webhooks.webhooks import NewWebhook, WebhookChange, WebhookRequest, Webhooks
 from services.client.errors import JobStateError, WebhookAddressError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

@@ -16,7 +16,7 @@ import aiohttp
 import numpy as np
 import psutil
 
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
 from tests.load.library import Library, fill
 from tests.load.mix import SUBMIT_PERIOD_S, Ask, Mix, periodic
 from tests.load.open_loop import Answer, offer, poisson, run, session

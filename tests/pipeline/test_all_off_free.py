@@ -18,11 +18,11 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from services.api import problems
 from services.api.app import create_app
-from services.api.bodies import MAX_FAULTS
-from services.api.jobs import Jobs
-from services.api.repository import Repository
+from services.api.http import problems
+from services.api.http.bodies import MAX_FAULTS
+from services.api.jobs.jobs import Jobs
+from services.api.jobs.repository import Repository
 from services.capture.dome.simulator import simulated_dome
 from services.core.errors import DentineError
 from services.core.settings import DomeSettings, ServerSettings
@@ -108,7 +108,7 @@ def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(tmp_path: 
                 monkeypatch.setattr(owner, name, hanging)
             for place in ("routes.list_artifacts", "observe_routes.list_artifacts", "uploads.Uploads.begin", "captures.Captures.commit"):
                 monkeypatch.setattr(f"services.api.{place}", hanging)
-            monkeypatch.setattr("services.api.jobs.Jobs.capturing", lambda _: [])
+            monkeypatch.setattr("services.api.jobs.jobs.Jobs.capturing", lambda _: [])
             with occupy(str(client.base_url), job):
                 wait_until(lambda: hanging.begun >= sum(POOLS))
                 client.timeout = httpx.Timeout(ANSWERED_WITHIN_S)

@@ -144,7 +144,7 @@ def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: st
 
 @pytest.mark.parametrize("at_once", [1000, 5], ids=["at once", "block by block"])
 def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.artifacts.MOST_BYTES_AT_ONCE", at_once)
+    monkeypatch.setattr("services.api.http.artifacts.MOST_BYTES_AT_ONCE", at_once)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
     finish(client, job_id)
@@ -218,7 +218,7 @@ def test_health_and_options(serve: Any) -> None:
 
 
 def test_every_error_has_a_status() -> None:
-    from services.api.problems import status_of
+    from services.api.http.problems import status_of
 
     def below(kind: type[DentineError]) -> Iterator[type[DentineError]]:
         yield kind
@@ -268,8 +268,8 @@ def test_what_the_machine_could_never_run_is_refused_with_507(serve: Any, captur
 
 
 def test_a_full_disk_pauses_a_job_and_it_goes_on(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.admission.RETRY_S", 0.5)
-    monkeypatch.setattr("services.api.runner.ROUND_S", 0.1)
+    monkeypatch.setattr("services.api.jobs.admission.RETRY_S", 0.5)
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.1)
     tries: list[int] = []
 
     def run(*_: object) -> None:
@@ -296,15 +296,15 @@ def test_failures_say_what_was_measured(serve: Any, capture_folder: str) -> None
 
 
 def test_a_runner_that_broke_off_loses_the_job_and_runs_it_again(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.runner.LEASE_S", 0.3)
-    monkeypatch.setattr("services.api.runner.ROUND_S", 0.1)
+    monkeypatch.setattr("services.api.jobs.runner.LEASE_S", 0.3)
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.1)
     broken = [OSError("The data folder is away.")]
 
     def withdraw(_folder: Path) -> None:
         if broken:
             raise broken.pop()
 
-    monkeypatch.setattr("services.api.runner.withdraw_cancel", withdraw)
+    monkeypatch.setattr("services.api.jobs.runner.withdraw_cancel", withdraw)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
     states = [json.loads(line.removeprefix("data: "))["data"]["state"] for line in finish(client, job_id).splitlines() if '"kind":"state"' in line]

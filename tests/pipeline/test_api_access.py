@@ -13,11 +13,12 @@ from typing import Any
 import pytest
 from fastapi import APIRouter, FastAPI
 
-from services.api import body_limit, gate
 from services.api.app import create_app
-from services.api.guard import LIVENESS, SETUP, guarded_routes, needs
-from services.api.sessions import COOKIE
-from services.api.tokens import Caller, Scope
+from services.api.auth import authentication as gate
+from services.api.auth.scopes import LIVENESS, SETUP, guarded_routes, needs
+from services.api.auth.sessions import COOKIE
+from services.api.auth.tokens import Caller, Scope
+from services.api.http import body_limit
 from services.core.settings import RateSettings, ServerSettings
 from tests.support.guarded_server import Guarded, guarded
 from tests.support.live_server import serving
@@ -158,7 +159,7 @@ def test_without_the_gate_a_route_is_closed(tmp_path: Path) -> None:
     app = FastAPI()
     app.add_api_route("/thing", lambda: 1, dependencies=[needs("read")])
     app.add_middleware(_As, caller=Caller("x", frozenset({Scope.OPERATE_DOME})))
-    from services.api import problems
+    from services.api.http import problems
 
     problems.install(app)
     with serving(app) as client:
@@ -337,7 +338,7 @@ def test_the_audit_log_is_paged(server: Guarded) -> None:
 def test_nothing_is_handed_out_that_cannot_be_audited(tmp_path: Path) -> None:
     import sqlalchemy as sql
 
-    from services.api.audit import AuditLog
+    from services.api.auth.audit import AuditLog
 
     with guarded(tmp_path, write_report) as server:
         job = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"}).json()["id"]
@@ -458,7 +459,7 @@ def test_a_route_without_body_refuses_a_long_one_before_it_acts(small: Guarded) 
 
 
 def test_uploads_are_exempt_by_their_path() -> None:
-    from services.api.body_limit import EXEMPT, BodyLimit
+    from services.api.http.body_limit import EXEMPT, BodyLimit
 
     assert EXEMPT == "/v1/uploads"
     for path, exempt in (("/v1/uploads", True), ("/v1/uploads/x", True), ("/v1/uploadsx", False), ("/v1/jobs", False)):

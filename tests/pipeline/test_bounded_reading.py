@@ -12,11 +12,11 @@ import numpy as np
 import psutil
 import pytest
 
-from services.api import reading
 from services.api.app import create_app
-from services.api.capture_contents import content_fault
-from services.api.descriptions import MAX_DESCRIPTION_BYTES
-from services.api.reading import ReadApart
+from services.api.captures.captures import reading
+from services.api.captures.contents import content_fault
+from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
+from services.api.captures.reading import ReadApart
 from services.core.errors import CaptureInputError
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
@@ -39,7 +39,7 @@ def faults(reader: ReadApart, *files: tuple[Path, str], names: frozenset[str] = 
 
 
 def children() -> list[psutil.Process]:
-    return [one for one in psutil.Process().children() if "services.api.reading_process" in one.cmdline()]
+    return [one for one in psutil.Process().children() if "services.api.captures.reading_process" in one.cmdline()]
 
 
 def test_it_says_what_would_be_said_in_this_process(apart: ReadApart, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sql
 
 from services.api.app import create_app
-from services.api.captures import Captures
+from services.api.captures.captures import Captures
 from services.core.settings import ServerSettings
 from tests.support.live_server import serving
 
@@ -23,7 +23,7 @@ def test_the_sweep_goes_on_after_an_error(tmp_path: Path, monkeypatch: pytest.Mo
         is_swept.set()
 
     monkeypatch.setattr(Captures, "sweep", sweep)
-    monkeypatch.setattr("services.api.captures_routes.SWEEP_S", 0.0)
+    monkeypatch.setattr("services.api.captures.routes.SWEEP_S", 0.0)
     with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)):
         assert is_swept.wait(10)
     assert [record.message for record in caplog.records if "looking after captures" in record.message] == [

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
 from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.store import open_stage, read_record

@@ -14,8 +14,8 @@ import pytest
 import sqlalchemy as sql
 from fastapi import FastAPI
 
-from services.api import problems
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
+from services.api.http import problems
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from tests.support.guarded_server import Guarded, guarded
@@ -56,8 +56,8 @@ def test_a_refusal_that_cannot_be_audited_is_503(tmp_path: Path) -> None:
 
 
 def test_a_stream_outlasts_the_absence_of_its_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.gate.RECHECK_S", 0.0)
-    monkeypatch.setattr("services.api.tokens.TRUSTED_S", 0.0)
+    monkeypatch.setattr("services.api.auth.authentication.RECHECK_S", 0.0)
+    monkeypatch.setattr("services.api.auth.tokens.TRUSTED_S", 0.0)
     told, is_over = threading.Event(), threading.Event()
 
     def run(_spec: object, _folder: Path, events: Any) -> None:

@@ -11,8 +11,8 @@ import pytest
 import sqlalchemy as sql
 from pydantic import SecretStr
 
-from services.api.jobs import Jobs
-from services.api.password_change import change_database_password
+from services.api.deployment.password_change import change_database_password
+from services.api.jobs.jobs import Jobs
 from services.core.errors import PlatformError, SettingsError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings, read_settings

@@ -13,8 +13,8 @@ from types import MappingProxyType
 
 import pytest
 
-from services.api.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, LEAST_DISK_BYTES, predict
-from services.api.job_size import size_of
+from services.api.jobs.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, LEAST_DISK_BYTES, predict
+from services.api.jobs.size import size_of
 from services.api.presets import find_preset
 from services.core.errors import CrashError, JobCancelledError, SettingsError
 from services.core.records import DEMO_MOUTH, FolderCapture, JobSpec

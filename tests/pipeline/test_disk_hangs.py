@@ -42,8 +42,8 @@ def disk() -> Iterator[Disk]:
 
 
 def test_a_job_is_told_without_its_time_and_everything_else_as_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
-    monkeypatch.setattr("services.api.time_ranges.size_of", disk)
-    monkeypatch.setattr("services.api.routes.LOOK_S", 0.1)
+    monkeypatch.setattr("services.api.jobs.time_ranges.size_of", disk)
+    monkeypatch.setattr("services.api.jobs.routes.LOOK_S", 0.1)
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: disk.is_mended.wait(60))) as client:
         job = submit(client, tmp_path)
         for _ in range(2):  # the second one finds the looker still busy with the first
@@ -60,8 +60,8 @@ def test_a_job_is_told_without_its_time_and_everything_else_as_ever(tmp_path: Pa
 
 def test_a_job_whose_size_is_being_predicted_can_be_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client:
-        monkeypatch.setattr("services.api.admission.Admission.refuse_too_large", lambda *_: None)
-        monkeypatch.setattr("services.api.admission.predict", disk)
+        monkeypatch.setattr("services.api.jobs.admission.Admission.refuse_too_large", lambda *_: None)
+        monkeypatch.setattr("services.api.jobs.admission.predict", disk)
         job = submit(client, tmp_path)
         assert disk.is_asked.wait(60)
         try:
@@ -73,7 +73,7 @@ def test_a_job_whose_size_is_being_predicted_can_be_asked_for(tmp_path: Path, mo
 
 
 def test_many_who_wait_for_files_of_jobs_keep_nobody_from_submitting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
-    monkeypatch.setattr("services.api.routes.list_artifacts", disk.list_nothing)
+    monkeypatch.setattr("services.api.jobs.routes.list_artifacts", disk.list_nothing)
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client, ThreadPoolExecutor(FILE_READERS) as pool:
         files = f"{client.base_url}/v1/jobs/{submit(client, tmp_path)}/artifacts"
         waiting = [pool.submit(httpx.get, files, timeout=60) for _ in range(FILE_READERS)]

@@ -17,8 +17,8 @@ import psutil
 import pytest
 
 from services.api.app import create_app
-from services.api.problems import status_of
-from services.api.tokens import Scope
+from services.api.auth.tokens import Scope
+from services.api.http.problems import status_of
 from services.capture import stage
 from services.capture.console import Console
 from services.capture.dome.controller import DomeObserver
@@ -369,7 +369,7 @@ def console_of(server: int) -> psutil.Process:
 
 
 def test_all_off_ends_a_process_that_hangs(client: httpx.Client, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.dome.OFF_S", 0.5)
+    monkeypatch.setattr("services.api.dome.dome.OFF_S", 0.5)
     client.put("/v1/dome/light", json={"light": 3, "on_s": 30}).raise_for_status()
     hanging = console_of(os.getpid())
     hanging.suspend()

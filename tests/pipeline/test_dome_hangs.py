@@ -11,8 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.api.dome import Dome, LightRequest
-from services.api.jobs import Jobs
+from services.api.dome.dome import Dome, LightRequest
+from services.api.jobs.jobs import Jobs
 from services.capture.dome.controller import DomeObserver
 from services.capture.dome.simulator import simulated_dome
 from services.core.errors import RigUnreachableError
@@ -43,7 +43,7 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging
         process.suspend()
         try:
             with monkeypatch.context() as hurried:
-                hurried.setattr("services.api.dome.ANSWER_S", 0.0)
+                hurried.setattr("services.api.dome.dome.ANSWER_S", 0.0)
                 require_end(lambda: [ask(dome) for _ in range(COMMANDS)])
             assert observer.status().lit == (3,)
             yield Hanging(dome, observer, process)
@@ -67,7 +67,7 @@ def require_end(work: Callable[[], object]) -> None:
 
 
 def test_all_off_gets_past_a_process_that_no_longer_reads(hanging: Hanging, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.dome.OFF_S", 0.2)
+    monkeypatch.setattr("services.api.dome.dome.OFF_S", 0.2)
     require_end(hanging.dome.all_off)
     assert hanging.observer.status().lit == ()
     assert hanging.observer.status().stopped
@@ -75,6 +75,6 @@ def test_all_off_gets_past_a_process_that_no_longer_reads(hanging: Hanging, monk
 
 
 def test_the_server_ends_with_a_process_that_no_longer_reads(hanging: Hanging, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.dome_process.END_S", 0.2)
+    monkeypatch.setattr("services.api.dome.process.END_S", 0.2)
     require_end(hanging.dome.close)
     assert not hanging.process.is_running()

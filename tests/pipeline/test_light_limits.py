@@ -13,9 +13,9 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.repository import Repository
+from services.api.auth.tokens import Scope
+from services.api.jobs.repository import Repository
 from services.api.server import _dark_at_once
-from services.api.tokens import Scope
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
 from tests.support.guarded_server import Guarded, guarded, make_token

@@ -19,7 +19,7 @@ import zarr
 from numpy.typing import NDArray
 
 from services.api.app import create_app
-from services.api.mask_images import picture_of
+from services.api.masks.images import picture_of
 from services.core.errors import CaptureInputError
 from services.core.masks import is_stale, mask_path
 from services.core.records import JobSpec, MaskBit

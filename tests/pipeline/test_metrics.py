@@ -11,9 +11,9 @@ from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from services.api.app import create_app
-from services.api.jobs import Jobs
-from services.api.metrics import build_registry
-from services.api.readiness import Readiness
+from services.api.health.metrics import build_registry
+from services.api.health.readiness import Readiness
+from services.api.jobs.jobs import Jobs
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.pipeline.event_log import EventAddress

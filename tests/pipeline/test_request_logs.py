@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from services.api.app import create_app
-from services.api.guard import needs
+from services.api.auth.scopes import needs
 from services.core.settings import ServerSettings
 from services.pipeline.logs import configure_logs, log_context
 from services.pipeline.machine_class import machine_class

@@ -11,15 +11,15 @@ from pathlib import Path
 import httpx
 import pytest
 
-from services.api.sessions import COOKIE, KEY_FILE
-from services.api.tokens import Scope
+from services.api.auth.sessions import COOKIE, KEY_FILE
+from services.api.auth.tokens import Scope
 from tests.support.guarded_server import make_token
 from tests.support.live_server import connect
 
 FAILING_SERVER = """
 import sys
 from pathlib import Path
-from services.api.jobs import Jobs
+from services.api.jobs.jobs import Jobs
 from services.api.server import serve
 from services.core.settings import ServerSettings
 

@@ -15,10 +15,10 @@ import pytest
 import sqlalchemy as sql
 
 from services.api.app import create_app
+from services.api.auth.sessions import COOKIE
+from services.api.auth.setup_links import LIFETIME_S, SetupLinks, setup_address
+from services.api.auth.tokens import Scope
 from services.api.migrations import upgrade
-from services.api.sessions import COOKIE
-from services.api.setup_links import LIFETIME_S, SetupLinks, setup_address
-from services.api.tokens import Scope
 from services.client.errors import SetupLinkError
 from services.core.settings import DATABASE_FILE, RateSettings, ServerSettings
 from services.pipeline.database import open_database

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.forecast import LEAST
+from services.api.jobs.forecast import LEAST
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent, StageName

@@ -16,10 +16,11 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from services.api import access, problems
-from services.api.captures import Captures
-from services.api.captures_routes import build_captures_router
-from services.api.clerks import Clerks
+from services.api.auth import access
+from services.api.captures.captures import Captures
+from services.api.captures.routes import build_captures_router
+from services.api.http import problems
+from services.api.http.thread_pools import Clerks
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
 from tests.support.uploading import TUS, announce, checksum, create_upload, offset_of, patch, upgraded
@@ -332,8 +333,8 @@ def test_a_whole_file_that_was_never_verified_is_verified_by_an_empty_request(cl
 
 
 def test_a_long_request_is_recorded_before_it_ends(client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.receiving.BLOCK_BYTES", 256)
-    monkeypatch.setattr("services.api.receiving.RECORD_BYTES", 1024)
+    monkeypatch.setattr("services.api.captures.receiving.BLOCK_BYTES", 256)
+    monkeypatch.setattr("services.api.captures.receiving.RECORD_BYTES", 1024)
     may_end = threading.Event()
 
     def slowly() -> Iterator[bytes]:

@@ -12,9 +12,9 @@ import httpx
 from fastapi import FastAPI
 
 from services.api.app import create_app
-from services.api.audit import Deed
+from services.api.auth.audit import Deed
+from services.api.auth.tokens import Scope, Tokens
 from services.api.migrations import upgrade
-from services.api.tokens import Scope, Tokens
 from services.core.owners import DEFAULT_GROUP
 from services.core.settings import ServerSettings
 from services.pipeline.database import open_database

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from services.api.job_size import method_of, size_of
-from services.api.past_runs import Course, past_run_table
+from services.api.jobs.past_runs import Course, past_run_table
+from services.api.jobs.size import method_of, size_of
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE
 from services.pipeline.database import open_database, sqlite_url, writing

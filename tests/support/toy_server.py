@@ -19,9 +19,9 @@ LEASE_S, ROUND_S, RETRY_S = 6.0, 0.5, 0.5
 def main(settings: ServerSettings, stages: str = "tests.support.toy_stages") -> None:
     """Serve with a module's stages and short leases."""
     with (
-        patch("services.api.runner.LEASE_S", LEASE_S),
-        patch("services.api.runner.ROUND_S", ROUND_S),
-        patch("services.api.admission.RETRY_S", RETRY_S),
+        patch("services.api.jobs.runner.LEASE_S", LEASE_S),
+        patch("services.api.jobs.runner.ROUND_S", ROUND_S),
+        patch("services.api.jobs.admission.RETRY_S", RETRY_S),
     ):
         serve(settings, doors={stage: f"{stages}:{stage}" for stage in get_args(StageName)})
 

@@ -7,8 +7,8 @@ import types
 
 import pytest
 
-from services.api import rates
-from services.api.rates import Rates, network_of
+from services.api.http import rate_limits as rates
+from services.api.http.rate_limits import Rates, network_of
 from services.core.settings import RateSettings
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from services.api.access import refuse_open_network
 from services.api.app import create_app
+from services.api.auth.access import refuse_open_network
 from services.api.server import serve
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings, read_settings

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sql
 
-from services.api import sessions, tokens
-from services.api.audit import AuditLog
+from services.api.auth import sessions, tokens
+from services.api.auth.audit import AuditLog
+from services.api.auth.sessions import Sessions, read_key
+from services.api.auth.tokens import DAY_S, LAST_USE_STEP_S, Caller, Scope, Tokens, token_table
 from services.api.migrations import upgrade
-from services.api.sessions import Sessions, read_key
-from services.api.tokens import DAY_S, LAST_USE_STEP_S, Caller, Scope, Tokens, token_table
 from services.client.errors import UnauthenticatedError, UnknownTokenError
 from services.core.errors import InputError
 from services.core.redaction import redacted

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from services.api.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
-from services.api.job_size import size_of
+from services.api.jobs.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
+from services.api.jobs.size import size_of
 from services.client.errors import JobTooLargeError
 from services.core.errors import DentineError, DiskFullError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from services.api.archive import PIECE_BYTES, stream_zip
+from services.api.http.zip_stream import PIECE_BYTES, stream_zip
 
 
 def write(root: Path, **files: bytes) -> list[str]:

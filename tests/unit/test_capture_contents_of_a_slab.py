@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.api.capture_contents import content_fault
+from services.api.captures.contents import content_fault
 from services.client.capture_paths import require_paths
 from services.core.settings import UploadLimits
 from tests.support.small_slab import description

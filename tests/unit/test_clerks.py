@@ -7,11 +7,11 @@ import threading
 
 import pytest
 
-from services.api.clerks import Clerks
+from services.api.http.thread_pools import Clerks
 
 
 def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.clerks.CLOSE_S", 0.01)
+    monkeypatch.setattr("services.api.http.thread_pools.CLOSE_S", 0.01)
     clerks, goes_on = Clerks(1), threading.Event()
 
     async def close_while_it_works() -> bool:

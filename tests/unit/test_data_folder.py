@@ -9,7 +9,7 @@ import pytest
 from pydantic import SecretStr
 
 from services.api.data_folder import FILE
-from services.api.jobs import Jobs
+from services.api.jobs.jobs import Jobs
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings
 from services.pipeline.database import sqlite_url

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from services.api import deployment_secrets
-from services.api.deployment_secrets import make_missing
+from services.api.deployment import secrets as deployment_secrets
+from services.api.deployment.secrets import make_missing
 from services.core.errors import SettingsError
 from services.pipeline.dask_tls import Certificates
 

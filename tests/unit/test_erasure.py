@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from services.api import erasure, jobs
-from services.api.erasure import Erased, erase, forget_listing
-from services.api.job_table import job_table
-from services.api.jobs import Jobs
-from services.api.lifecycle import JobState, Trigger
+from services.api.jobs.erasure import Erased, erase, forget_listing
+from services.api.jobs.jobs import Jobs, erasure, jobs
+from services.api.jobs.lifecycle import JobState, Trigger
+from services.api.jobs.table import job_table
 from services.core.errors import StoreError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 import sqlalchemy as sql
 
-from services.api import feed
-from services.api.feed import EventFeed, Turn
-from services.api.lifecycle import Trigger
-from services.api.repository import Lease, Repository
+from services.api.jobs.event_stream import EventFeed, Turn
+from services.api.jobs.jobs import event_stream as feed
+from services.api.jobs.lifecycle import Trigger
+from services.api.jobs.repository import Lease, Repository
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
 from services.pipeline.database import sqlite_url

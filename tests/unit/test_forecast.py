@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from services.api.forecast import LEAST, SHARE, Observation, foresee, survival
+from services.api.jobs.forecast import LEAST, SHARE, Observation, foresee, survival
 
 SECONDS = st.floats(0.01, 1e6)
 LOGARITHMS = st.floats(-5, 15)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.api.history import Histories, History, read_history
+from services.api.jobs.history import Histories, History, read_history
 from services.core.stage import StageEvent
 from services.pipeline.event_log import EventLog, event_table, folder_events
 
@@ -49,7 +49,7 @@ def test_a_later_attempt_replaces_the_steps_that_it_repeats(log: EventLog) -> No
 
 def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = []
-    monkeypatch.setattr("services.api.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked))
+    monkeypatch.setattr("services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked))
     histories = Histories(most_bytes=2000)
     for number in range(3):
         log.append(1, step(number))

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.api.capture_contents import content_fault
+from services.api.captures.contents import content_fault
 from services.core.files.image_headers import declared
 from services.core.settings import UploadLimits
 from tests.support.uploading import contents_of, write_capture

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from services.api import admission
-from services.api.admission import Needs
-from services.api.jobs import Jobs
-from services.api.lifecycle import JobState
-from services.api.repository import Lease
+from services.api.jobs.admission import Needs
+from services.api.jobs.jobs import Jobs, admission
+from services.api.jobs.lifecycle import JobState
+from services.api.jobs.repository import Lease
 from services.core.errors import DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
@@ -60,7 +59,7 @@ def test_a_capture_that_takes_long_to_measure_holds_up_no_other_submission(servi
 
 
 def test_a_long_round_keeps_no_lease_from_being_renewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.runner.ROUND_S", 0.05)
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.05)
     running, deleting, go_on, renewed = (threading.Event() for _ in range(4))
     begun_under: list[int] = []
 

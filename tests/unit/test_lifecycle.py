@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.api import lifecycle
-from services.api.lifecycle import TABLE, Instruction, JobState, Trigger, apply
+from services.api.jobs.jobs import lifecycle
+from services.api.jobs.lifecycle import TABLE, Instruction, JobState, Trigger, apply
 from services.client.errors import JobStateError
 
 triggers = st.lists(st.sampled_from(Trigger), max_size=30)

@@ -9,7 +9,7 @@ import zlib
 import numpy as np
 import pytest
 
-from services.api.mask_images import require_mask
+from services.api.masks.images import require_mask
 from services.client.errors import MaskError
 from services.core.files.image_headers import PNG_SIGNATURE
 from services.core.geometry import Camera

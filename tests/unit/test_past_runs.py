@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import sqlalchemy as sql
 
-from services.api.job_size import JobSize, method_of, size_of
-from services.api.past_runs import Course, PastRun, course_of, tenth_of
-from services.api.repository import Repository
-from services.api.time_ranges import Position, TimeRange, TimeRanges, time_range
+from services.api.jobs.past_runs import Course, PastRun, course_of, tenth_of
+from services.api.jobs.repository import Repository
+from services.api.jobs.size import JobSize, method_of, size_of
+from services.api.jobs.time_ranges import Position, TimeRange, TimeRanges, time_range
 from services.core.records import JobSpec, RigSpec
 from services.core.settings import DATABASE_FILE
 from services.core.stage import StageEvent

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.api import problems
-from services.api.problems import _STATUS, status_of
+from services.api.http import problems
+from services.api.http.problems import _STATUS, status_of
 from services.core.errors import DentineError
 
 

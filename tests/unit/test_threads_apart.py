@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from starlette.requests import HTTPConnection
 
-from services.api.access import Access
-from services.api.sessions import Sessions
-from services.api.tokens import Scope, Tokens
-from services.api.webhook_address import AddressPolicy
+from services.api.auth.access import Access
+from services.api.auth.sessions import Sessions
+from services.api.auth.tokens import Scope, Tokens
+from services.api.webhooks.address import AddressPolicy
 from services.core.settings import ServerSettings
 from services.pipeline.database import open_database
 from tests.support.guarded_server import make_token

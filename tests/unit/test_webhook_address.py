@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.api.webhook_address import AddressPolicy, is_public
+from services.api.webhooks.address import AddressPolicy, is_public
 from services.client.errors import WebhookAddressError
 
 STRICT, PRIVATE = AddressPolicy(), AddressPolicy(allow_private=True)

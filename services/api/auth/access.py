@@ -1,0 +1,89 @@
+"""Finds out whom a request comes from, and puts all that guards the API in front of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from services.api.auth.audit import AuditLog
+from services.api.auth.sessions import COOKIE, Sessions, read_key
+from services.api.auth.tokens import LOCAL, Caller, Tokens
+from services.api.http.thread_pools import Clerks
+from services.client.errors import UnauthenticatedError
+from services.core.errors import SettingsError
+from services.core.settings import ServerSettings
+
+if TYPE_CHECKING:
+    import sqlalchemy as sql
+    from fastapi import FastAPI
+    from starlette.requests import HTTPConnection
+
+
+LOOKERS = 4
+"""Threads that look tokens up: of their own, so that no disk or name server that hangs keeps anybody from ALL OFF."""
+
+
+class Access:
+    """The callers of one server; ``sessions`` is None where access is open."""
+
+    def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
+        self.tokens, self.sessions, self.lookers = tokens, sessions, Clerks(LOOKERS)
+
+    async def identify(self, request: HTTPConnection) -> Caller:
+        """The caller, by the Authorization header or else by the session cookie.
+
+        Raises:
+            UnauthenticatedError: neither is there, or what is there is not valid.
+        """
+        if self.sessions is None:
+            return LOCAL
+        if (authorization := request.headers.get("authorization")) is not None:
+            scheme, _, presented = authorization.partition(" ")
+            if scheme.lower() != "bearer":
+                raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
+            presented = presented.strip()
+            if (token := self.tokens.trusted(presented=presented)) is None:
+                token = await self.lookers.ask(self.tokens.authenticate, presented)
+            return Caller.of(token)
+        if (cookie := request.cookies.get(COOKIE)) is not None:
+            session = self.sessions.read(cookie)
+            if (token := self.tokens.trusted(session_of=session.sha256)) is None:
+                token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
+            return Caller.of(token, by_session=True)
+        raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
+
+    @staticmethod
+    def credential(request: HTTPConnection) -> str | None:
+        """What the caller has presented, whether valid or not."""
+        authorization = request.headers.get("authorization")
+        return request.cookies.get(COOKIE) if authorization is None else authorization.partition(" ")[2].strip()
+
+
+def refuse_open_network(settings: ServerSettings) -> None:
+    """Keep a server without tokens off the network.
+
+    Raises:
+        SettingsError: access is open and the address is not loopback.
+    """
+    if settings.access == "open" and not settings.is_loopback:
+        raise SettingsError(
+            f"Host {settings.host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens, or listen on 127.0.0.1."
+        )
+
+
+def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks, dark_auditors: Clerks) -> None:
+    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
+
+    Args:
+        dark_auditors: write what darkens a dome, so that its answer waits behind no other change's row.
+    """
+    from services.api.auth.authentication import Gate
+    from services.api.auth.routes import build_access_router
+    from services.api.auth.setup_links import SetupLinks
+    from services.api.http.body_limit import BodyLimit
+    from services.api.http.rate_limits import Rates
+
+    sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
+    access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
+    app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
+    app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
+    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors)

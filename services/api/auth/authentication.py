@@ -1,0 +1,208 @@
+"""Who may pass to the routes, decided before a byte of the body is read. What passes, and what is refused, is audited here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cached_property
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+import anyio
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.requests import HTTPConnection
+from starlette.responses import Response
+
+from services.api.auth.access import Access
+from services.api.auth.audit import AuditLog, Deed
+from services.api.auth.browser_protection import SAFE_METHODS
+from services.api.auth.ownership import Ownership
+from services.api.auth.scopes import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
+from services.api.auth.tokens import Caller, public_id
+from services.api.http.problems import MEDIA_TYPE, Problem, database_lost, response_of
+from services.api.http.rate_limits import Rates, network_of
+from services.api.http.request_log import method_of
+from services.api.http.thread_pools import Clerks
+from services.client.errors import RateError, ScopeError, UnauthenticatedError
+from services.core.errors import PlatformError
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+RECHECK_S = 5.0
+"""A stream of a token that was revoked ends at its first message after this time."""
+
+
+class Gate:
+    """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
+
+    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks, dark_auditors: Clerks) -> None:
+        self._app, self._owner, self._access, self._rates = app, owner, access, rates
+        self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
+        self._ownership = Ownership(access.tokens.engine)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        found = find_route(self._routes, scope["method"], scope["path"]) if scope["type"] == "http" else None
+        if found is None or _is_public(scope, found):
+            await self._app(scope, receive, send)
+            return
+        request = HTTPConnection(scope)
+        deed = Deed(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
+        try:
+            refusal = await (self._stranger_refusal(request, deed) if _is_setup(found) else self._refusal(request, found, deed))
+        except SQLAlchemyError:
+            refusal = database_lost(scope["path"])
+        if refusal is not None:
+            await refusal(scope, receive, send)
+            return
+        await self._pass(request, found.route, deed, receive, send)
+
+    @cached_property
+    def _routes(self) -> Sequence[GuardedRoute]:
+        return guarded_routes(self._owner.routes)
+
+    async def _refusal(self, request: HTTPConnection, found: Found, deed: Deed) -> Response | None:
+        """The answer to a request that may not pass."""
+        path, is_change = request.scope["path"], request.scope["method"] not in SAFE_METHODS
+        try:
+            caller = await self._access.identify(request)
+        except UnauthenticatedError as problem:
+            return await self._refuse_unknown(request, problem, deed)
+        deed.who, deed.token = caller.name, caller.token.id if caller.token else None
+        if wait_s := self._rates.count(deed.token or network_of(deed.address), is_change=is_change):
+            return _too_many(f"Token {caller.name} asked" if caller.token else f"Address {deed.address} asked", wait_s, path)
+        if found.route is None:
+            return _nothing_there(found, path, request.scope["method"])
+        try:
+            found.route.admit(caller)
+        except ScopeError as problem:
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.FORBIDDEN)
+            lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
+            return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
+        request.scope["caller"], request.scope["deed"] = caller, deed
+        return await self._hidden(request, found.route, found.ids, caller, deed)
+
+    async def _hidden(self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, deed: Deed) -> Response | None:
+        """The answer to a request that names something of others: the same as if it were not there, and before anything else of it is looked at."""
+        named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
+        if named is None:
+            return None
+        thing, name = named
+        if (owner := thing.known_owner(name)) is None:
+            owner = await self._access.lookers.ask(thing.find_owner, self._ownership.engine, name)
+        if caller.viewer.may_see(owner):
+            return None
+        if _is_audited(request.scope, route):
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.NOT_FOUND)
+        return response_of(thing.absent(name), request.scope["path"])
+
+    async def _stranger_refusal(self, request: HTTPConnection, deed: Deed) -> Response | None:
+        """The answer to somebody with a setup link who may not even try it: each try counts as a request without a valid token."""
+        deed.who, request.scope["deed"] = "setup link", deed
+        if wait_s := self._rates.count_refusal(network_of(deed.address)):
+            await self._tell_of_many(deed)
+            return _too_many(f"Address {deed.address} asked", wait_s, request.scope["path"])
+        return None
+
+    async def _tell_of_many(self, deed: Deed) -> None:
+        if self._rates.is_worth_telling(network_of(deed.address)):
+            await self._auditors.ask(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+
+    async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, deed: Deed) -> Response:
+        """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
+        credential = Access.credential(request)
+        deed.token = public_id(credential) if credential else None
+        if wait_s := self._rates.count_refusal(network_of(deed.address)):
+            await self._tell_of_many(deed)
+            return _too_many(f"Address {deed.address} was refused", wait_s, request.scope["path"])
+        await self._auditors.ask(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
+        challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
+        return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
+
+    async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
+        scope = request.scope
+        is_audited = _is_audited(scope, route)
+        auditors = self._dark_auditors if route is not None and route.needs is not None and route.needs.darkens else self._auditors
+        known_at, is_over = time.monotonic(), False
+
+        async def send_audited(message: Message) -> None:
+            nonlocal known_at, is_over
+            if is_over:
+                return
+            if message["type"] == "http.response.start" and is_audited:
+                deed.ids |= _made(message)
+                try:
+                    await auditors.ask(self._audit.append, deed, message["status"])
+                except SQLAlchemyError:
+                    is_over = True
+                    full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
+                    await response_of(full, scope["path"])(scope, receive, send)
+                    return
+            if message["type"] == "http.response.body" and message.get("more_body") and time.monotonic() - known_at > RECHECK_S:
+                known_at, is_over = time.monotonic(), not await self._is_still_known(request)
+                if is_over:
+                    await send({"type": "http.response.body", "body": b""})
+                    work.cancel()
+                    return
+            await send(message)
+
+        with anyio.CancelScope() as work:
+            try:
+                await self._app(scope, receive, send_audited)
+            except Exception:
+                if is_audited:
+                    with suppress(SQLAlchemyError):
+                        await auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                raise
+
+    async def _is_still_known(self, request: HTTPConnection) -> bool:
+        # While the database is away nobody can say otherwise; the next message asks again.
+        try:
+            with suppress(SQLAlchemyError):
+                await self._access.identify(request)
+        except UnauthenticatedError:
+            return False
+        return True
+
+
+def _is_audited(scope: Scope, route: GuardedRoute | None) -> bool:
+    return scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
+
+
+def _is_public(scope: Scope, found: Found) -> bool:
+    """The liveness route, and whatever only the page's static files can answer."""
+    if found.route is not None:
+        return found.route.template == LIVENESS
+    return not scope["path"].startswith("/v1/") and not found.allowed_methods
+
+
+def _is_setup(found: Found) -> bool:
+    return found.route is not None and found.route.template == SETUP
+
+
+def _address(scope: Scope) -> str:
+    return scope["client"][0] if scope.get("client") else "unknown"
+
+
+def _made(message: Message) -> dict[str, str]:
+    location = next((value for name, value in message["headers"] if name.lower() == b"location"), None)
+    return {} if location is None else {"made": location.decode("latin-1")}
+
+
+def _too_many(who: str, wait_s: int, path: str) -> Response:
+    return response_of(RateError(f"{who} too often; wait {wait_s} s."), path, {"Retry-After": str(wait_s)})
+
+
+def _nothing_there(found: Found, path: str, method: str) -> Response:
+    if found.allowed_methods:
+        allowed = ", ".join(sorted(found.allowed_methods))
+        problem = Problem.of(HTTPStatus.METHOD_NOT_ALLOWED, "method-not-allowed", f"{path} does not take {method}; it takes {allowed}.", path)
+        return Response(problem.model_dump_json(), problem.status, {"Allow": allowed}, MEDIA_TYPE)
+    problem = Problem.of(HTTPStatus.NOT_FOUND, "not-found", f"There is nothing at {path}; GET /v1/openapi.json lists what there is.", path)
+    return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)

@@ -1,0 +1,92 @@
+"""What every answer carries and what no request may do, as plain ASGI so that streams pass through unbuffered."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
+
+from services.api.http.problems import MEDIA_TYPE, Problem
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+_ALWAYS = (
+    (b"content-security-policy", PAGE_POLICY.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"permissions-policy", b"camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()"),
+)
+_BY_TLS_ONLY = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
+_NOT_KEPT = (b"cache-control", b"no-store")
+
+
+class Shield:
+    """Adds security headers; refuses other names for this server (DNS rebinding), and changes that another site's page asks a visitor's browser to make.
+
+    Args:
+        names: of this server, as clients use them.
+    """
+
+    def __init__(self, app: ASGIApp, *, names: Iterable[str], secure: bool) -> None:
+        self._app, self._names = app, frozenset(name.strip("[] ").lower() for name in names)
+        self._headers = (*_ALWAYS, *((_BY_TLS_ONLY,) if secure else ()))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request; ``secure`` servers tell browsers to come by TLS only."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_shielded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                is_api = scope["path"].startswith("/v1/")
+                own = [one for one in message["headers"] if not (is_api and one[0] == b"cache-control")]
+                set_already = {name for name, _ in own}
+                message["headers"] = [*own, *(one for one in self._headers if one[0] not in set_already), *([_NOT_KEPT] if is_api else [])]
+            await send(message)
+
+        asked, refusal = Headers(scope=scope), None
+        if _name_of(asked.get("host", "")) not in self._names:
+            detail = "This server does not go by the name in the request's Host; add it to DENTINE__SERVER__NAMES, or use another."
+            refusal = Problem.of(HTTPStatus.BAD_REQUEST, "foreign-host", detail, scope["path"])
+        elif scope["method"] not in SAFE_METHODS and _is_foreign(asked):
+            detail = "Another site asked for this change; use the dashboard or the API itself."
+            refusal = Problem.of(HTTPStatus.FORBIDDEN, "foreign-origin", detail, scope["path"])
+        if refusal is not None:
+            await Response(refusal.model_dump_json(), refusal.status, media_type=MEDIA_TYPE)(scope, receive, send_shielded)
+            return
+        await self._app(scope, receive, send_shielded)
+
+
+def _name_of(host: str) -> str | None:
+    match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^][:/?#@\s]+)(:[0-9]*)?", host)
+    return match[1].strip("[]").lower() if match else None
+
+
+def _is_foreign(asked: Headers) -> bool:
+    """Whether another site's page may be behind a change. A browser says where a change comes from; one that sends a cookie must."""
+    origin, site = asked.get("origin"), asked.get("sec-fetch-site")
+    if origin is not None and _host_of(origin) != asked.get("host"):
+        return True
+    if site not in {None, "same-origin", "none"}:
+        return True
+    return origin is None and site is None and "cookie" in asked and "authorization" not in asked
+
+
+def _host_of(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

@@ -1,0 +1,75 @@
+"""Browser sessions: a signed cookie that stands for a token for some hours. The server keeps nothing but those that were ended; see ``ended_sessions``.
+
+::
+
+    dentine_<token id>_<expiry, Unix s>_<random>.<HMAC-SHA256>     version 0.1 had no random part
+
+The signing key lies beside the database and not in it, so that a copy of the database opens no session.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.api.auth.tokens import Token
+from services.client.errors import UnauthenticatedError
+from services.core.files.private import write_private
+
+COOKIE = "dentine-session"
+KEY_FILE = "session.key"
+_KEY_BYTES = 32
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a valid cookie says."""
+
+    token_id: str
+    expires_s: float
+    sha256: str
+    """Of the cookie, which names the session without opening it."""
+
+
+class Sessions:
+    """Issues and reads session cookies."""
+
+    def __init__(self, key: bytes, lifetime_s: float, clock: Callable[[], float] = time.time) -> None:
+        self._key, self._lifetime_s, self._clock = key, lifetime_s, clock
+
+    def issue(self, token: Token) -> tuple[str, int]:
+        """A session for a valid token, and its lifetime in s; it never outlives the token."""
+        now = self._clock()
+        expires_s = int(min(now + self._lifetime_s, token.expires_s or float("inf")))
+        claim = f"dentine_{token.id}_{expires_s}_{secrets.token_hex(8)}"
+        return f"{claim}.{self._sign(claim)}", max(0, expires_s - int(now))
+
+    def read(self, cookie: str) -> Session:
+        """The session that a cookie stands for.
+
+        Raises:
+            UnauthenticatedError: not signed by this server, or over.
+        """
+        claim, _, signature = cookie.rpartition(".")
+        match = re.fullmatch(r"dentine_([0-9a-f]{12})_([0-9]{1,12})(_[0-9a-f]{16})?", claim)
+        is_ours = hmac.compare_digest(self._sign(claim).encode(), signature.encode("utf-8", "surrogateescape"))
+        if match is None or not is_ours or self._clock() >= int(match[2]):
+            raise UnauthenticatedError("This session is over; sign in again with a token.")
+        return Session(match[1], float(match[2]), hashlib.sha256(claim.encode()).hexdigest())
+
+    def _sign(self, claim: str) -> str:
+        return hmac.new(self._key, claim.encode("utf-8", "surrogateescape"), hashlib.sha256).hexdigest()
+
+
+def read_key(data: Path) -> bytes:
+    """The signing key of a data folder; made on first use, readable by its owner alone."""
+    path = data / KEY_FILE
+    if not path.exists():
+        write_private(path, secrets.token_bytes(_KEY_BYTES))
+    return path.read_bytes()

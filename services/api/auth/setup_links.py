@@ -1,0 +1,87 @@
+"""The first token of a server: a link in its log makes it, so that nobody needs a shell where the server runs.
+
+As long as the token table is empty, each start of a server writes one link to the log. It holds for an hour, and the first one that is used makes an
+administrator's token and ends them all. The database keeps a link's hash alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Callable
+
+import sqlalchemy as sql
+from pydantic import SecretStr
+
+from services.api.auth.audit import Deed
+from services.api.auth.tokens import IssuedToken, Scope, insert_token, token_table
+from services.client.errors import SetupLinkError
+from services.core.settings import ServerSettings
+from services.pipeline.database import metadata, writing
+
+LIFETIME_S = 3600.0
+"""How long a link holds: long enough to find it in the log, too short to be found in an old one."""
+NAME = "administrator"
+"""Of the token that a link makes."""
+
+setup_link_table = sql.Table("setup_link", metadata, sql.Column("sha256", sql.Text, primary_key=True), sql.Column("expires_s", sql.Float, nullable=False))
+
+
+class SetupLinks:
+    """The links of a database, of all servers that share it.
+
+    Args:
+        clock: Unix time.
+    """
+
+    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time) -> None:
+        self._engine, self._clock = engine, clock
+
+    def issue(self) -> SecretStr | None:
+        """The secret of a new link, or None where there is a token, whether it still holds or not."""
+        secret = secrets.token_urlsafe(32)
+        with writing(self._engine) as connection:
+            if _has_token(connection):
+                return None
+            connection.execute(setup_link_table.delete().where(setup_link_table.c.expires_s <= self._clock()))
+            connection.execute(setup_link_table.insert().values(sha256=_hash(secret), expires_s=self._clock() + LIFETIME_S))
+        return SecretStr(secret)
+
+    def redeem(self, secret: str, deed: Deed) -> IssuedToken:
+        """The administrator's token that a link stands for; no link holds after this.
+
+        Raises:
+            SetupLinkError: it was used, has expired or is unknown, or there is a token by now; the message does not tell which.
+        """
+        presented = _hash(secret)
+        with writing(self._engine) as connection:
+            held = connection.scalars(sql.select(setup_link_table.c.sha256).where(setup_link_table.c.expires_s > self._clock())).all()
+            is_known = sum(hmac.compare_digest(presented, one) for one in held) > 0  # all of them, so that the time tells nothing
+            if not is_known or _has_token(connection):
+                what = "This setup link was used, has expired or is unknown"
+                raise SetupLinkError(f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for one.")
+            connection.execute(setup_link_table.delete())
+            return insert_token(connection, NAME, (Scope.ADMIN,), self._clock(), None, deed)
+
+
+def setup_address(settings: ServerSettings, port: int) -> str:
+    """Where people reach the page: the public URL, else the first further name by TLS, else this machine's own address.
+
+    Args:
+        port: that the server listens on.
+    """
+    if settings.public_url is not None:
+        return settings.public_url.rstrip("/")
+    if first := settings.names.split(",")[0].strip():
+        return f"https://{first}"
+    return f"http://127.0.0.1:{port}"
+
+
+def _has_token(connection: sql.Connection) -> bool:
+    return connection.execute(sql.select(token_table.c.id).limit(1)).first() is not None
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()

@@ -1,0 +1,298 @@
+"""Tokens: who may call, and what for. The database holds their hashes; the token itself is shown once.
+
+::
+
+    dentine_<id>_<secret>     id: public, 48 bits, finds the row; secret: 256 random bits
+
+A secret of 256 random bits needs no slow hash: SHA-256 of it cannot be searched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import math
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Annotated, Any, NamedTuple, Self
+
+import sqlalchemy as sql
+from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
+
+from services.api.auth.audit import Deed
+from services.api.auth.ended_sessions import EndedSessions
+from services.client.errors import UnauthenticatedError, UnknownTokenError
+from services.core.errors import InputError
+from services.core.geometry import Record
+from services.core.owners import LOCAL_VIEWER, Viewer, owner_of_token
+from services.pipeline.database import Query, metadata, writing
+
+TRUSTED_S = 1.0
+"""How long a server goes on trusting a token that it has looked up; one that is revoked at this server ends at once."""
+MOST_TRUSTED = 1000
+LAST_USE_STEP_S = 3600.0
+"""The last use is noted once in this time, so that reading stays reading."""
+DAY_S = 86400.0
+NAME = "[A-Za-z0-9][A-Za-z0-9.-]{0,63}"
+"""Pattern of a token's name."""
+ID = "[0-9a-f]{12}"
+"""Pattern of a token's id, which no name has, so that either names one token."""
+
+token_table = sql.Table(
+    "token",
+    metadata,
+    sql.Column("id", sql.Text, primary_key=True),
+    sql.Column("name", sql.Text, nullable=False),
+    sql.Column("scopes", sql.Text, nullable=False),
+    sql.Column("sha256", sql.Text, nullable=False),
+    sql.Column("created_s", sql.Float, nullable=False),
+    sql.Column("expires_s", sql.Float),
+    sql.Column("revoked_s", sql.Float),
+    sql.Column("last_used_s", sql.Float),
+    sql.Column("group", sql.Text),
+)
+
+_ONE = Query(sql.select(token_table).where(token_table.c.id == sql.bindparam("of")))
+
+
+class Scope(StrEnum):
+    """What a token may do. ``admin`` includes all, ``submit`` includes ``read``."""
+
+    READ = "read"
+    SUBMIT = "submit"
+    OPERATE_DOME = "operate-dome"
+    ADMIN = "admin"
+
+    @property
+    def included(self) -> frozenset[Scope]:
+        """This scope and those that come with it."""
+        return {Scope.ADMIN: frozenset(Scope), Scope.SUBMIT: frozenset({Scope.SUBMIT, Scope.READ})}.get(self, frozenset({self}))
+
+
+class Token(Record):
+    """A token as it may be shown at any time."""
+
+    id: str = Field(description="public part of the token")
+    name: str = Field(description="who or what uses it")
+    scopes: tuple[Scope, ...]
+    created_s: float = Field(description="Unix time")
+    expires_s: float | None = Field(description="Unix time; null: never")
+    revoked_s: float | None = Field(description="Unix time; null: not revoked")
+    last_used_s: float | None = Field(description="Unix time, noted at most once an hour; null: never")
+    group: str | None = Field(default=None, description="owns what its tokens make, and they see it; null: the token stands alone")
+
+
+class IssuedToken(Token):
+    """A token on the one occasion when its secret is shown."""
+
+    token: Annotated[SecretStr, WithJsonSchema({"type": "string"})] = Field(description="send it as 'Authorization: Bearer …'; it is not shown again")
+
+    @field_serializer("token", when_used="json")
+    def _reveal(self, token: SecretStr) -> str:
+        return token.get_secret_value()
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Whom a request comes from."""
+
+    name: str
+    scopes: frozenset[Scope]
+    token: Token | None = None
+    by_session: bool = False
+
+    @cached_property
+    def viewer(self) -> Viewer:
+        """What it may see."""
+        if self.token is None:
+            return LOCAL_VIEWER
+        return Viewer(self.token.group or owner_of_token(self.token.id), sees_all=Scope.ADMIN in self.scopes, uses_paths=Scope.SUBMIT in self.scopes)
+
+    @classmethod
+    def of(cls, token: Token, *, by_session: bool = False) -> Caller:
+        """The caller that a valid token stands for."""
+        return cls(token.name, frozenset().union(*(scope.included for scope in token.scopes)), token, by_session)
+
+
+LOCAL = Caller("local", frozenset(Scope))
+"""Whoever is on this machine where access is open."""
+
+
+class _Credential(NamedTuple):
+    """A token's hash, or a session's, else the id of its token: an id is public, so one must never pass for the other."""
+
+    sha256: str | None
+    session_of: str | None
+
+    @classmethod
+    def of(cls, presented: str | None = None, session_of: str | None = None) -> Self:
+        return cls(None if presented is None else _hash(presented), session_of)
+
+
+class _Trust(NamedTuple):
+    """A token that was looked up, how long to trust it, and how many were revoked at this server before the look-up began: after another one it is void."""
+
+    token: Token
+    until_ticks: float
+    revocations: int
+
+
+class Tokens:
+    """The token table.
+
+    Args:
+        clock: Unix time; tokens expire by it.
+        ticks: seconds that no step of the clock changes; trust ends by them.
+    """
+
+    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time, ticks: Callable[[], float] = time.monotonic) -> None:
+        self.engine, self._clock, self._ticks = engine, clock, ticks
+        self.ended_sessions = EndedSessions(engine, clock)
+        self._trusted: dict[_Credential, _Trust] = {}
+        self._revocations = 0
+
+    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed, group: str | None = None) -> IssuedToken:
+        """Make a token; the result is the only place where its secret is.
+
+        Args:
+            group: owns what it makes; None: nobody but the token itself and administrators see that.
+
+        Raises:
+            InputError: the name is malformed or belongs to a living token, the group's is malformed, or there is no scope.
+        """
+        if not re.fullmatch(NAME, name) or name == LOCAL.name or re.fullmatch(ID, name):
+            what = f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like an id"
+            raise InputError(f"Token name {name!r} does not serve; {what}.")
+        if group is not None and not re.fullmatch(NAME, group):
+            raise InputError(f"Group {group!r} of token {name} does not serve; use up to 64 letters, digits, points and hyphens.")
+        if not (wanted := sorted(set(scopes))):
+            raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
+        now = self._clock()
+        with writing(self.engine) as connection:
+            namesake = sql.select(token_table).where(token_table.c.name == name, token_table.c.revoked_s.is_(None))
+            if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
+                raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
+            expires_s = None if expires_days is None else now + expires_days * DAY_S
+            return insert_token(connection, name, wanted, now, expires_s, deed, group)
+
+    def list(self) -> list[Token]:
+        """Every token, newest first, revoked and expired ones too."""
+        with self.engine.connect() as connection:
+            return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
+
+    def revoke(self, token_id: str, deed: Deed) -> Token:
+        """End a token now, by its id, else by the name of one that is not revoked; ending it again changes nothing.
+
+        Raises:
+            UnknownTokenError: there is none.
+        """
+        now = self._clock()
+        with writing(self.engine) as connection:
+            is_meant = sql.or_(token_table.c.id == token_id, sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)))
+            id_first = sql.case((token_table.c.id == token_id, 0), else_=1)
+            found = connection.execute(sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())).mappings().first()
+            if found is None:
+                raise UnknownTokenError(f"There is no token {token_id}; list the tokens to see their ids.")
+            row = dict(found)
+            if row["revoked_s"] is None:
+                row["revoked_s"] = now
+                connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(revoked_s=now))
+            deed.ids["token_id"] = row["id"]
+            deed.write(connection, 200)
+        self._revocations += 1
+        return Token(**_fields(row))
+
+    def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
+        """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks nobody."""
+        found = self._trusted.get(_Credential.of(presented, session_of))
+        return found.token if found is not None and self._ticks() < found.until_ticks and found.revocations == self._revocations else None
+
+    def authenticate(self, presented: str) -> Token:
+        """The token that was presented.
+
+        Raises:
+            UnauthenticatedError: it is malformed, unknown, expired or revoked; the message does not tell which.
+        """
+        revocations, row = self._revocations, self._find(public_id(presented) or "")
+        is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
+        if row is None or not is_same or not _is_living(row, self._clock()):
+            raise UnauthenticatedError("This token is unknown, expired or revoked; ask an administrator for a new one.")
+        self._note_use(row)
+        return self._trust(_Credential.of(presented), row, revocations)
+
+    def end_session(self, sha256: str, expires_s: float) -> None:
+        """End a session now: at this server with the next request, at others within ``TRUSTED_S``."""
+        self.ended_sessions.add(sha256, expires_s)
+        self._revocations += 1
+
+    def living(self, token_id: str, session: str | None = None) -> Token:
+        """The token with this id, for a session that it has opened.
+
+        Args:
+            session: SHA-256 of its cookie.
+
+        Raises:
+            UnauthenticatedError: the token has expired or was revoked since, or the session was ended.
+        """
+        revocations, row = self._revocations, self._find(token_id)
+        if session is not None and self.ended_sessions.has(session):
+            raise UnauthenticatedError("This session was ended; sign in again with a token.")
+        if row is None or not _is_living(row, self._clock()):
+            raise UnauthenticatedError("The token of this session has expired or was revoked; sign in with another one.")
+        return self._trust(_Credential.of(session_of=session or token_id), row, revocations)
+
+    def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
+        token = Token(**_fields(row))
+        left_s = math.inf if token.expires_s is None else token.expires_s - self._clock()
+        if len(self._trusted) >= MOST_TRUSTED:
+            self._trusted.clear()
+        self._trusted[credential] = _Trust(token, self._ticks() + min(TRUSTED_S, left_s), revocations)
+        return token
+
+    def _find(self, token_id: str) -> Any:
+        rows = _ONE.rows(self.engine, of=token_id)
+        return dict(zip(token_table.c.keys(), rows[0], strict=True)) if rows else None
+
+    def _note_use(self, row: Any) -> None:
+        now = self._clock()
+        if row["last_used_s"] is None or now - row["last_used_s"] >= LAST_USE_STEP_S:
+            with suppress(sql.exc.OperationalError), writing(self.engine) as connection:  # a full disk must not refuse a reader
+                connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
+
+
+def insert_token(
+    connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, deed: Deed, group: str | None = None
+) -> IssuedToken:
+    """Add a token, and the audit's row of it, inside the caller's transaction."""
+    token_id = secrets.token_hex(6)
+    secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
+    row = {"id": token_id, "name": name, "scopes": " ".join(scopes), "sha256": _hash(secret.get_secret_value()), "created_s": now_s}
+    row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None, "group": group}
+    connection.execute(token_table.insert().values(row))
+    deed.ids["token_id"] = token_id
+    deed.write(connection, 201)
+    return IssuedToken(**_fields(row), token=secret)
+
+
+def public_id(credential: str) -> str | None:
+    """The public part of a token or session, whether valid or not."""
+    match = re.match(r"dentine_([0-9a-f]{12})_", credential)
+    return match[1] if match else None
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def _is_living(row: Any, now: float) -> bool:
+    return row["revoked_s"] is None and (row["expires_s"] is None or now < row["expires_s"])
+
+
+def _fields(row: Any) -> dict[str, Any]:
+    return {name: row[name] for name in Token.model_fields} | {"scopes": tuple(Scope(name) for name in row["scopes"].split())}

@@ -1,0 +1,79 @@
+"""What the server itself needs to know of a capture: its cameras, lights and size, and nothing of its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from services.api.captures.contents import content_fault
+from services.core.calibration import MAX_LIGHTS, Calibration, read_description
+from services.core.errors import CaptureInputError
+from services.core.geometry import Record
+from services.core.settings import UploadLimits
+from services.core.store import MANIFEST
+
+MAX_DESCRIPTION_BYTES = 4 * 2**20
+"""Of a JSON file that is parsed: five thousand images with the longest names, under a thousand lights, take a third of it."""
+MAX_CAMERAS = 1000
+"""More than any rig has; with as many lights, what is told of a capture stays below a megabyte."""
+_PLACES = ("capture.json", MANIFEST, f"capture/{MANIFEST}")
+
+
+class Described(Record):
+    """A capture in short."""
+
+    calibration: Calibration
+    image_px: int
+    """Pixels of all its images together."""
+
+
+class CaptureReader(Protocol):
+    """Reads what others have written: in this process, or in one of bounded memory and time."""
+
+    def content_faults(self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]) -> Iterator[tuple[str, str]]:
+        """Names of files, which are given with where they lie, and what is wrong with their contents; see ``capture_contents``."""
+
+    def describe(self, capture: Path) -> Described:
+        """See ``describe``."""
+
+
+class ReadHere:
+    """Reads in this process."""
+
+    def content_faults(self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]) -> Iterator[tuple[str, str]]:
+        """See ``CaptureReader``."""
+        for path, name in files:
+            if (fault := content_fault(path, name, limits, names)) is not None:
+                yield name, fault
+
+    def describe(self, capture: Path) -> Described:
+        """See ``describe``."""
+        return describe(capture)
+
+
+Describe = Callable[[Path], Described]
+
+
+def description_file(capture: Path) -> Path | None:
+    """Where a capture, or a job that holds one, says what it is; None if nowhere."""
+    return next((path for name in _PLACES if (path := capture / name).is_file()), None)
+
+
+def describe(capture: Path) -> Described:
+    """What a folder capture or a published one says of itself.
+
+    Raises:
+        CaptureInputError: it cannot be read, or says too much. CorruptStoreError: it was published and is damaged.
+    """
+    path = description_file(capture)
+    if path is not None and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
+        raise CaptureInputError(f"{path} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed; leave out what describes no image.")
+    description = read_description(capture)
+    for what, count, most in (("cameras", len(description.cameras), MAX_CAMERAS), ("lights", len(description.lights), MAX_LIGHTS)):
+        if count > most:
+            raise CaptureInputError(f"{path} lists {count} {what}, more than any rig has ({most}); remove those without images.")
+    pixels: Mapping[str, int] = {camera.name: camera.size[0] * camera.size[1] for camera in description.cameras}
+    seen = [image.camera for image in description.images] or [name for name in pixels for _ in description.lights]
+    calibration = Calibration(**{part: getattr(description, part) for part in Calibration.model_fields})
+    return Described(calibration=calibration, image_px=sum(pixels.get(name, 0) for name in seen))

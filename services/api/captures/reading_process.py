@@ -1,0 +1,69 @@
+"""``python -m services.api.captures.reading_process BYTES``: reads what others have written, in so much memory. Requests and answers are lines of JSON.
+
+What a file makes of it ends with this process: too much memory, too much time, a fault in a parser. It can write to no file and leaves no dump.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy.lib.format  # noqa: F401 - so that it is not imported within the bounds
+
+from services.api.captures.contents import content_fault
+from services.api.captures.descriptions import describe
+from services.core.errors import DentineError
+from services.core.settings import UploadLimits
+
+GROWN_BYTES = 64 * 2**20
+"""Whoever has taken so much more than at its start ends after its answer, as the memory of what was parsed stays with the process."""
+
+
+def main(most_bytes: int) -> None:
+    """Answer requests until the pipe is closed."""
+    _bound(most_bytes)
+    start_bytes = _peak_bytes()
+    for line in sys.stdin.buffer:
+        answer = _answer(json.loads(line))
+        is_last = _peak_bytes() - start_bytes > GROWN_BYTES
+        print(json.dumps(answer | {"is_last": is_last}), flush=True)
+        if is_last:
+            return
+
+
+def _answer(asked: dict[str, Any]) -> dict[str, Any]:
+    try:
+        if "capture" in asked:
+            return {"described": describe(Path(asked["capture"])).model_dump(mode="json")}
+        limits, names = UploadLimits.model_validate(asked["limits"]), frozenset(asked["names"])
+        return {"faults": [content_fault(Path(path), name, limits, names) for path, name in asked["files"]]}
+    except DentineError as problem:
+        return {"code": problem.code, "message": problem.message}
+    except MemoryError:
+        return {"is_costly": True}
+    except OSError as problem:
+        return {"code": DentineError.code, "message": f"{problem.filename or 'A file'} cannot be read ({problem.strerror}); check the server's disk."}
+
+
+def _bound(most_bytes: int) -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    bounds = {
+        resource.RLIMIT_AS: pages * resource.getpagesize() + most_bytes,
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_FSIZE: 0,
+    }
+    for kind, bound in bounds.items():
+        with contextlib.suppress(OSError, ValueError):  # a bound that is lower already
+            resource.setrlimit(kind, (bound, bound))
+
+
+def _peak_bytes() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

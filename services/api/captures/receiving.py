@@ -1,0 +1,148 @@
+"""The bytes of one request on their way to disk, with bounded memory.
+
+Blocks are written behind the recorded offset, made durable, and only then recorded. A request with a checksum is recorded as a whole
+once the checksum holds; without one, what came before the connection broke is kept.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hashlib
+import hmac
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+
+from starlette.requests import ClientDisconnect
+
+from services.api.captures.blobs import PartialFile
+from services.api.captures.uploads import Upload, Uploads
+from services.api.http.awaited_threads import in_thread
+from services.client.errors import ChecksumError, TooLargeError
+from services.client.tus import Checksum
+from services.core.errors import DentineError, DiskFullError
+
+BLOCK_BYTES = 2**20
+RECORD_BYTES = 64 * 2**20
+"""A long request is recorded every so often, so that a dead server loses no more of it."""
+DRAIN_BYTES = 16 * 2**20
+"""Of a refused request so much is read and dropped, so that its client reads the answer and not a broken pipe."""
+
+
+class SilenceError(Exception):
+    """The client sent nothing for too long."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """What a request led to."""
+
+    offset: int
+    expires_s: float
+
+
+async def receive(uploads: Uploads, capture: str, number: int, offset: int, stream: AsyncIterator[bytes], checksum: Checksum | None) -> Received:
+    """Append a request's bytes to an upload and verify the file once it is whole.
+
+    Raises:
+        LockedError, OffsetError, TooLargeError, ChecksumError, CorruptUploadError, DiskFullError: see ``Uploads`` and ``PartialFile``.
+        SilenceError: nothing came for too long; what came before is kept as if the connection had broken.
+    """
+    body = _audible(stream, uploads.limits.silence_s)
+    try:
+        with uploads.claims.claim(capture, number):
+            upload = await in_thread(uploads.begin, capture, number, offset)
+            result = await _append(uploads, upload, body, checksum) if upload.missing_bytes else Received(offset, upload.expires_s)
+            if result.offset == upload.row.file.bytes:
+                await in_thread(uploads.finish, upload.row)
+            return result
+    except DentineError:
+        await _drain(body)
+        raise
+
+
+async def _append(uploads: Uploads, upload: Upload, body: AsyncIterator[bytes], checksum: Checksum | None) -> Received:
+    with ExitStack() as opened:
+        partial = await in_thread(_open, uploads, upload, opened)
+        tail = _Tail(uploads, upload, partial, checksum)
+        try:
+            async for chunk in body:
+                tail.buffer += chunk
+                if len(tail.buffer) >= BLOCK_BYTES:
+                    await in_thread(tail.flush)
+        except (ClientDisconnect, SilenceError):
+            if checksum is None:
+                await in_thread(tail.flush)
+                await in_thread(tail.record)
+            raise
+        await in_thread(tail.flush)
+        tail.require_checksum()
+        return await in_thread(tail.record)
+
+
+def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
+    """Open the file where its next bytes go, to be closed with ``opened``, also if whoever asked has gone meanwhile."""
+    try:
+        return opened.enter_context(uploads.open_partial(upload))
+    except OSError as problem:
+        if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
+            raise DiskFullError("The server's disk is full; free some space there and send again, what was acknowledged is kept.") from problem
+        raise
+
+
+class _Tail:
+    """The end of an upload within one request."""
+
+    def __init__(self, uploads: Uploads, upload: Upload, partial: PartialFile, checksum: Checksum | None) -> None:
+        self._uploads, self._upload, self._partial, self._checksum = uploads, upload, partial, checksum
+        self._written = self._recorded = upload.offset
+        self._hash = hashlib.new(checksum.algorithm, usedforsecurity=False) if checksum is not None else None
+        self.buffer = bytearray()
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        block, self.buffer = bytes(self.buffer), bytearray()
+        file = self._upload.row.file
+        if self._written + len(block) > file.bytes:
+            raise TooLargeError(f"More bytes were sent of file {file.path!r} than the {file.bytes} of the manifest; send only what is missing.")
+        self._partial.write(block)
+        self._written += len(block)
+        if self._hash is not None:
+            self._hash.update(block)
+        elif self._written - self._recorded >= RECORD_BYTES:
+            self.record()
+
+    def record(self) -> Received:
+        """Make durable and known what is written."""
+        self._partial.sync()
+        self._recorded = self._written
+        return Received(self._written, self._uploads.record(self._upload, self._written))
+
+    def require_checksum(self) -> None:
+        """Refuse bytes that were altered on their way."""
+        if self._hash is not None and self._checksum is not None and not hmac.compare_digest(self._hash.digest(), self._checksum.digest):
+            raise ChecksumError(
+                f"The bytes sent of file {self._upload.row.file.path!r} do not have the {self._checksum.algorithm} that was sent with them; send them again."
+            )
+
+
+async def _audible(stream: AsyncIterator[bytes], silence_s: float) -> AsyncIterator[bytes]:
+    while True:
+        try:
+            async with asyncio.timeout(silence_s):
+                chunk = await anext(stream)
+        except StopAsyncIteration:
+            return
+        except TimeoutError as problem:
+            raise SilenceError from problem
+        yield chunk
+
+
+async def _drain(body: AsyncIterator[bytes]) -> None:
+    dropped = 0
+    with suppress(ClientDisconnect, SilenceError):
+        async for chunk in body:
+            dropped += len(chunk)
+            if dropped > DRAIN_BYTES:
+                break

@@ -1,0 +1,70 @@
+"""Gives every request an id, a log line and its place in the metrics, as plain ASGI so that streams pass through unbuffered."""
+
+from __future__ import annotations
+
+import logging
+import re
+import secrets
+import time
+from typing import TYPE_CHECKING
+
+from starlette.datastructures import Headers, MutableHeaders
+
+from services.api.health.metrics import METHODS, RequestMetrics
+from services.pipeline.logs import bind_request
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+HEADER = "X-Request-ID"
+UNROUTED = "unrouted"
+"""Stands for the route of a request that none took, so that neither logs nor metrics repeat what a stranger asked for."""
+
+_WELL_FORMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+class RequestLog:
+    """Takes the client's request id if it is well-formed, else makes one; answers with it, logs it, and keeps it in the request's state."""
+
+    def __init__(self, app: ASGIApp, metrics: RequestMetrics) -> None:
+        self._app, self._metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        asked = Headers(scope=scope).get(HEADER, "")
+        request_id = asked if _WELL_FORMED.fullmatch(asked) else secrets.token_hex(8)
+        scope.setdefault("state", {})["request_id"] = request_id
+        bind_request(request_id)
+        started_s, status = time.perf_counter(), 0
+
+        async def send_named(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message)[HEADER] = request_id
+                status = message["status"]
+                self._metrics.count(scope["method"], route_of(scope), status, time.perf_counter() - started_s)
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_named)
+        finally:
+            duration_s = time.perf_counter() - started_s
+            if not status:  # an exception, which the server answers further out
+                status = 500
+                self._metrics.count(scope["method"], route_of(scope), status, duration_s)
+            told = {"method": method_of(scope), "route": route_of(scope), "status": status, "duration_s": round(duration_s, 6)}
+            logging.getLogger(__name__).info("Request answered.", extra=told | {"client": scope["client"][0] if scope.get("client") else None})
+
+
+def method_of(scope: Scope) -> str:
+    """The request's method, ``other`` for one that HTTP does not know: that is whatever a stranger wrote, at any length."""
+    method: str = scope["method"]
+    return method if method in METHODS else "other"
+
+
+def route_of(scope: Scope) -> str:
+    """The template of the route that took the request; never its path or query."""
+    return getattr(scope.get("route"), "path", None) or UNROUTED

@@ -1,0 +1,325 @@
+"""Which jobs may start, and what the others wait for: a place beside the ones that run, disk, memory, a dome, workers.
+
+What disk or memory the machine does not have in all is refused when a job is submitted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from services.api.jobs.repository import Job
+from services.client.errors import JobTooLargeError
+from services.core.errors import DentineError, DiskFullError, StoreError
+from services.core.placement import rank
+from services.core.records import JobSpec
+from services.core.store import MANIFEST
+
+DISK_PER_CAPTURE = 6.0
+"""Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are most."""
+LEAST_DISK_BYTES = 64 * 2**20
+"""What a job stores of a small capture: pictures, checkpoint and asset."""
+RIG_CAPTURE_BYTES = 2 * 2**30
+"""A capture that a rig is about to take."""
+DEMO_CAPTURE_BYTES = 2**20
+"""What the demonstration's rig takes: 0.3 MB were measured."""
+WORKER_BYTES = 3 * 2**29
+"""Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
+MOST_FILES = 5_000
+"""Of a capture that are looked at."""
+_DESCRIPTIONS = ("capture.json", "slab.json", MANIFEST, f"capture/{MANIFEST}")
+"""One of these makes a folder a capture, or a job that holds one."""
+KEPT_FREE_BYTES = 256 * 2**20
+"""Disk that no job may count on."""
+AT_ONCE = 4
+"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they share the
+same workers, and holds memory; but two long jaws should not keep a short tooth waiting, and while one job is prepared or solves,
+another one keeps the workers busy."""
+RETRY_S = 10.0
+"""How long a job waits after it was paused."""
+
+
+def turn(job: Job) -> tuple[int, int]:
+    """Queued jobs start in this order: those of higher priority first, among equals the oldest."""
+    return rank(job.spec.priority), job.number
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a job is predicted to take."""
+
+    disk_bytes: int
+    memory_bytes: int
+
+
+def predict(spec: JobSpec) -> Needs:
+    """Prediction from the size of the capture and the number of workers."""
+    rigs = DEMO_CAPTURE_BYTES if spec.is_demo else RIG_CAPTURE_BYTES
+    size = rigs if spec.capture is None else _stored_bytes(spec.capture)
+    return Needs(LEAST_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
+
+
+def _stored_bytes(folder: Path) -> int:
+    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its stage and not walked through here. Nor
+    # does a folder that cannot be listed, as on a mount that went away, keep other jobs from starting.
+    total = 0
+    with suppress(OSError):
+        if not any((folder / one).is_file() for one in _DESCRIPTIONS):
+            return 0
+        for path in itertools.islice(folder.rglob("*"), MOST_FILES):
+            with suppress(OSError):
+                status = path.lstat()
+                total += 512 * status.st_blocks if stat.S_ISREG(status.st_mode) else 0
+    return total
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What there is."""
+
+    free_disk_bytes: int
+    disk_bytes: int
+    memory_bytes: int | None
+    """None where workers run elsewhere."""
+
+    @classmethod
+    def of(cls, folder: Path, *, has_workers: bool = True) -> Machine:
+        """This machine, and the disk of a folder."""
+        disk = shutil.disk_usage(folder)
+        return cls(disk.free, disk.total, psutil.virtual_memory().total if has_workers else None)
+
+
+_TURN = ("Waits for a place", "Waits for the dome")
+"""How the sentences begin that say that a job's turn has not come."""
+
+
+@dataclass
+class _Running:
+    """A job that was started and has not ended."""
+
+    number: int
+    needs: Needs
+    dome: str | None
+    """Address of the dome that it captures with."""
+    has_place: bool
+    """False while it only captures."""
+    begun_s: float
+    sharing_then_s: float
+    """``Admission._sharing_s`` when it began."""
+
+
+class Admission:
+    """Holds jobs back; remembers why.
+
+    Args:
+        look: what the machine has now.
+        at_once: most jobs that run side by side. A capture needs no place: it has a worker of its own, and a person waits.
+        lacks: why no worker can capture (True) or run other stages (False); None if one can.
+    """
+
+    def __init__(
+        self,
+        look: Callable[[], Machine],
+        clock: Callable[[], float] = time.monotonic,
+        at_once: int = AT_ONCE,
+        lacks: Callable[[bool], str | None] = lambda _: None,
+    ) -> None:
+        self._look, self._clock, self._at_once, self._lacks = look, clock, at_once, lacks
+        self._lock = threading.Lock()
+        self._needs: dict[str, Needs] = {}
+        self._paused: dict[str, tuple[float, str]] = {}
+        self._reasons: dict[str, str] = {}
+        self._running: dict[str, _Running] = {}
+        self._stalled: dict[str, str] = {}
+        self._lacking: dict[bool, str | None] = {}
+        self._first_in_line = ""
+        self._sharing_s, self._summed_to_s = 0.0, clock()
+
+    @property
+    def sharing(self) -> int:
+        """How many jobs share the workers now."""
+        with self._lock:
+            return len(self._placed())
+
+    def beside(self, job_id: str) -> float:
+        """How many jobs shared the workers while a job ran, itself included; mean until now."""
+        with self._lock:
+            self._sum_sharing()
+            job = self._running[job_id]
+            lasted_s = self._summed_to_s - job.begun_s
+            return max((self._sharing_s - job.sharing_then_s) / lasted_s, 1.0) if lasted_s > 0 else 1.0
+
+    def refuse_too_large(self, spec: JobSpec) -> None:
+        """Refuse what this machine could never run.
+
+        Raises:
+            JobTooLargeError: it needs more disk or memory than there is in all.
+        """
+        needs, machine = predict(spec), self._look()
+        if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
+            raise JobTooLargeError(
+                f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all; put the server's data on a larger one.",
+                {"needed_disk_bytes": needs.disk_bytes, "disk_bytes": machine.disk_bytes},
+            )
+        if machine.memory_bytes is not None and needs.memory_bytes > machine.memory_bytes:
+            raise JobTooLargeError(
+                f"{spec.workers} workers need about {_gib(needs.memory_bytes)} of memory and there are {_gib(machine.memory_bytes)}; ask for fewer workers.",
+                {"needed_memory_bytes": needs.memory_bytes, "memory_bytes": machine.memory_bytes},
+            )
+
+    def begin_round(self, job_ids: Iterable[str]) -> None:
+        """Forget what the last look found, and jobs that wait no more: cancelled, deleted or another server's.
+
+        Args:
+            job_ids: those that wait, in the order in which ``holds`` will be asked of them.
+        """
+        waiting = set(job_ids)
+        with self._lock:
+            self._lacking, self._first_in_line = {}, ""
+            for known in (self._needs, self._paused, self._reasons):
+                for job_id in known.keys() - waiting:
+                    del known[job_id]
+
+    def holds(self, job_id: str, spec: JobSpec, *, is_to_capture: bool = False) -> bool:
+        """Whether a queued job must wait; ``reason`` then says why, without waiting, as the disk of a capture may hang."""
+        reason = self._obstacle(job_id, spec, is_to_capture=is_to_capture)
+        with self._lock:
+            self._reasons.pop(job_id, None)
+            if reason:
+                self._reasons[job_id] = reason
+        return bool(reason)
+
+    def start(self, job_id: str, number: int, spec: JobSpec, *, is_to_capture: bool = False) -> None:
+        """Count a job among those that run."""
+        needs = self._needs.pop(job_id, None) or predict(spec)
+        dome = spec.rig.dome if is_to_capture and spec.rig else None
+        with self._lock:
+            self._sum_sharing()
+            self._running[job_id] = _Running(number, needs, dome, not is_to_capture, self._summed_to_s, self._sharing_s)
+
+    def takes_place(self, job_id: str) -> bool:
+        """Whether a job that has captured may go on; it then counts as any other."""
+        memory_bytes = self._look().memory_bytes
+        with self._lock:
+            job = self._running[job_id]
+            job.dome = None
+            if not job.has_place:
+                self._sum_sharing()
+                job.has_place = not self._no_place() and not self._no_memory(job.needs, memory_bytes)
+            return job.has_place
+
+    def end(self, job_id: str) -> None:
+        """Count a job no longer."""
+        with self._lock:
+            self._sum_sharing()
+            del self._running[job_id]
+            self._stalled.pop(job_id, None)
+
+    def look_for_stalled(self) -> None:
+        """Find the running jobs whose next task no worker can take; ``stalled`` then says why, until a later look finds one that can."""
+        with self._lock:
+            captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
+        lacking = {kind: self._lacks(kind) for kind in set(captures.values())}
+        with self._lock:
+            still = {job_id: lacking[kind] for job_id, kind in captures.items() if job_id in self._running}
+            self._stalled = {job_id: f"Waits for workers: {why}" for job_id, why in still.items() if why is not None}
+
+    def pause(self, job_id: str, problem: DentineError) -> None:
+        """Let a job wait that could not go on."""
+        what = "disk" if isinstance(problem, DiskFullError) else "store" if isinstance(problem, StoreError) else "workers"
+        with self._lock:
+            self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
+
+    def stalled(self, job_id: str) -> str | None:
+        """Why a running job does not go on; None if it does."""
+        with self._lock:
+            return self._stalled.get(job_id)
+
+    def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
+        """Why a queued job does not start; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
+        with self._lock:
+            reason = self._reasons.get(job_id)
+            return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
+
+    def _obstacle(self, job_id: str, spec: JobSpec, *, is_to_capture: bool) -> str:
+        # What costs least to find first. Nothing slow is done under the lock.
+        with self._lock:
+            if job_id in self._running:
+                return "Waits until its earlier run has ended."
+            if obstacle := self._pause_of(job_id) or (self._busy_dome(spec) if is_to_capture else self._no_place()):
+                return obstacle
+        if is_to_capture not in self._lacking:
+            self._lacking[is_to_capture] = self._lacks(is_to_capture)
+        if (lacking := self._lacking[is_to_capture]) is not None:
+            return f"Waits for workers: {lacking}"
+        machine = self._look()
+        needs = self._needs[job_id] = self._needs.get(job_id) or predict(spec)
+        with self._lock:
+            return self._no_disk(needs, machine) or ("" if is_to_capture else self._no_turn(needs, machine))
+
+    def _no_turn(self, needs: Needs, machine: Machine) -> str:
+        if self._first_in_line:
+            return self._first_in_line
+        if short := self._no_memory(needs, machine.memory_bytes):
+            # Whoever asks for much would never get it if all that ask for less went before.
+            self._first_in_line = "Waits behind a job that is before it and waits for memory."
+        return short
+
+    def _pause_of(self, job_id: str) -> str:
+        until, reason = self._paused.get(job_id, (0.0, ""))
+        if self._clock() < until:
+            return reason
+        self._paused.pop(job_id, None)
+        return ""
+
+    def _busy_dome(self, spec: JobSpec) -> str:
+        dome = spec.rig.dome if spec.rig else None
+        busy = next((job.number for job in self._running.values() if job.dome == dome), None)
+        return "" if busy is None else f"{_TURN[1]} {dome}: job {busy} captures with it."
+
+    def _no_place(self) -> str:
+        placed = self._placed()
+        return f"{_TURN[0]}: {_named(placed)}, and {self._at_once} at once is the most." if len(placed) >= self._at_once else ""
+
+    def _no_memory(self, needs: Needs, memory_bytes: int | None) -> str:
+        placed = self._placed()
+        held = sum(job.needs.memory_bytes for job in placed)
+        if memory_bytes is None or not placed or held + needs.memory_bytes <= memory_bytes:
+            return ""
+        what = f"about {_gib(needs.memory_bytes)} are needed beside the {_gib(held)} of those that run, and there are {_gib(memory_bytes)}"
+        return f"Waits for memory: {_named(placed)}; {what}."
+
+    def _no_disk(self, needs: Needs, machine: Machine) -> str:
+        # A running job counts in full, also what it has written already: it is not looked at again how much that is.
+        kept = sum(job.needs.disk_bytes for job in self._running.values())
+        if machine.free_disk_bytes >= needs.disk_bytes + kept + KEPT_FREE_BYTES:
+            return ""
+        beside = f" beside {_gib(kept)} that running jobs may take" if kept else ""
+        needed = needs.disk_bytes + KEPT_FREE_BYTES
+        return f"Waits for disk: about {_gib(needed)} are needed{beside} and {_gib(machine.free_disk_bytes)} are free."
+
+    def _sum_sharing(self) -> None:
+        now_s = self._clock()
+        self._sharing_s += len(self._placed()) * (now_s - self._summed_to_s)
+        self._summed_to_s = now_s
+
+    def _placed(self) -> list[_Running]:
+        return [job for job in self._running.values() if job.has_place]
+
+
+def _named(jobs: list[_Running]) -> str:
+    numbers = [str(job.number) for job in sorted(jobs, key=lambda job: job.number)]
+    return f"job {numbers[0]} runs" if len(numbers) == 1 else f"jobs {', '.join(numbers[:-1])} and {numbers[-1]} run"
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"

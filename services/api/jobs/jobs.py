@@ -1,0 +1,262 @@
+"""What can be done with jobs."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from pydantic import Field
+
+from services.api.calibrations.calibrations import Calibrations, is_stored
+from services.api.captures.captures import Captures, is_uploaded
+from services.api.captures.reading import ReadApart
+from services.api.data_folder import keep_password_apart, require_own_folder
+from services.api.jobs.admission import Admission, Machine
+from services.api.jobs.erasure import erase, forget_listing
+from services.api.jobs.lifecycle import Instruction, JobState, Trigger
+from services.api.jobs.light_limits import LightLimits
+from services.api.jobs.repository import Creation, Deletion, Job, Repository
+from services.api.jobs.runner import RunJob, Runner
+from services.api.jobs.server_paths import ServerPaths
+from services.api.jobs.table import JobFilter
+from services.api.jobs.time_ranges import TimeRange, TimeRanges
+from services.client.errors import JobStateError, UnknownJobError
+from services.core.errors import SettingsError, StoreError
+from services.core.geometry import Record
+from services.core.masks import is_stale
+from services.core.owners import LOCAL_VIEWER, Viewer
+from services.core.records import JobSpec
+from services.core.settings import ServerSettings
+from services.core.stage import StageName
+from services.core.store import is_published
+from services.pipeline.event_log import EventAddress, JobEvent
+from services.pipeline.machine_class import machine_class
+from services.pipeline.stages import request_cancel, stages_of
+
+DAY_S = 86400.0
+MOST_RUNNING = 1000
+"""More jobs are not run at once: each is one thread of a server."""
+
+
+class StageProgress(Record):
+    """How far one stage of a job is."""
+
+    stage: StageName
+    state: str = Field(description="waiting, running, finished, or stopped where it was begun and the job does not run")
+    attempt: int = Field(description="0 before the first")
+    done: float = Field(description="fraction, 0 to 1")
+    message: str
+
+
+class Jobs:
+    """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run.
+
+    Args:
+        lacks: see ``Admission``.
+
+    Raises:
+        SettingsError: the database belongs to another data folder.
+    """
+
+    def __init__(self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None) -> None:
+        self._data, self._keep_days = settings.data.resolve(), settings.keep_days
+        self._data.mkdir(parents=True, exist_ok=True)
+        self.repository = Repository(keep_password_apart(settings.database_url, self._data))
+        if settings.database is not None:
+            require_own_folder(self.repository.engine, self._data)
+        self.reader = ReadApart()
+        self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
+        self.calibrations = Calibrations(self._data)
+        self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
+        has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
+        self._admission = Admission(lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks)
+        places, running = settings.jobs_at_once, lambda: self._admission.sharing
+        self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running, self.reader.describe)
+
+        def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
+            return run(self._light_limits.lowered(spec), folder, events)
+
+        self._runner = Runner(
+            self.repository, self.folder, self.locate, run_within_limits, self._admission, self._tidy, self._time_ranges.learn, self.server_paths.tell
+        )
+        self._is_alone = settings.database is None
+        self._deleting = threading.Lock()
+
+    def start(self) -> None:
+        """Queue again what an earlier server left unfinished, then run jobs."""
+        self._runner.start(alone=self._is_alone)
+
+    def stop(self) -> None:
+        """Ask the running jobs to stop, and wait for nothing: what they light goes dark at once."""
+        self._runner.stop()
+
+    def close(self) -> None:
+        """Stop the running jobs cooperatively; they stay queued and resume when the server starts again."""
+        self._runner.close()
+        self.reader.close()
+        self.repository.close()
+
+    def take_turn(self, job_id: str) -> None:
+        """See ``Runner``."""
+        self._runner.take_turn(job_id)
+
+    def folder(self, job_id: str) -> Path:
+        """Where a job's stages and results lie."""
+        return self._data / "jobs" / job_id
+
+    def locate(self, spec: JobSpec) -> JobSpec:
+        """A job's options with the files of what the server stores for it."""
+        return self.calibrations.locate(self.captures.locate(spec))
+
+    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
+        """Queue a job, under a label where it is given one.
+
+        Raises:
+            SettingsError: a path is relative, absent or may not be named, or an uploaded capture is not committed or somebody else's.
+            JobTooLargeError: the machine could never run it.
+            ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another job.
+        """
+        if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
+            return Creation(earlier, is_new=False)
+        if spec.channels == ():
+            raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
+        if spec.capture is not None and not is_uploaded(spec.capture):
+            self.server_paths.require("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
+        if spec.rig is not None:
+            self._light_limits.require(spec.rig)
+        if spec.rig is not None and not spec.is_demo and not is_uploaded(spec.rig.mouth):
+            remedy = "upload it with dentine submit --upload, or try the demonstration with dentine demo"
+            self.server_paths.require("rig.mouth", spec.rig.mouth, remedy)
+        if spec.calibration is not None and is_stored(spec.calibration):
+            self.calibrations.require(spec.calibration, viewer)
+        elif spec.calibration is not None:
+            self.server_paths.require("calibration", spec.calibration)
+        self._admission.refuse_too_large(self.locate(spec))  # before other submissions have to wait, as it walks through the capture
+        with self.captures.keeping(spec, viewer):
+            creation = self.repository.create(spec, key, request_id, name, viewer)
+        logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
+        self._runner.wake()
+        return creation
+
+    def cancel(self, job_id: str) -> Job:
+        """Cancel a job; a running one stops between two frames or steps, or in mid-kernel.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it has ended.
+        """
+        if self.repository.get(job_id).state is JobState.RUNNING:
+            # Darkness before the record of it: whoever reads the database never waits, whoever writes may for seconds.
+            self._tell_to_stop(job_id)
+        if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
+            self._tell_to_stop(job_id)  # again, as a job that was just begun forgets what was told before
+        return self.repository.get(job_id)
+
+    def _tell_to_stop(self, job_id: str) -> None:
+        try:
+            request_cancel(self.folder(job_id))
+        except OSError as problem:  # the runner asks again in each of its rounds
+            logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
+
+    def retry(self, job_id: str) -> Job:
+        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it had published and is still good.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: there is nothing to do again.
+        """
+        is_revised = self.repository.get(job_id).state is JobState.SUCCEEDED and is_stale(self.folder(job_id))
+        self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY)
+        self._runner.wake()
+        return self.repository.get(job_id)
+
+    def delete(self, job_id: str) -> Deletion:
+        """Remove everything that is stored of a job that has ended, and give a receipt.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be removed; delete it again.
+        """
+        self.repository.apply(job_id, Trigger.DELETE)
+        with self._deleting:
+            with suppress(UnknownJobError):
+                return self.repository.deletion(job_id)  # a round found the deletion begun and has finished it
+            erased = erase(self.folder(job_id))
+            receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
+            forget_listing(self.folder(job_id))
+            return receipt
+
+    def capturing(self) -> list[Job]:
+        """Jobs under way, of any server of the database, whose capture is not published yet."""
+        return self._to_capture(self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
+
+    def lights_again(self, job_id: str) -> bool:
+        """Whether a retry of a job would light a dome that is not simulated.
+
+        Raises:
+            UnknownJobError: there is no such job.
+        """
+        return any(job.spec.rig is not None and not job.spec.rig.is_simulated for job in self._to_capture([self.repository.get(job_id)]))
+
+    def cancel_captures(self) -> list[str]:
+        """Cancel every job that captures or will capture next; returns their ids."""
+        cancelled, capturing = [], self.capturing()
+        for job in capturing:  # all of them before the first is recorded, as each may have a dome of its own
+            self._tell_to_stop(job.id)
+        for job in self._to_capture(self.repository.queued()) + capturing:
+            with suppress(JobStateError):
+                self.cancel(job.id)
+                cancelled.append(job.id)
+        return cancelled
+
+    def waits_for(self, job: Job) -> str | None:
+        """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
+        if job.state not in {JobState.RUNNING, JobState.QUEUED}:
+            return None
+        # Not both of either: a job that is read as running may have been paused since.
+        look = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
+        if (reason := look(job.id)) is not None:
+            return self.server_paths.tell(reason, self.locate(job.spec))
+        return None if job.state is JobState.RUNNING or self.is_running() else "This server does not run jobs; restart it and read its log."
+
+    def _is_kept_by(self, job: Job) -> str | None:
+        return self._admission.reason(job.id, besides_turn=True) if job.state is JobState.QUEUED else None
+
+    def time_range(self, job: Job) -> TimeRange | None:
+        """How long until a job ends; None if it neither runs nor waits."""
+        return self._time_ranges.of(job)
+
+    def progress(self, job: Job) -> list[StageProgress]:
+        """How far each stage is, from the event table."""
+        latest = {event.stage: event for event in self.repository.events_of(job.id).latest()}
+        return [_stage_progress(job, stage, latest.get(stage)) for stage in stages_of(job.spec)]
+
+    def free_bytes(self) -> int:
+        """Free space where jobs are stored."""
+        return Machine.of(self._data).free_disk_bytes
+
+    def is_running(self) -> bool:
+        """Whether queued jobs will be run."""
+        return self._runner.is_running
+
+    def _to_capture(self, jobs: list[Job]) -> list[Job]:
+        return [job for job in jobs if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
+
+    def _tidy(self) -> None:
+        # Finish deletions that were cut short, and delete what has been kept long enough.
+        oldest_s = 0.0 if self._keep_days is None else time.time() - self._keep_days * DAY_S
+        for job_id in self.repository.ended_before(oldest_s):
+            try:
+                self.delete(job_id)
+            except UnknownJobError:
+                continue  # deleted meanwhile
+            except (StoreError, OSError) as problem:
+                logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
+
+
+def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:
+    if last is None:
+        return StageProgress(stage=stage, state="waiting", attempt=0, done=0.0, message="")
+    state = "finished" if last.kind == "finished" else "running" if job.state in {JobState.RUNNING, JobState.CANCELLING} else "stopped"
+    return StageProgress(stage=stage, state=state, attempt=last.attempt, done=last.done or 0.0, message=last.message)

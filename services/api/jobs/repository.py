@@ -1,0 +1,388 @@
+"""Jobs beside the event table; a change of state and its event are one transaction.
+
+Whoever runs a job holds its lease: a number, one more than any before, and a time until which it is his. A lease that is not renewed is lost, and what its
+holder still says of the job is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Self
+
+import sqlalchemy as sql
+from pydantic import Field
+
+from services.api.jobs.lifecycle import JobState, Transition, Trigger, apply
+from services.api.jobs.past_runs import PastRuns, past_run_table
+from services.api.jobs.server_paths import without_folders
+from services.api.jobs.table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
+from services.api.jobs.verdicts import Verdicts
+from services.api.migrations import upgrade
+from services.api.webhooks.outbox import collect_changes
+from services.client.errors import JobStateError
+from services.core.errors import DentineError, FencedError
+from services.core.geometry import Record
+from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
+from services.core.records import JobName, JobSpec, Verdict
+from services.core.stage import StageName
+from services.pipeline.database import Query, open_database, writing
+from services.pipeline.event_log import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
+
+KNOWN_JOBS = 1024
+"""Jobs, and their options, that are kept as they were read."""
+
+
+class Failure(Record):
+    """Why a job failed."""
+
+    code: str = Field(description="stable and machine-readable")
+    message: str = Field(description="one sentence that names the thing and the remedy")
+    exit_status: int = Field(description="what `dentine run` would have exited with")
+    stage: StageName | None = None
+    evidence: dict[str, str | int | float | None] = Field(default={}, description="what was measured when it failed, units in the names")
+
+    @classmethod
+    def of(cls, problem: DentineError, stage: StageName | None) -> Self:
+        """The failure that an error means."""
+        return cls(code=problem.code, message=problem.message, exit_status=problem.exit_status, stage=stage, evidence=dict(problem.evidence))
+
+
+class Job(Record):
+    """One job as the API shows it."""
+
+    id: str
+    number: int = Field(description="grows with every submission")
+    state: JobState
+    created_s: float = Field(description="Unix time of the submission")
+    changed_s: float = Field(description="Unix time of the last change of state")
+    spec: JobSpec
+    failure: Failure | None
+    request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
+    name: JobName | None = Field(default=None, description="label that a person gave it")
+    owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
+    verdict: Verdict | None = Field(
+        default=None, description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it"
+    )
+
+    def seen_by(self, viewer: Viewer) -> Job:
+        """The same as somebody may see it: without the folders on the server, for one who may not use them."""
+        return self if viewer.uses_paths else self.model_copy(update={"spec": without_folders(self.spec)})
+
+
+class Deletion(Record):
+    """The receipt of a deleted job: all that is left of it."""
+
+    job: str
+    deleted_s: float = Field(description="Unix time")
+    submitted_s: float = Field(description="Unix time of the submission")
+    files: int = Field(description="files that were removed")
+    bytes: int
+    digest: str = Field(description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before")
+
+
+@dataclass(frozen=True)
+class Creation:
+    """What a submission led to."""
+
+    job: Job
+    is_new: bool
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to run a job for a while."""
+
+    job: Job
+    number: int
+
+
+_IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)
+# Built once, as what follows: building a query takes longer than asking it.
+_JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields if name in job_table.c))
+_ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
+_WITH_KEY = Query(_JOBS.where(job_table.c.key == sql.bindparam("of_key")))
+_NEWEST_EVENTS = Query(
+    sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > sql.bindparam("after")).group_by(event_table.c.job)
+)
+_UNFINISHED = Query(_JOBS.where(_IS_UNFINISHED).order_by(job_table.c.number))
+_BEGUN = Query(latest_of_stages(sql.select(job_table.c.id).where(_IS_UNFINISHED)))
+_INSERT = job_table.insert()
+
+
+@lru_cache(64)
+def _listing(only: JobFilter, *, is_first: bool) -> Query:
+    """The newest ``most`` jobs, those with a number below ``before`` unless it is the first page."""
+    query = _JOBS.where(*only.conditions()).order_by(job_table.c.number.desc()).limit(sql.bindparam("most", type_=sql.Integer))
+    return Query(query if is_first else query.where(job_table.c.number < sql.bindparam("before")))
+
+
+class Repository:
+    """The database of a server, brought to this version's tables when it is opened.
+
+    Args:
+        clock: Unix time; servers that share a database must agree on it to within a lease's length.
+    """
+
+    def __init__(self, url: str, clock: Callable[[], float] = time.time) -> None:
+        self._url, self._clock = url, clock
+        self.engine = open_database(url)
+        upgrade(self.engine)
+        self.past_runs = PastRuns(self.engine)
+        self._spec_of = lru_cache(KNOWN_JOBS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
+        self._verdicts = Verdicts(self.engine)
+        self._known = lru_cache(KNOWN_JOBS)(self._read)
+
+    def close(self) -> None:
+        """Close every connection."""
+        self.engine.dispose()
+
+    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
+        """Insert a job as QUEUED, or find the one that its owner submitted with this idempotency key.
+
+        Raises:
+            JobStateError: the key was used for other options.
+        """
+        options = spec.model_dump_json()
+        with writing(self.engine) as connection:
+            own_key = viewer.key(key)
+            if key is not None and (earlier := connection.execute(_WITH_KEY.statement, {"of_key": own_key}).first()):
+                return Creation(self._same(earlier, spec, key), is_new=False)
+            job_id, now = secrets.token_hex(6), self._clock()
+            row = {"id": job_id, "key": own_key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
+            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture), "name": name, "owner": viewer.owner}
+            connection.execute(_INSERT, row)
+            insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
+            self._apply(connection, job_id, Trigger.QUEUE)
+            return Creation(self._find(connection, job_id), is_new=True)
+
+    def rename(self, job_id: str, name: str | None) -> Job:
+        """Give a job another label, or none.
+
+        Raises:
+            UnknownJobError: there is no such job.
+        """
+        with writing(self.engine) as connection:
+            connection.execute(job_table.update().where(job_table.c.id == job_id).values(name=name))
+            renamed = self._find(connection, job_id)
+        return self._verdicts.judged([renamed])[0]
+
+    def submitted(self, spec: JobSpec, key: str, viewer: Viewer = LOCAL_VIEWER) -> Job | None:
+        """The job that its owner submitted with this idempotency key, if there is one.
+
+        Raises:
+            JobStateError: the key was used for other options.
+        """
+        rows = _WITH_KEY.rows(self.engine, of_key=viewer.key(key))
+        return self._same(rows[0], spec, key) if rows else None
+
+    def get(self, job_id: str) -> Job:
+        """One job.
+
+        Raises:
+            UnknownJobError: there is none with this id.
+        """
+        return self._verdicts.judged([self._only(_ONE.rows(self.engine, of=job_id), job_id)])[0]
+
+    def seen(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
+        """Those of the jobs that are there and that somebody may see."""
+        found = (_ONE.rows(self.engine, of=job_id) for job_id in job_ids)
+        return {job.id for job in self._jobs(rows[0] for rows in found if rows) if viewer.may_see(job.owner)}
+
+    def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
+        """Newest jobs first, those with a number below ``before``."""
+        values = {"most": limit} | ({} if before is None else {"before": before})
+        return self._verdicts.judged(self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values)))
+
+    def unfinished(self) -> list[Job]:
+        """Jobs that run or wait, those that have waited longest first."""
+        return self._jobs(_UNFINISHED.rows(self.engine))
+
+    def begun(self) -> dict[str, Begun]:
+        """How far the stages are of each job that runs or waits and was begun."""
+        return begun(_BEGUN.rows(self.engine))
+
+    def queued(self) -> list[Job]:
+        """Jobs that wait, those that have waited longest first."""
+        query = _JOBS.where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number)
+        with self.engine.connect() as connection:
+            return self._jobs(connection.execute(query))
+
+    def lease(self, job_id: str, holder: str, seconds: float) -> Lease:
+        """Start a queued job.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it is not queued, any more perhaps.
+        """
+        with writing(self.engine) as connection:
+            self._apply(connection, job_id, Trigger.START)
+            number, until_s = 1 + self._lease_number(connection, job_id), self._clock() + seconds
+            connection.execute(lease_table.delete().where(lease_table.c.job == job_id))
+            connection.execute(lease_table.insert().values(job=job_id, number=number, holder=holder, until_s=until_s))
+            return Lease(self._find(connection, job_id), number)
+
+    def renew(self, lease: Lease, seconds: float) -> bool:
+        """Keep a lease; False if somebody else has the job by now."""
+        held = (lease_table.c.job == lease.job.id) & (lease_table.c.number == lease.number)
+        with writing(self.engine) as connection:
+            return bool(connection.execute(lease_table.update().where(held).values(until_s=self._clock() + seconds)).rowcount)
+
+    def settle(self, lease: Lease, trigger: Trigger, failure: Failure | None = None) -> Transition:
+        """Apply what the holder of a lease says of its job, and end the lease.
+
+        Raises:
+            FencedError: somebody else has the job by now. JobStateError: its state does not take the trigger.
+        """
+        with writing(self.engine) as connection:
+            if (newest := self._lease_number(connection, lease.job.id)) != lease.number:
+                raise FencedError(f"Job {lease.job.id} was taken over under lease {newest}; lease {lease.number} has no say in it.")
+            connection.execute(lease_table.update().where(lease_table.c.job == lease.job.id).values(until_s=0.0))
+            return self._apply(connection, lease.job.id, trigger, failure)
+
+    def apply(self, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
+        """Apply a trigger to a job's state.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: its state does not take the trigger.
+        """
+        with writing(self.engine) as connection:
+            return self._apply(connection, job_id, trigger, failure)
+
+    def tell(self, job_id: str, message: str) -> None:
+        """Append a sentence to the events of a job that waits, if it still does."""
+        is_waiting = sql.select(job_table.c.id).where(job_table.c.id == job_id, job_table.c.state == JobState.QUEUED)
+        with writing(self.engine) as connection:
+            if connection.scalar(is_waiting) is not None:
+                insert_event(connection, job_id, 0, kind="log", message=message)
+
+    def lose(self) -> list[str]:
+        """Tell every job under way that no process works on it any more."""
+        return self._lose(sql.true())
+
+    def lose_expired(self, keep: Iterable[Lease] = (), length_s: float = math.inf) -> list[str]:
+        """Tell those that have no lease, or one that ran out.
+
+        Args:
+            keep: hold whatever the clock says: the caller's own, who knows that it works on those jobs.
+            length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped back, and counts as run out.
+        """
+        now_s = self._clock()
+        held: sql.ColumnElement[bool] = lease_table.c.until_s.between(now_s, now_s + 2 * length_s)
+        for one in keep:
+            held |= (lease_table.c.job == one.job.id) & (lease_table.c.number == one.number)
+        return self._lose(job_table.c.id.not_in(sql.select(lease_table.c.job).where(held)))
+
+    def _lose(self, which: sql.ColumnElement[bool]) -> list[str]:
+        running = job_table.c.state.in_([JobState.RUNNING, JobState.CANCELLING])
+        with writing(self.engine) as connection:
+            ids = list(connection.scalars(sql.select(job_table.c.id).where(running, which).order_by(job_table.c.number)))
+            for job_id in ids:
+                self._apply(connection, job_id, Trigger.LOSE)
+        return ids
+
+    def forget(self, job_id: str, files: int, size: int, digest: str) -> Deletion:
+        """Remove what is stored of a job whose files are gone, and keep a receipt.
+
+        Raises:
+            UnknownJobError: there is no such job. JobStateError: it is not being deleted.
+        """
+        with writing(self.engine) as connection:
+            job = self._find(connection, job_id)
+            if job.state is not JobState.DELETING:
+                raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
+            collect_changes(connection, self._clock())  # as the events go with the job
+            receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
+            connection.execute(deletion_table.insert().values(receipt.model_dump() | {"owner": job.owner}))
+            for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):
+                connection.execute(column.table.delete().where(column == job_id))
+            return receipt
+
+    def deletion(self, job_id: str) -> Deletion:
+        """The receipt of a deleted job.
+
+        Raises:
+            UnknownJobError: no job of this id was deleted.
+        """
+        with self.engine.connect() as connection:
+            row = connection.execute(sql.select(deletion_table).where(deletion_table.c.job == job_id)).mappings().first()
+        if row is None:
+            raise unknown_deletion(job_id)
+        return Deletion(**{name: row[name] for name in Deletion.model_fields})
+
+    def ended_before(self, time_s: float) -> list[str]:
+        """Jobs that ended before a time, oldest first, and those whose deletion was begun."""
+        ended = job_table.c.state.in_([state for state in JobState if state.is_final]) & (job_table.c.changed_s < time_s)
+        query = sql.select(job_table.c.id).where(ended | (job_table.c.state == JobState.DELETING)).order_by(job_table.c.number)
+        with self.engine.connect() as connection:
+            return list(connection.scalars(query))
+
+    def events_of(self, job_id: str) -> EventLog:
+        """The job's events."""
+        return EventLog(self.engine, job_id)
+
+    def address_of(self, lease: Lease) -> EventAddress:
+        """Where another process appends the job's events."""
+        return EventAddress(self._url, lease.job.id, lease.number, lease.job.request_id)
+
+    def newest_event(self) -> int:
+        """Id of the last event of any job."""
+        with self.engine.connect() as connection:
+            return connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
+
+    def newest_events(self, after: int) -> dict[str, int]:
+        """Jobs with events after an id, and the id of the last one of each."""
+        return {str(job): int(newest) for job, newest in _NEWEST_EVENTS.rows(self.engine, after=after)}
+
+    def _lease_number(self, connection: sql.Connection, job_id: str) -> int:
+        return connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == job_id)) or 0
+
+    def _find(self, connection: sql.Connection, job_id: str) -> Job:
+        return self._only(connection.execute(_ONE.statement, {"of": job_id}).all(), job_id)
+
+    def _only(self, rows: Sequence[Sequence[Any]], job_id: str) -> Job:
+        if not rows:
+            raise unknown_job(job_id)
+        return self._job(rows[0])
+
+    def _same(self, row: Sequence[Any], spec: JobSpec, key: str) -> Job:
+        job = self._job(row)
+        if job.spec != spec:
+            raise JobStateError(f"Idempotency key {key!r} was used for a job with other options; choose another key.")
+        return job
+
+    def _jobs(self, rows: Iterable[Any]) -> list[Job]:
+        return [self._job(row) for row in rows]
+
+    def _job(self, row: Sequence[Any]) -> Job:
+        return self._known(*row)
+
+    def _read(self, *row: Any) -> Job:
+        job_id, number, state, created_s, changed_s, spec, failure, request_id, name, owner = row
+        return Job(
+            id=job_id,
+            number=number,
+            state=state,
+            created_s=created_s,
+            changed_s=changed_s,
+            spec=self._spec_of(spec),
+            failure=Failure.model_validate_json(failure) if failure else None,
+            request_id=request_id,
+            name=name,
+            owner=owner,
+        )
+
+    def _apply(self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
+        before = self._find(connection, job_id).state
+        transition = apply(before, trigger)
+        if transition.state is before and trigger is not Trigger.LOSE:
+            return transition
+        changes = {"state": transition.state, "changed_s": self._clock(), "failure": failure.model_dump_json() if failure else None}
+        connection.execute(job_table.update().where(job_table.c.id == job_id).values(changes))
+        data: dict[str, Any] = {"state": transition.state, "trigger": trigger} | ({"failure": failure.model_dump()} if failure else {})
+        message = failure.message if failure else f"{transition.state.capitalize()}."
+        insert_event(connection, job_id, 0, kind="state", message=message, data=data)
+        return transition

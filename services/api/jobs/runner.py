@@ -1,0 +1,268 @@
+"""The threads of a server that run queued jobs side by side, and look after those that nobody runs any more."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from services.api.jobs.admission import Admission, turn
+from services.api.jobs.lifecycle import JobState, Trigger
+from services.api.jobs.repository import Failure, Job, Lease, Repository
+from services.client.errors import JobStateError
+from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, ReadOnlyStoreError, SchedulerLostError
+from services.core.records import JobSpec
+from services.core.stage import StageName
+from services.core.store import telling_disk_faults
+from services.pipeline.database import patiently
+from services.pipeline.event_log import EventAddress
+from services.pipeline.logs import log_context
+from services.pipeline.stages import first_stage, request_cancel, withdraw_cancel
+
+RunJob = Callable[[JobSpec, Path, EventAddress], object]
+"""Runs a job in a folder to its end, events to the given table; raises what a stage raises."""
+
+LEASE_S = 60.0
+"""How long a job stays with a server that no longer answers."""
+ROUND_S = 10.0
+"""How often leases are renewed, lost ones found and waiting jobs looked at again."""
+
+
+class WaitsForItsTurnError(Exception):
+    """A job has captured, and there is no place for the rest of it yet."""
+
+
+class Runner:
+    """Runs jobs between ``start`` and ``close``, each in a thread of its own.
+
+    Args:
+        folder: of a job by its id.
+        locate: a job's options with the folder of an uploaded capture.
+        on_round: called every so often.
+        on_success: called with a job that has succeeded, and how many on average ran while it did.
+        tell: why a job failed or waits, as those who look at jobs may read it.
+    """
+
+    def __init__(
+        self,
+        repository: Repository,
+        folder: Callable[[str], Path],
+        locate: Callable[[JobSpec], JobSpec],
+        run: RunJob,
+        admission: Admission,
+        on_round: Callable[[], None],
+        on_success: Callable[[Job, float], None],
+        tell: Callable[[str, JobSpec], str] = lambda sentence, _: sentence,
+    ) -> None:
+        self._tell = tell
+        self._repository, self._folder, self._locate, self._run, self._admission = repository, folder, locate, run, admission
+        self._on_round, self._on_success = on_round, on_success
+        self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
+        self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
+        self._running: dict[str, tuple[Lease, threading.Thread]] = {}
+        self._told_obstacles: dict[str, str | None] = {}
+        parts = {"jobs": self._start_jobs, "leases": self._look_after, "rounds": self._make_rounds}
+        self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
+
+    def start(self, *, alone: bool) -> None:
+        """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left by one that died."""
+        if alone:
+            self._repository.lose()
+        self._wake.set()
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Ask the running jobs to stop, and wait for nothing; they stay queued and resume when a server starts again."""
+        self._closing.set()
+        self._wake.set()
+        for lease in self._leases():
+            try:
+                request_cancel(self._folder(lease.job.id))
+            except OSError as problem:  # of one job's folder, which keeps no other from going dark
+                logging.getLogger(__name__).warning("job %s cannot be told to stop: %s", lease.job.id, problem)
+
+    def close(self) -> None:
+        """Stop the running jobs cooperatively, and wait for that."""
+        self.stop()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+        # A job that was started meanwhile has asked for its own end; see _prepare.
+        for _, thread in self._under_way():
+            thread.join()
+
+    def wake(self) -> None:
+        """There is something to run."""
+        self._wake.set()
+
+    def take_turn(self, job_id: str) -> None:
+        """Called before each stage that follows a job's capture, in the job's own thread.
+
+        Raises:
+            WaitsForItsTurnError: all places are taken.
+        """
+        if not self._admission.takes_place(job_id):
+            raise WaitsForItsTurnError
+
+    @property
+    def is_running(self) -> bool:
+        """Whether queued jobs will be run."""
+        return all(thread.is_alive() for thread in self._threads) and not self._closing.is_set()
+
+    def _under_way(self) -> list[tuple[Lease, threading.Thread]]:
+        with self._lock:
+            return list(self._running.values())
+
+    def _leases(self) -> list[Lease]:
+        return [lease for lease, _ in self._under_way()]
+
+    def _start_jobs(self) -> None:
+        while not self._closing.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            try:
+                self._start_what_may()
+            except Exception:  # of the database or the data folder
+                logging.getLogger(__name__).exception("starting jobs failed; trying again in %g s", ROUND_S)
+
+    def _start_what_may(self) -> None:
+        # In turn; those that wait for disk or workers let others pass.
+        queued = sorted(self._repository.queued(), key=turn)
+        self._admission.begin_round(job.id for job in queued)
+        self._told_obstacles = {job.id: told for job in queued if (told := self._told_obstacles.get(job.id)) is not None}
+        for job in queued:
+            if self._closing.is_set():
+                return
+            spec, is_to_capture = self._locate(job.spec), first_stage(job.spec, self._folder(job.id)) == "capture"
+            if self._admission.holds(job.id, spec, is_to_capture=is_to_capture):
+                self._tell_obstacle(job.id, spec)
+                continue
+            self._told_obstacles.pop(job.id, None)
+            try:
+                lease = self._repository.lease(job.id, self._holder, LEASE_S)
+            except JobStateError:
+                continue  # cancelled, or another server's by now
+            self._admission.start(job.id, job.number, spec, is_to_capture=is_to_capture)
+            thread = threading.Thread(target=self._run_in_thread, args=(lease,), name=f"job-{job.id}")
+            with self._lock:
+                self._running[job.id] = lease, thread
+            thread.start()
+
+    def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
+        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers
+        # change all the time. That others are before it is nothing to act on.
+        reason = self._admission.reason(job_id, besides_turn=True)
+        kind = None if reason is None else reason.partition(":")[0]
+        if kind != self._told_obstacles.get(job_id):
+            self._told_obstacles[job_id] = kind
+            if reason is not None:
+                self._repository.tell(job_id, self._tell(reason, located))
+
+    def _run_in_thread(self, lease: Lease) -> None:
+        job = lease.job
+        try:
+            with log_context(job=job.id, request_id=job.request_id):
+                self._run_one(lease)
+        except Exception:  # of the database or the data folder; the job is lost when its lease runs out
+            logging.getLogger(__name__).exception("job %s broke off; it is queued again within %g s", job.id, LEASE_S)
+        finally:
+            with self._lock:
+                del self._running[job.id]
+            self._admission.end(job.id)
+            self._wake.set()
+
+    def _look_after(self) -> None:
+        log = logging.getLogger(__name__)
+        while not self._closing.wait(ROUND_S):
+            try:
+                self._renew_leases()
+                self._admission.look_for_stalled()
+            except Exception:
+                log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
+            self._wake.set()
+
+    def _renew_leases(self) -> None:
+        log = logging.getLogger(__name__)
+        leases = self._leases()
+        for lease in leases:
+            if not self._repository.renew(lease, LEASE_S):
+                log.warning("job %s was taken over by another server", lease.job.id)
+        for job_id in self._repository.lose_expired(leases, LEASE_S):
+            log.warning("job %s was lost by its server and is queued again", job_id)
+        for lease in leases:
+            if self._is_cancelled(lease):
+                request_cancel(self._folder(lease.job.id))
+
+    def _make_rounds(self) -> None:
+        # A thread of its own, as a deletion of many files takes longer than a lease lasts.
+        while not self._closing.wait(ROUND_S):
+            try:
+                self._on_round()
+            except Exception:
+                logging.getLogger(__name__).exception("the round failed; trying again in %g s", ROUND_S)
+
+    def _run_one(self, lease: Lease) -> None:
+        job, folder = lease.job, self._folder(lease.job.id)
+        trigger, failure, is_begun = Trigger.SUCCEED, None, False
+        try:
+            self._prepare(lease, folder)
+            is_begun = True
+            self._run(self._locate(job.spec), folder, self._repository.address_of(lease))
+        except JobCancelledError:
+            trigger = self._after_cancel(job)
+        except FencedError as problem:
+            logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
+            return
+        except WaitsForItsTurnError:
+            trigger = Trigger.PAUSE
+        except (DiskFullError, ReadOnlyStoreError, SchedulerLostError) as problem:
+            self._admission.pause(job.id, problem)
+            trigger = Trigger.PAUSE
+        except DentineError as problem:
+            trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
+        except Exception as problem:
+            if not is_begun:
+                raise  # nothing of the job broke; whoever leases it next may have better luck
+            logging.getLogger(__name__).exception("Job broke.")
+            message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
+            trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
+        if failure is not None:
+            failure = failure.model_copy(update={"message": self._tell(failure.message, self._locate(job.spec))})
+        self._settle(lease, trigger, failure)
+
+    def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:
+        try:
+            transition = patiently(lambda: self._repository.settle(lease, trigger, failure))
+        except FencedError as problem:
+            logging.getLogger(__name__).warning("job %s: %s", lease.job.id, problem)
+            return
+        logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
+        if transition.state is JobState.SUCCEEDED:
+            self._on_success(lease.job, self._admission.beside(lease.job.id))
+
+    def _prepare(self, lease: Lease, folder: Path) -> None:
+        with telling_disk_faults(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            withdraw_cancel(folder)
+            if self._closing.is_set() or self._is_cancelled(lease):
+                request_cancel(folder)
+
+    def _after_cancel(self, job: Job) -> Trigger:
+        # A user's, this server's end, or nobody's: whoever cancels tasks in Dask itself finds the job going on, but not at once and over and over.
+        if patiently(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
+            return Trigger.STOPPED
+        if self._closing.is_set():
+            return Trigger.LOSE
+        self._admission.pause(job.id, SchedulerLostError("The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself."))
+        return Trigger.PAUSE
+
+    def _is_cancelled(self, lease: Lease) -> bool:
+        return self._repository.get(lease.job.id).state is JobState.CANCELLING
+
+    def _stage(self, job: Job) -> StageName | None:
+        latest = self._repository.events_of(job.id).latest()
+        return latest[-1].stage if latest else None

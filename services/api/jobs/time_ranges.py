@@ -1,0 +1,224 @@
+"""How long until a job ends: an 80 % range learned from past jobs that did the same on the same class of machine, or a reason why there is none."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+from pydantic import Field
+
+from services.api.captures.descriptions import Describe, describe
+from services.api.jobs.admission import turn
+from services.api.jobs.forecast import LEAST, Observation, foresee
+from services.api.jobs.lifecycle import JobState
+from services.api.jobs.past_runs import TENTHS, PastRun, tenth_of
+from services.api.jobs.repository import Job, Repository
+from services.api.jobs.size import method_of, size_of
+from services.core.geometry import Record
+from services.core.records import JobSpec
+from services.core.stage import StageName
+from services.pipeline.event_log import Begun, EventLog, JobEvent
+from services.pipeline.stages import stages_of
+
+SIZE_SLOPE = 0.5
+"""Expected growth of a duration's logarithm with that of each size: between none and proportion."""
+
+SHORTEST_S = 1e-3
+WIDEST = 100.0
+"""Ratio of a range's limits beyond which it says nothing."""
+
+
+class TimeRange(Record):
+    """How long until a job ends; both limits are null where nothing honest can be said."""
+
+    low_s: float | None = Field(default=None, description="from now; in 80 of 100 cases the job ends between the two limits")
+    high_s: float | None = Field(default=None, description="from now")
+    past_jobs: int = Field(default=0, description="how many past jobs it is learned from")
+    reason: str | None = Field(default=None, description="why there is no range")
+
+    def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
+        """The range of what begins when a place is free for it: jobs end that run, and those ahead of it have had theirs.
+
+        Lower limits go with lower ones and upper with upper, as on a busy machine all jobs are late together.
+        """
+        if self.low_s is None or self.high_s is None:
+            return self
+        low_s, high_s = (
+            _start_s([getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places) for limit in ("low_s", "high_s")
+        )
+        fewer = min(one.past_jobs for one in (self, *running, *ahead))
+        return self.model_copy(update={"low_s": self.low_s + low_s, "high_s": self.high_s + high_s, "past_jobs": fewer})
+
+
+def _start_s(running_s: list[float], ahead_s: list[float], places: int) -> float:
+    """When a place is free: each of those ahead takes the one that is free first."""
+    free_s = sorted(running_s)[max(len(running_s) - places, 0) :] + [0.0] * (places - len(running_s))
+    heapq.heapify(free_s)
+    for lasts_s in ahead_s:
+        heapq.heapreplace(free_s, free_s[0] + lasts_s)
+    return free_s[0]
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a job is: which tenth of which stage it has reached last."""
+
+    stage: StageName | None = None
+    """None before the first one."""
+    tenth: int = 0
+    since_s: float = 0.0
+    """How long ago."""
+    took_s: float | None = None
+    """How long the run had taken until then; None where past runs do not compare."""
+
+
+def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastRun], beside: float = 1.0) -> TimeRange:
+    """Range of what remains from a position, from past runs.
+
+    Args:
+        job_size: the features of its size.
+        runs: oldest first.
+        beside: how many jobs are expected to share the workers, this one included.
+    """
+    job_size = *job_size, math.log(beside)
+    compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
+    pairs = [_split(run, position) for run in compared]
+    # What was needed so far tells of what is left by as much as it was a part of the whole.
+    weight = 0.0 if position.took_s is None or not pairs else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
+    past = [Observation((*_features(run), weight * math.log(took_s)), left_s) for run, (took_s, left_s) in zip(compared, pairs, strict=True)]
+    pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
+    outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
+    if outlook is None:
+        what = f"{len(past)} jobs like this one have succeeded on such a machine, and {LEAST} are needed to tell a time."
+        return TimeRange(past_jobs=len(past), reason=what)
+    left = outlook.remaining_s(position.since_s)
+    if left is None:
+        return TimeRange(past_jobs=len(past), reason=f"It takes longer than {len(past)} jobs like it let expect.")
+    if left[1] + position.since_s > WIDEST * (left[0] + position.since_s):
+        return TimeRange(past_jobs=len(past), reason=f"The {len(past)} past jobs differ too much from each other, or from this one, to tell a time.")
+    return TimeRange(low_s=left[0], high_s=left[1], past_jobs=len(past))
+
+
+def _features(run: PastRun) -> tuple[float, ...]:
+    return *run.size.features, math.log(run.course.beside)
+
+
+def _split(run: PastRun, position: Position) -> tuple[float, float]:
+    """How long a run had taken until a position, and took from there."""
+    reached_s = 0.0 if position.stage is None else run.course.reached_s[position.stage][position.tenth]
+    return max(reached_s, SHORTEST_S), max(run.course.total_s - reached_s, SHORTEST_S)
+
+
+class TimeRanges:
+    """Ranges over one server's jobs.
+
+    Args:
+        locate: a job's options with the folder of an uploaded capture.
+        waits_for: what a queued job waits for that does not come by other jobs' ends.
+        machine: class of the machine that runs jobs; None where that is not known before they do.
+        places: most jobs that run side by side.
+        running: how many share the workers now.
+        describe: reads what a capture says of itself.
+    """
+
+    def __init__(
+        self,
+        repository: Repository,
+        locate: Callable[[JobSpec], JobSpec],
+        waits_for: Callable[[Job], str | None],
+        machine: str | None,
+        places: int = 1,
+        running: Callable[[], int] = lambda: 1,
+        describe: Describe = describe,
+    ) -> None:
+        self._repository, self._locate, self._waits_for, self._machine = repository, locate, waits_for, machine
+        self._places, self._running, self._describe = places, running, describe
+
+    def learn(self, job: Job, beside: float = 1.0) -> None:
+        """Remember how a job went that has succeeded, and how many on average ran while it did."""
+        if (size := size_of(self._locate(job.spec), self._describe)) is not None:
+            self._repository.past_runs.record(job.id, method_of(job.spec), size, beside)
+
+    def of(self, job: Job) -> TimeRange | None:
+        """How long until a job ends; None if it neither runs nor waits."""
+        if job.state is JobState.RUNNING:
+            return self._own(job, self._repository.events_of(job.id).begun(), _Past(self._repository), max(self._running(), 1))
+        if job.state is not JobState.QUEUED:
+            return None
+        unfinished, stages, past = self._repository.unfinished(), self._repository.begun(), _Past(self._repository)
+        running = [one for one in unfinished if one.state is JobState.RUNNING]
+        ahead = sorted((one for one in unfinished if one.state is JobState.QUEUED and turn(one) < turn(job)), key=turn)
+        beside = min(self._places, len(running) + len(ahead) + 1)
+        own = self._own(job, stages.get(job.id, Begun()), past, beside)
+        if own.low_s is None:
+            return own
+        earlier = [self._own(one, stages.get(one.id, Begun()), past, beside) for one in (*running, *ahead)]
+        for one, range_ in zip((*running, *ahead), earlier, strict=True):
+            if range_.reason is not None:
+                return TimeRange(reason=f"Job {one.number} comes first: {range_.reason}")
+        return own.after(earlier[: len(running)], earlier[len(running) :], self._places)
+
+    def _own(self, job: Job, stages: Begun, past: _Past, beside: float) -> TimeRange:
+        # Without the jobs before it.
+        if (waits_for := self._waits_for(job)) is not None:
+            return TimeRange(reason=waits_for)
+        position = _position(job, stages.latest, self._repository.events_of(job.id))
+        if position is None:
+            return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
+        size = size_of(self._locate(job.spec), self._describe)
+        if size is None:
+            return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
+        machine = (stages.started.data.get("machine") if stages.started is not None else self._machine) or past.newest_machine
+        return time_range(size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine), beside)
+
+
+class _Past:
+    """Past runs while one range is told: jobs in a queue are mostly alike, and what is asked for one is known for the others."""
+
+    def __init__(self, repository: Repository) -> None:
+        self._runs = repository.past_runs
+        self._alike: dict[tuple[str, str], list[PastRun]] = {}
+
+    def alike(self, method: str, machine: str) -> list[PastRun]:
+        """The newest runs of jobs that did the same on the same class of machine, oldest first."""
+        if (method, machine) not in self._alike:
+            self._alike[method, machine] = self._runs.alike(method, machine)
+        return self._alike[method, machine]
+
+    @cached_property
+    def newest_machine(self) -> str | None:
+        """Class of the machine on which a job succeeded last."""
+        return self._runs.newest_machine()
+
+
+def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position | None:
+    """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is left."""
+    stages = stages_of(job.spec)
+    if job.state is JobState.QUEUED:
+        if not latest:
+            return Position()
+        return Position(_following(stages, latest[-1])) if latest[-1].kind == "finished" else None
+    if not latest:
+        return Position(since_s=time.time() - job.changed_s)
+    last, tenth, reached_s = latest[-1], 0, latest[-1].time_s
+    if last.stage is None or (last.kind != "finished" and (last.attempt > 1 or last.time_s < job.changed_s)):
+        return None
+    if last.kind == "finished":
+        stage = _following(stages, last)
+        tenth = TENTHS - 1 if stage == last.stage else 0
+    else:
+        stage, tenth = last.stage, tenth_of(last.done or 0.0)
+        reached_s = log.reached_s(stage, last.attempt, tenth / TENTHS) or reached_s
+    is_whole = all(event.attempt == 1 and event.time_s >= job.changed_s for event in latest)
+    is_compared = is_whole and (stage, tenth) != (stages[0], 0)  # until then nothing was done that tells a pace
+    return Position(stage, tenth, max(time.time() - max(reached_s, job.changed_s), 0.0), reached_s - job.changed_s if is_compared else None)
+
+
+def _following(stages: tuple[StageName, ...], event: JobEvent) -> StageName:
+    """The stage after the one of an event, which itself is the last one's."""
+    return stages[min(stages.index(event.stage) + 1, len(stages) - 1)] if event.stage in stages else stages[0]

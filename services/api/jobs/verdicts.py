@@ -1,0 +1,66 @@
+"""How well the fits of jobs went.
+
+Read from the events with which they finished, as many jobs are listed at once and their folders may hang.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import sqlalchemy as sql
+from pydantic import ValidationError
+from pydantic_core import from_json
+
+from services.api.jobs.lifecycle import JobState
+from services.core.records import Verdict
+from services.core.verdict import VERDICT
+from services.pipeline.event_log import event_table
+
+if TYPE_CHECKING:
+    from services.api.jobs.repository import Job
+
+MAX_KEPT = 1024
+"""Verdicts that are kept as they were read: as many as the jobs that are."""
+
+
+_UNREAD: Any = object()
+
+
+class Verdicts:
+    """Of the jobs of one database. A fit that has succeeded is judged once; one that runs again succeeds at another time."""
+
+    def __init__(self, engine: sql.Engine) -> None:
+        self._engine = engine
+        self._kept: OrderedDict[tuple[str, float], Verdict | None] = OrderedDict()
+
+    def judged(self, jobs: Sequence[Job]) -> list[Job]:
+        """Jobs with the verdicts of those that have succeeded."""
+        succeeded = {(job.id, job.changed_s) for job in jobs if job.state is JobState.SUCCEEDED}
+        kept = {key: verdict for key in succeeded if (verdict := self._kept.get(key, _UNREAD)) is not _UNREAD}
+        if missing := succeeded - kept.keys():
+            found = self._read([job_id for job_id, _ in missing])
+            kept |= {key: found.get(key[0]) for key in missing}
+            self._keep(kept)
+        told = ((job, kept.get((job.id, job.changed_s))) for job in jobs)
+        return [job if verdict is None else job.model_copy(update={"verdict": verdict}) for job, verdict in told]
+
+    def _read(self, job_ids: list[str]) -> dict[str, Verdict | None]:
+        columns = event_table.c
+        of_fits = (columns.kind == "finished") & (columns.stage == "fit") & columns.job.in_(job_ids)
+        with self._engine.connect() as connection:
+            rows = connection.execute(sql.select(columns.job, columns.data).where(of_fits).order_by(columns.id)).all()
+        return {job: _verdict(from_json(data)) for job, data in rows}  # the last fit's, where there were several
+
+    def _keep(self, found: dict[tuple[str, float], Verdict | None]) -> None:
+        self._kept |= found
+        while len(self._kept) > MAX_KEPT:
+            self._kept.popitem(last=False)
+
+
+def _verdict(data: dict[str, Any]) -> Verdict | None:
+    try:
+        return Verdict.model_validate(data.get(VERDICT))
+    except ValidationError:
+        return None  # of a fit by a version that judged otherwise, or not at all
