@@ -61,12 +61,12 @@ def main() -> NoReturn:
 
 def build_app() -> typer.Typer:
     """Put the commands together."""
-    from services.client_commands import add_client_commands
+    from services.cli.client import add_client_commands
+    from services.cli.dask import add_dask_commands
+    from services.cli.secrets import build_secrets_app
+    from services.cli.slab import simulate_slab_command
+    from services.cli.token import build_token_app
     from services.core.settings import read_settings
-    from services.dask_command import add_dask_commands
-    from services.secrets_command import build_secrets_app
-    from services.slab_command import simulate_slab_command
-    from services.token_command import build_token_app
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
@@ -120,16 +120,16 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Run a job to its asset, without a server."""
+    from services.cli.run import run_and_tell
     from services.core.settings import read_job
-    from services.run_command import run_and_tell
 
     run_and_tell(read_job(job), out, workers, as_json=as_json)
 
 
 def capture(job: JobFile, out: Annotated[Path, typer.Option(help="Folder of the job.")]) -> None:
     """Run only the capture of a job that names a rig."""
+    from services.cli.run import require_apart
     from services.core.settings import read_job
-    from services.run_command import require_apart
 
     spec = read_job(job)
     if spec.rig is None:
@@ -150,9 +150,9 @@ def export(out: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a 
 
 
 def _run_some(stages: Any, spec: Any, out: Path, *, again: bool) -> None:
+    from services.cli.run import cancelling_on_signals
     from services.client.progress import ProgressView
     from services.pipeline.stages import run_stages
-    from services.run_command import cancelling_on_signals
 
     with cancelling_on_signals(out), ProgressView() as view:
         run_stages(spec, out, stages, view, workers=1, again=again)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
+from services.cli.upload import upload_folder
 from services.client.client import Client
-from services.upload_command import upload_folder
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import toy_server
 from tests.support.uploading import write_capture

@@ -15,9 +15,9 @@ from sqlalchemy.exc import OperationalError
 
 from services.api import server
 from services.api.captures.contents import content_fault
+from services.cli.dask import require_scheduler_named
 from services.core.errors import PlatformError
 from services.core.settings import ServerSettings, UploadLimits
-from services.dask_command import require_scheduler_named
 from tests.support.mouth import write_mouth
 
 PATIENCE_S = 280.0

@@ -21,8 +21,8 @@ import httpx
 import psutil
 import pytest
 
-from services import dask_command
 from services.api.http.connections import Crowd
+from services.cli import dask as dask_command
 from services.core.settings import ConnectionLimits
 from services.pipeline.workers import Workers
 from tests.support.live_server import toy_server

@@ -16,9 +16,9 @@ import httpx
 import pytest
 
 from services.capture import stage as capture_stage
+from services.cli.dask import _claiming
 from services.core.errors import PlatformError
 from services.core.placement import DOME, STAGES
-from services.dask_command import _claiming
 from services.fit import stage as fit_stage
 from services.pipeline.worker_check import fault_of
 from services.pipeline.worker_health import Sign, require_healthy_workers

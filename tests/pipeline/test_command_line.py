@@ -129,7 +129,7 @@ def test_submit_watch_and_retry_through_a_server(tmp_path: Path, job_file: Path)
 def test_ctrl_c_during_a_capture_leaves_the_dome_dark(tmp_path: Path) -> None:
     """The whole process group gets the signal, as from a terminal."""
     code = (
-        "import sys; from pathlib import Path; from services.run_command import cancelling_on_signals;"
+        "import sys; from pathlib import Path; from services.cli.run import cancelling_on_signals;"
         "from services.pipeline.stages import run_job; from services.core.errors import JobCancelledError;"
         "from services.core.records import JobSpec, RigSpec; from tests.support.toy_stages import DOORS\n"
         "if __name__ == '__main__':\n"

@@ -32,7 +32,7 @@ class Role:
 _COMMANDS = ("services.__main__:build_app",)
 _WORKER = (
     *_COMMANDS,
-    "services.dask_command",
+    "services.cli.dask",
     "services.pipeline.stages",
     "services.preprocess.stage",
     "services.fit.stage",
@@ -41,12 +41,12 @@ _WORKER = (
 _WORKER += ("services.fit.transport.engine", "services.pipeline.worker_setup", "services.pipeline.worker_check")
 
 ROLES: Mapping[str, Role] = {
-    "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.token_command", DOME_AT_THE_SERVER)),
-    "scheduler": Role((), (*_COMMANDS, "services.dask_command")),
+    "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.cli.token", DOME_AT_THE_SERVER)),
+    "scheduler": Role((), (*_COMMANDS, "services.cli.dask")),
     "worker": Role(("worker",), _WORKER),
     "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
     "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.dome.simulator")),
-    "client": Role((), (*_COMMANDS, "services.client_commands")),
+    "client": Role((), (*_COMMANDS, "services.cli.client")),
 }
 
 

@@ -21,8 +21,8 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     Raises:
         typer.Exit: the fit did not converge.
     """
+    from services.cli.client import require_converged
     from services.client.progress import ProgressView
-    from services.client_commands import require_converged
     from services.pipeline.stages import run_job
 
     require_apart(spec, out)

@@ -49,7 +49,7 @@ def _add_submission(app: typer.Typer, connect: Callable[[str | None], Client]) -
         as_json: Json = False,
     ) -> None:
         """Upload a capture to a server; the same command again goes on with an upload that broke."""
-        from services.upload_command import upload_folder
+        from services.cli.upload import upload_folder
 
         with connect(server) as client:
             uploaded = upload_folder(client, folder, subject)
@@ -72,7 +72,7 @@ def _add_submission(app: typer.Typer, connect: Callable[[str | None], Client]) -
         spec = read_job(job)
         with connect(server) as client:
             if send:
-                from services.upload_command import with_uploaded_source
+                from services.cli.upload import with_uploaded_source
 
                 spec = with_uploaded_source(client, spec)
             if calibration is not None:
@@ -97,7 +97,7 @@ def _add_demonstration(app: typer.Typer, connect: Callable[[str | None], Client]
 
         spec = JobSpec.model_validate(find_preset("demo").options)
         if server is None:
-            from services.run_command import run_and_tell
+            from services.cli.run import run_and_tell
 
             run_and_tell(spec, out, None, as_json=as_json)
             return
