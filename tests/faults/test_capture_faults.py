@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from services.capture.dome import registers as reg
 from services.capture.dome.controller import DomeObserver
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
-from services.capture.dome.protocol import registers as reg
 from services.capture.dome.registers import FaultKind
 from services.capture.dome.simulator import order_fault, serve_dome, simulated_dome
 from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError

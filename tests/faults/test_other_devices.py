@@ -10,10 +10,10 @@ from contextlib import contextmanager
 
 import pytest
 
+from services.capture.dome import registers as reg
 from services.capture.dome.controller import all_off
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
-from services.capture.dome.protocol import registers as reg
 from services.core.errors import RigError, RigUnreachableError
 
 READ_INPUT = 4

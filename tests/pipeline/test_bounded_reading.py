@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from services.api.app import create_app
-from services.api.captures.captures import reading
+from services.api.captures import reading
 from services.api.captures.contents import content_fault
 from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
 from services.api.captures.reading import ReadApart

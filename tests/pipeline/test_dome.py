@@ -21,10 +21,10 @@ from services.api.auth.tokens import Scope
 from services.api.http.problems import status_of
 from services.capture import stage
 from services.capture.console import Console
+from services.capture.dome import registers as reg
 from services.capture.dome.controller import DomeObserver
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
-from services.capture.dome.protocol import registers as reg
 from services.capture.dome.registers import FaultBit, FaultKind
 from services.capture.dome.simulator import order_fault, simulated_dome
 from services.core.dome import DomeAnswer, DomeCommand

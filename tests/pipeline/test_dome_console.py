@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from services.capture.console import Console
+from services.capture.dome import registers as reg
 from services.capture.dome.controller import DomeObserver
 from services.capture.dome.modbus_link import ModbusLink
-from services.capture.dome.protocol import registers as reg
 from services.capture.dome.simulator import simulated_dome
 from services.capture.preflight import preflight
 from services.capture.rig import PlannedRig

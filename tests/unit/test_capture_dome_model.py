@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import services.capture
+from services.capture.dome import registers as reg
 from services.capture.dome.model import DEVICE_FAILURE, ILLEGAL_VALUE, DomeModel
-from services.capture.dome.protocol import registers as reg
 from services.capture.dome.registers import FaultBit, FaultKind
 
 WATCHDOG_S = 1.0

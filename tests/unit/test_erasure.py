@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from services.api.jobs import erasure, jobs
 from services.api.jobs.erasure import Erased, erase, forget_listing
-from services.api.jobs.jobs import Jobs, erasure, jobs
+from services.api.jobs.jobs import Jobs
 from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.table import job_table
 from services.core.errors import StoreError

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import sqlalchemy as sql
 
+from services.api.jobs import event_stream as feed
 from services.api.jobs.event_stream import EventFeed, Turn
-from services.api.jobs.jobs import event_stream as feed
 from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.repository import Lease, Repository
 from services.core.records import JobSpec

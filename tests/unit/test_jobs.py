@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from services.api.jobs import admission
 from services.api.jobs.admission import Needs
-from services.api.jobs.jobs import Jobs, admission
+from services.api.jobs.jobs import Jobs
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.repository import Lease
 from services.core.errors import DiskFullError

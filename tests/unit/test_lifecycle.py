@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.api.jobs.jobs import lifecycle
+from services.api.jobs import lifecycle
 from services.api.jobs.lifecycle import TABLE, Instruction, JobState, Trigger, apply
 from services.client.errors import JobStateError
 

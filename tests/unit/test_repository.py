@@ -14,12 +14,12 @@ from alembic.migration import MigrationContext
 
 from services.api import data_folder
 from services.api.auth import audit, ended_sessions, setup_links, tokens
-from services.api.captures.captures import table as capture_table
+from services.api.captures import table as capture_table
 from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.repository import Failure, Repository
 from services.api.jobs.table import JobFilter, job_table
 from services.api.migrations import FIRST, upgrade
-from services.api.webhooks.webhooks import tables as webhook_tables
+from services.api.webhooks import tables as webhook_tables
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec

@@ -1,0 +1,1 @@
+"""Calibrations that captures and jobs name."""

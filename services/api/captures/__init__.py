@@ -1,0 +1,1 @@
+"""Uploaded captures: their files, checks and records."""

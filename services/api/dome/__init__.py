@@ -1,0 +1,1 @@
+"""The dome by hand: look, one light, ALL OFF, preflight."""

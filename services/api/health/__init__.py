@@ -1,0 +1,1 @@
+"""Whether the service and its workers are well: readiness, metrics, workers."""

@@ -1,0 +1,1 @@
+"""What every route shares: bodies, problem documents, files, limits, thread pools, connections."""

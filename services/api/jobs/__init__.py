@@ -1,0 +1,1 @@
+"""Jobs: their states, table, queue, history and times."""

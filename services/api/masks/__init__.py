@@ -1,0 +1,1 @@
+"""Masks of prepared captures, drawn and corrected by hand."""

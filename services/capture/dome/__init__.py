@@ -1,0 +1,1 @@
+"""The light dome: protocol, Modbus driver, model and simulator."""

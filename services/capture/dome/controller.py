@@ -7,8 +7,8 @@ from contextlib import closing, suppress
 import numpy as np
 from numpy.typing import NDArray
 
+from services.capture.dome import registers as reg
 from services.capture.dome.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
-from services.capture.dome.protocol import registers as reg
 from services.core.dome import DomeStatus
 from services.core.errors import RigError, RigUnreachableError
 

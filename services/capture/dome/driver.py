@@ -24,11 +24,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from services.capture.dome import registers as reg
 from services.capture.dome.controller import DARK_ATTEMPTS, REPLY_TIMEOUT_S, OtherDeviceError, error_kind, fault_names, read_status, require_dome
 from services.capture.dome.keepalive import KeepAlive
 from services.capture.dome.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
 from services.capture.dome.protocol import ExposureBudget, Rgb
-from services.capture.dome.protocol import registers as reg
 from services.core.dome import DomeStatus
 from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from services.capture.dome.protocol import registers as reg
+from services.capture.dome import registers as reg
 from services.capture.dome.registers import FaultBit, FaultKind, Register, Space
 
 ILLEGAL_VALUE = 3

@@ -19,9 +19,9 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from services.capture.dome import registers as reg
 from services.capture.dome.modbus_link import UNIT, LinkError, ModbusLink
 from services.capture.dome.model import DomeModel
-from services.capture.dome.protocol import registers as reg
 from services.capture.dome.registers import FaultKind, Space
 from services.core.errors import RigError
 

@@ -1,0 +1,1 @@
+"""Reading and writing what is kept in files: meshes, image headers, folders, private files."""

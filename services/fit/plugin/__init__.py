@@ -1,0 +1,1 @@
+"""The Mitsuba integrator that renders measured teeth in any scene."""

@@ -1,0 +1,1 @@
+"""Derivatives of images by moving borders, shapes and stains."""

@@ -1,0 +1,1 @@
+"""Lights: connections to them and maps of what they reach."""

@@ -1,0 +1,1 @@
+"""Random walks through teeth, from their start to a light, and what they score."""

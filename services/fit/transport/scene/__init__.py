@@ -1,0 +1,1 @@
+"""The scene that walks go through: its recipe, media, solids and checks."""
