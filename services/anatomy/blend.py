@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.anatomy.frame import ToothFrame
 from services.anatomy.isosurface import surface_net
 from services.anatomy.templates.dimensions import ToothDimensions
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.transport.scene.recipe import DentinShape
 
 MODES = ("buccal", "proximal", "occlusal")
 """Order of the blend weights c."""

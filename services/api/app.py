@@ -53,8 +53,9 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
 
-    from services.api.auth import access
     from services.api.auth.browser_protection import Shield
+    from services.api.auth.access import refuse_open_network
+    from services.api.auth.install import install
     from services.api.calibrations.routes import build_calibrations_router
     from services.api.captures.routes import build_captures_router
     from services.api.dome.dome import Dome
@@ -68,7 +69,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from services.api.masks.routes import build_masks_router
     from services.api.observation import Observation
 
-    access.refuse_open_network(settings)
+    refuse_open_network(settings)
     certificates = Certificates.of(settings.tls) if settings.tls is not None else None
     workers = Workers(settings.scheduler, certificates)
 
@@ -125,7 +126,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     app.include_router(build_dome_router(dome, darkeners, operators))
     app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
-    access.install(app, settings, jobs.repository.engine, auditors, dark_auditors)
+    install(app, settings, jobs.repository.engine, auditors, dark_auditors)
     app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
     names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
     app.add_middleware(Shield, names=names, secure=not settings.is_loopback)

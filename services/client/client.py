@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from pydantic import SecretStr
 
 from services.client.downloads import telling_lost, whole_file
-from services.client.requests import RECONNECT_S, Ask, EventCursor, Exchange, Flow, Pause, Work, error_in
+from services.client.flows import RECONNECT_S, Ask, EventCursor, Flow, Pause, Work, error_in
+from services.client.requests import Exchange
+from services.core.events import JobEvent
 from services.core.records import JobSpec
-from services.pipeline.event_log import JobEvent
 
 if TYPE_CHECKING:
     from services.client.uploader import UploadProgress, UploadResult

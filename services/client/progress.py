@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from services.pipeline.event_log import JobEvent
+from services.core.events import JobEvent
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -1,57 +1,17 @@
-"""What a client and a server say to each other, without a connection: whoever has one performs the steps and hands back what came of them.
-
-A flow is a generator. It yields an ``Ask``, a ``Pause`` or some ``Work``, is sent the answer or has the error thrown into it, and returns the result. So the
-blocking and the asynchronous client share every request, retry and error, and differ only in how a step is taken.
-"""
+"""Every request that the clients make of a server, as flows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 
 from pydantic import SecretStr
 
-from services.client.errors import JobStateError, RateError, ScopeError, UnauthenticatedError, UnknownJobError, error_of
-from services.core.errors import DentineError, InputError, PlatformError
+from services.client.flows import Ask, Flow, answer
+from services.client.uploader import Uploader, UploadProgress, UploadResult
 from services.core.records import JobSpec
-from services.pipeline.event_log import JobEvent
-
-if TYPE_CHECKING:
-    from services.client.uploader import UploadProgress, UploadResult
-
-R = TypeVar("R")
-RECONNECT_S = 1.0
-RECONNECT_TRIES = 30
-
-
-@dataclass(frozen=True)
-class Ask:
-    """A request to be made; its answer is an ``httpx.Response``, whatever its status."""
-
-    method: str
-    path: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Further arguments of ``httpx.Client.request``."""
-
-
-@dataclass(frozen=True)
-class Pause:
-    """Time to let pass."""
-
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Work:
-    """A call that takes a while, as it reads a file."""
-
-    call: Callable[[], Any]
-
-
-Flow = Generator[Ask | Pause | Work, Any, R]
 
 
 class Exchange:
@@ -93,8 +53,6 @@ class Exchange:
 
     def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> Flow[UploadResult]:
         """Upload a folder capture and commit it."""
-        from services.client.uploader import Uploader
-
         return Uploader(self.server, progress).upload(folder, subject)
 
     def get(self, job_id: str) -> Flow[dict[str, Any]]:
@@ -115,78 +73,3 @@ class Exchange:
 
     def _answer(self, method: str, path: str, **options: Any) -> Flow[dict[str, Any]]:
         return answer(self.server, Ask(method, path, options))
-
-
-def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
-    """The JSON that a request is answered with. One that changes nothing is made once more if its connection breaks, as servers close idle ones.
-
-    Raises:
-        PlatformError: no server answers. DentineError: the one that the answer tells of.
-    """
-    import httpx
-
-    try:
-        try:
-            response = yield ask
-        except (httpx.ReadError, httpx.RemoteProtocolError):
-            if ask.method != "GET":
-                raise
-            response = yield ask
-    except httpx.HTTPError as problem:
-        raise PlatformError(f"Server {server} does not answer ({problem}); start it with dentine serve or give --server.") from problem
-    if response.is_error:
-        raise error_in(response)
-    told: dict[str, Any] = response.json()
-    return told
-
-
-class EventCursor:
-    """Reads a job's event stream line by line, over as many connections as it takes, without loss or repetition."""
-
-    def __init__(self, server: str, job_id: str, after: int) -> None:
-        self._server, self._path, self._after = server, f"/jobs/{job_id}/events", after
-        self._tries, self._ends = 0, False
-        self.has_ended = False
-
-    def ask(self) -> Ask:
-        """The request of another connection, for what was not read yet."""
-        self._ends = False
-        return Ask("GET", self._path, {"headers": {"Last-Event-ID": str(self._after)}})
-
-    def take(self, line: str) -> JobEvent | None:
-        """Read a line; an event if it completes one."""
-        name, _, value = line.partition(": ")
-        if name == "event":
-            self._ends = value == "end"
-        elif name == "data" and self._ends:
-            self.has_ended = True
-        elif name == "data":
-            event = JobEvent.model_validate_json(value)
-            self._after, self._tries = event.id, 0
-            return event
-        return None
-
-    def lose(self, problem: Exception) -> None:
-        """The connection broke.
-
-        Raises:
-            PlatformError: it has done so too often in a row.
-        """
-        self._tries += 1
-        if self._tries > RECONNECT_TRIES:
-            raise PlatformError(f"Server {self._server} no longer answers; start it again, the job is kept.") from problem
-
-
-def error_in(response: Any) -> DentineError:
-    """The error that a problem document tells of."""
-    try:
-        problem = response.json()
-        detail, code = str(problem["detail"]), str(problem["code"])
-    except (ValueError, KeyError):
-        detail, code = f"The server answered {response.status_code}; is it a dentine server?", ""
-    if response.status_code == 401:
-        detail += " The command line reads it from the variable DENTINE__CLIENT__TOKEN."
-    if (known := error_of(code, detail)) is not None:
-        return known
-    kinds = {401: UnauthenticatedError, 403: ScopeError, 404: UnknownJobError, 409: JobStateError, 422: InputError, 429: RateError}
-    return kinds.get(response.status_code, DentineError)(detail)

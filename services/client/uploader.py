@@ -16,7 +16,7 @@ from pydantic import Field
 from services.client.capture_paths import path_fault, require_paths
 from services.client.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
 from services.client.errors import UploadError
-from services.client.requests import Ask, Flow, Pause, Work, answer, error_in
+from services.client.flows import Ask, Flow, Pause, Work, answer, error_in
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.files.image_metadata import metadata_fault
 from services.core.geometry import Record

@@ -18,8 +18,8 @@ from services.core.store import StageWriter, open_stage, write_atomic, write_rec
 from services.core.verdict import VERDICT, verdict_of
 
 if TYPE_CHECKING:
+    from services.anatomy.dentin_shape import DentinShape
     from services.core.geometry import Tooth
-    from services.fit.transport.scene.recipe import DentinShape
 
 ENGINE = "services.fit.transport.engine:Engine"
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from services.anatomy.blend import dentin_blend_shape
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.scans.scan import read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.dimensions import upper_tooth
@@ -21,7 +22,7 @@ from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
 from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import InputError
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
@@ -18,7 +19,7 @@ from services.fit.export.stains import keep_stains, write_textures
 from services.fit.inputs.stain_uv import ToothStains
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
 from services.phantom.reflection import ROUGHNESS, Reflection, reflect

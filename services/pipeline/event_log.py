@@ -15,14 +15,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import sqlalchemy as sql
-from pydantic import Field
 from pydantic_core import from_json
 
 from services.core.errors import FencedError
-from services.core.geometry import Record
+from services.core.events import JobEvent
 from services.core.stage import StageEvent, StageName
 from services.pipeline.database import Query, metadata, open_database, sqlite_url, writing
 
@@ -56,20 +55,6 @@ lease_table = sql.Table(
     sql.Column("holder", sql.Text, nullable=False),
     sql.Column("until_s", sql.Float, nullable=False),
 )
-
-
-class JobEvent(Record):
-    """One row of the event table."""
-
-    id: int = Field(description="grows over all jobs; what Last-Event-ID names")
-    job: str
-    time_s: float = Field(description="Unix time")
-    attempt: int = Field(description="attempt of the stage; 0 for a change of state")
-    stage: StageName | None
-    kind: Literal["state", "started", "progress", "log", "step", "preview", "finished"]
-    message: str
-    done: float | None = Field(description="fraction of the stage done, 0 to 1")
-    data: dict[str, Any]
 
 
 _COLUMNS = tuple(JobEvent.model_fields)

@@ -27,6 +27,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from services.core.errors import CorruptStoreError, InputError, JobCancelledError, MissingStageError, PlatformError, SchedulerLostError, WorkerLostError
+from services.core.events import JobEvent
 from services.core.job_kinds import JOB_KINDS
 from services.core.masks import is_stale
 from services.core.placement import DOME, STAGES, rank
@@ -34,7 +35,7 @@ from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
 from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
 from services.pipeline.database import patiently
-from services.pipeline.event_log import EventAddress, EventLog, JobEvent, folder_events
+from services.pipeline.event_log import EventAddress, EventLog, folder_events
 from services.pipeline.machine_class import machine_class
 from services.pipeline.workers import Workers
 

@@ -18,7 +18,8 @@ from standardwebhooks.webhooks import Webhook as Verifier
 
 from services.api.app import create_app
 from services.api.jobs.lifecycle import JobState, Trigger
-from services.api.jobs.repository import Failure, Repository
+from services.api.jobs.records import Failure
+from services.api.jobs.repository import Repository
 from services.api.webhooks.address import AddressPolicy
 from services.api.webhooks.deliveries import CLAIM_S, DISABLE_AFTER_S, KEEP_S, Attempt, Deliveries, Delivery
 from services.api.webhooks.outbox import DAY_S

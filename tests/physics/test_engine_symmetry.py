@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from tests.support.small_tooth import CAMERA_DISTANCE_MM, camera_at, recipe, sphere, whole_view
 from tests.support.z_scores import LARGEST_Z
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
@@ -22,7 +23,7 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, View, single_tooth
+from services.fit.transport.scene.recipe import View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.stain_paint import painted_depth
 

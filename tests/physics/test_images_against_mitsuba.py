@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.files.meshes import read_teeth, write_mesh
 from services.core.records import Boundary, FolderCapture
 from services.core.store import read_record
@@ -19,7 +20,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_b
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import DentineError, InputError, MeshError, PlatformError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
@@ -24,7 +25,7 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_d
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SurfaceDistance
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
@@ -25,7 +26,7 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.paths.scores import Scores
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.mixed_border import MixedBorder
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
@@ -20,7 +21,7 @@ from services.fit.optics.phase_table import PhaseTable, tent_weights
 from services.fit.slab.simulate import Layer, simulate_slab
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape, single_tooth
+from services.fit.transport.scene.recipe import single_tooth
 from tests.support.exit_tables import angular_cases
 from tests.support.phase_tables import TENT_SPACING_RAD, cumulative, density, henyey_greenstein, over_equal_angles, over_equal_cosines
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures

@@ -13,12 +13,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import InputError
 from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, View
+from services.fit.transport.scene.recipe import View
 from tests.support.small_mouth import FREE_MM, LIGHTS_MM, MOUTH, mouth_recipe, revolved
 from tests.support.small_tooth import camera_at, recipe, whole_view
 

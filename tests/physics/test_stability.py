@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.bench.stability.corners import MATCHED, REGIONS, SMOOTH, THIN, Corners, draw
 from services.bench.stability.difficult_scenes import Scene, ellipsoid, look, scenes, with_slivers
 from services.bench.stability.formula_errors import FORMULAS
@@ -19,7 +20,7 @@ from services.fit.slab.simulate import Layer, simulate_slab, specular_share
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.nesting import winding_number
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, single_tooth
+from services.fit.transport.scene.recipe import SceneRecipe, single_tooth
 from tests.support.slab_tables import total_cases
 from tests.support.small_tooth import LIGHTS_MM, camera_at, whole_view
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
@@ -21,7 +22,6 @@ from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_b
 from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import DentinShape
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, camera_at, recipe, whole_view
 from tests.support.stained_tooth import WIDTH, stain, stained_recipe, texture_coordinates

@@ -17,10 +17,11 @@ from services.api.app import create_app
 from services.client.client import AsyncClient, Client
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import CaptureInputError, PlatformError
+from services.core.events import JobEvent
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
-from services.pipeline.event_log import EventAddress, JobEvent
+from services.pipeline.event_log import EventAddress
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import serving
 from tests.support.uploading import contents_of, write_capture

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera
 from services.fit.checks.next_capture import LIGHTS, VIEWS, Candidate, Sensor, advice, probes_of, sentence, turned
 from services.fit.execution.blocks import Block, read_recipe, write_block, write_recipe
@@ -18,7 +19,7 @@ from services.fit.execution.seeds import Seeds
 from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
 from services.fit.solve.information import Addition, covariance_with
 from services.fit.tooth.schedule import media_domain
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, View, single_tooth
+from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere
 

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 
 from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, PlatformError, WorkerLostError
+from services.core.events import JobEvent
 from services.core.records import JobSpec, RigSpec
 from services.core.stage import StageEvent
 from services.core.store import is_published
-from services.pipeline.event_log import JobEvent, folder_events
+from services.pipeline.event_log import folder_events
 from services.pipeline.stages import StageTask, request_cancel, run_job, stages_of, withdraw_cancel
 from tests.support.toy_stages import DOORS
 

@@ -16,7 +16,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from services.api.auth import access
+from services.api.auth.install import install
 from services.api.captures.captures import Captures
 from services.api.captures.routes import build_captures_router
 from services.api.http import problems
@@ -61,7 +61,7 @@ def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
     app.include_router(build_captures_router(captures))
-    access.install(app, ServerSettings(data=tmp_path), engine, Clerks(1), Clerks(1))
+    install(app, ServerSettings(data=tmp_path), engine, Clerks(1), Clerks(1))
     with serving(app) as connected:
         yield connected
     engine.dispose()

@@ -129,7 +129,7 @@ def test_a_file_that_changes_meanwhile_is_refused_by_name(server: httpx.Client, 
 
 
 def test_an_error_of_the_tree_is_found_by_its_code() -> None:
-    from services.client.requests import error_in
+    from services.client.flows import error_in
 
     answer = httpx.Response(507, json={"detail": "The disk is full.", "code": "disk-full"})
     assert type(error_in(answer)) is DiskFullError

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, single_tooth
+from services.fit.transport.scene.recipe import SceneRecipe, single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, ellipsoid, whole_view
 
 Array = NDArray[np.float64]

@@ -12,13 +12,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
 from services.core.records import JobSpec, MaskBit, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from tests.support.small_mouth import revolved
 from tests.support.small_tooth import camera_at
 

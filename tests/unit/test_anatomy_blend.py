@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.anatomy.blend import BASE_DEPTH_MM, CLEARANCE_MM, FULL_DEPTH_MM, MODES, dentin_blend_shape
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.anatomy.frame import ToothFrame, estimate_frame
 from services.anatomy.templates.dimensions import upper_tooth
@@ -19,7 +20,6 @@ from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.transport.scene.recipe import DentinShape
 from tests.support.shared_data import shared_path
 
 GRID_ERROR_MM = 0.02

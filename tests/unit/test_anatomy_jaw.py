@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SurfaceDistance
 from services.anatomy.templates.dimensions import UPPER_TEETH, upper_tooth
 from services.anatomy.templates.jaw import GAP_MM, SHORT_OF_PLANE_MM, TILT_SPREAD_DEG, Jaw, JawTooth, build_jaw
@@ -17,7 +18,7 @@ from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.scene.nesting import require_nested
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from tests.support.shared_data import shared_path
 

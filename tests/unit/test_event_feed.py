@@ -17,7 +17,8 @@ import sqlalchemy as sql
 from services.api.jobs import event_stream as feed
 from services.api.jobs.event_stream import EventFeed, Turn
 from services.api.jobs.lifecycle import Trigger
-from services.api.jobs.repository import Lease, Repository
+from services.api.jobs.records import Lease
+from services.api.jobs.repository import Repository
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
 from services.pipeline.database import sqlite_url

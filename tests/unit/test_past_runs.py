@@ -13,11 +13,11 @@ from services.api.jobs.past_runs import Course, PastRun, course_of, tenth_of
 from services.api.jobs.repository import Repository
 from services.api.jobs.size import JobSize, method_of, size_of
 from services.api.jobs.time_ranges import Position, TimeRange, TimeRanges, time_range
+from services.core.events import JobEvent
 from services.core.records import JobSpec, RigSpec
 from services.core.settings import DATABASE_FILE
 from services.core.stage import StageEvent
 from services.pipeline.database import sqlite_url
-from services.pipeline.event_log import JobEvent
 from services.pipeline.machine_class import machine_class
 from tests.support.past_runs import remember_runs
 from tests.support.uploading import write_capture

@@ -1,11 +1,10 @@
-"""Finds out whom a request comes from, and puts all that guards the API in front of it."""
+"""Finds out whom a request comes from."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from services.api.auth.audit import AuditLog
-from services.api.auth.sessions import COOKIE, Sessions, read_key
+from services.api.auth.sessions import COOKIE, Sessions
 from services.api.auth.tokens import LOCAL, Caller, Tokens
 from services.api.http.thread_pools import Clerks
 from services.client.errors import UnauthenticatedError
@@ -13,8 +12,6 @@ from services.core.errors import SettingsError
 from services.core.settings import ServerSettings
 
 if TYPE_CHECKING:
-    import sqlalchemy as sql
-    from fastapi import FastAPI
     from starlette.requests import HTTPConnection
 
 
@@ -68,22 +65,3 @@ def refuse_open_network(settings: ServerSettings) -> None:
         raise SettingsError(
             f"Host {settings.host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens, or listen on 127.0.0.1."
         )
-
-
-def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks, dark_auditors: Clerks) -> None:
-    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
-
-    Args:
-        dark_auditors: write what darkens a dome, so that its answer waits behind no other change's row.
-    """
-    from services.api.auth.authentication import Gate
-    from services.api.auth.routes import build_access_router
-    from services.api.auth.setup_links import SetupLinks
-    from services.api.http.body_limit import BodyLimit
-    from services.api.http.rate_limits import Rates
-
-    sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
-    access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
-    app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
-    app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
-    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors)

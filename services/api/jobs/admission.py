@@ -17,7 +17,7 @@ from pathlib import Path
 
 import psutil
 
-from services.api.jobs.repository import Job
+from services.api.jobs.records import Job
 from services.client.errors import JobTooLargeError
 from services.core.errors import DentineError, DiskFullError, StoreError
 from services.core.placement import rank

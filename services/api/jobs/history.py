@@ -8,9 +8,10 @@ from typing import Any
 
 from pydantic import Field
 
+from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.stage import StageName
-from services.pipeline.event_log import EventLog, JobEvent, Told
+from services.pipeline.event_log import EventLog, Told
 
 PICTURES = ("render", "photo", "residual")
 ENTRY_BYTES = 512

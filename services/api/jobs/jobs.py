@@ -19,13 +19,15 @@ from services.api.jobs.admission import Admission, Machine
 from services.api.jobs.erasure import erase, forget_listing
 from services.api.jobs.lifecycle import Instruction, JobState, Trigger
 from services.api.jobs.light_limits import LightLimits
-from services.api.jobs.repository import Creation, Deletion, Job, Repository
+from services.api.jobs.records import Creation, Deletion, Job
+from services.api.jobs.repository import Repository
 from services.api.jobs.runner import RunJob, Runner
 from services.api.jobs.server_paths import ServerPaths
 from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange, TimeRanges
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import SettingsError, StoreError
+from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.masks import is_stale
 from services.core.owners import LOCAL_VIEWER, Viewer
@@ -33,7 +35,7 @@ from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
 from services.core.store import is_published
-from services.pipeline.event_log import EventAddress, JobEvent
+from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
 from services.pipeline.stages import request_cancel, stages_of
 

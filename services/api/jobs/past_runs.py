@@ -10,10 +10,11 @@ from pydantic import Field
 
 from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.size import JobSize
+from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.stage import StageName
 from services.pipeline.database import metadata, writing
-from services.pipeline.event_log import EventLog, JobEvent, event_table
+from services.pipeline.event_log import EventLog, event_table
 
 NEWEST = 40
 """Runs that are learned from: enough for a range, few enough to follow a machine that changes."""

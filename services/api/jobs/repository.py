@@ -10,95 +10,27 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Self
+from typing import Any
 
 import sqlalchemy as sql
-from pydantic import Field
 
 from services.api.jobs.lifecycle import JobState, Transition, Trigger, apply
 from services.api.jobs.past_runs import PastRuns, past_run_table
-from services.api.jobs.server_paths import without_folders
+from services.api.jobs.records import Creation, Deletion, Failure, Job, Lease
 from services.api.jobs.table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.jobs.verdicts import Verdicts
 from services.api.migrations import upgrade
 from services.api.webhooks.outbox import collect_changes
 from services.client.errors import JobStateError
-from services.core.errors import DentineError, FencedError
-from services.core.geometry import Record
-from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
-from services.core.records import JobName, JobSpec, Verdict
-from services.core.stage import StageName
+from services.core.errors import FencedError
+from services.core.owners import LOCAL_VIEWER, Viewer
+from services.core.records import JobSpec
 from services.pipeline.database import Query, open_database, writing
 from services.pipeline.event_log import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
 
 KNOWN_JOBS = 1024
 """Jobs, and their options, that are kept as they were read."""
-
-
-class Failure(Record):
-    """Why a job failed."""
-
-    code: str = Field(description="stable and machine-readable")
-    message: str = Field(description="one sentence that names the thing and the remedy")
-    exit_status: int = Field(description="what `dentine run` would have exited with")
-    stage: StageName | None = None
-    evidence: dict[str, str | int | float | None] = Field(default={}, description="what was measured when it failed, units in the names")
-
-    @classmethod
-    def of(cls, problem: DentineError, stage: StageName | None) -> Self:
-        """The failure that an error means."""
-        return cls(code=problem.code, message=problem.message, exit_status=problem.exit_status, stage=stage, evidence=dict(problem.evidence))
-
-
-class Job(Record):
-    """One job as the API shows it."""
-
-    id: str
-    number: int = Field(description="grows with every submission")
-    state: JobState
-    created_s: float = Field(description="Unix time of the submission")
-    changed_s: float = Field(description="Unix time of the last change of state")
-    spec: JobSpec
-    failure: Failure | None
-    request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
-    name: JobName | None = Field(default=None, description="label that a person gave it")
-    owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
-    verdict: Verdict | None = Field(
-        default=None, description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it"
-    )
-
-    def seen_by(self, viewer: Viewer) -> Job:
-        """The same as somebody may see it: without the folders on the server, for one who may not use them."""
-        return self if viewer.uses_paths else self.model_copy(update={"spec": without_folders(self.spec)})
-
-
-class Deletion(Record):
-    """The receipt of a deleted job: all that is left of it."""
-
-    job: str
-    deleted_s: float = Field(description="Unix time")
-    submitted_s: float = Field(description="Unix time of the submission")
-    files: int = Field(description="files that were removed")
-    bytes: int
-    digest: str = Field(description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before")
-
-
-@dataclass(frozen=True)
-class Creation:
-    """What a submission led to."""
-
-    job: Job
-    is_new: bool
-
-
-@dataclass(frozen=True)
-class Lease:
-    """The right to run a job for a while."""
-
-    job: Job
-    number: int
 
 
 _IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)

@@ -18,7 +18,7 @@ from services.api.http.thread_pools import Clerks
 from services.api.jobs.event_stream import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
 from services.api.jobs.jobs import Jobs, StageProgress
 from services.api.jobs.lifecycle import JobState
-from services.api.jobs.repository import Deletion, Job
+from services.api.jobs.records import Deletion, Job
 from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange
 from services.core.geometry import Record

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from services.api.jobs.admission import Admission, turn
 from services.api.jobs.lifecycle import JobState, Trigger
-from services.api.jobs.repository import Failure, Job, Lease, Repository
+from services.api.jobs.records import Failure, Job, Lease
+from services.api.jobs.repository import Repository
 from services.client.errors import JobStateError
 from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, ReadOnlyStoreError, SchedulerLostError
 from services.core.records import JobSpec

@@ -17,12 +17,14 @@ from services.api.jobs.admission import turn
 from services.api.jobs.forecast import LEAST, Observation, foresee
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.past_runs import TENTHS, PastRun, tenth_of
-from services.api.jobs.repository import Job, Repository
+from services.api.jobs.records import Job
+from services.api.jobs.repository import Repository
 from services.api.jobs.size import method_of, size_of
+from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
-from services.pipeline.event_log import Begun, EventLog, JobEvent
+from services.pipeline.event_log import Begun, EventLog
 from services.pipeline.stages import stages_of
 
 SIZE_SLOPE = 0.5

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sqlalchemy as sql
 from pydantic import ValidationError
 from pydantic_core import from_json
 
 from services.api.jobs.lifecycle import JobState
+from services.api.jobs.records import Job
 from services.core.records import Verdict
 from services.core.verdict import VERDICT
 from services.pipeline.event_log import event_table
-
-if TYPE_CHECKING:
-    from services.api.jobs.repository import Job
 
 MAX_KEPT = 1024
 """Verdicts that are kept as they were read: as many as the jobs that are."""

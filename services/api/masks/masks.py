@@ -10,7 +10,7 @@ from pydantic import Field
 
 from services.api.jobs.jobs import Jobs
 from services.api.jobs.lifecycle import JobState
-from services.api.jobs.repository import Job
+from services.api.jobs.records import Job
 from services.api.masks.images import picture_of, require_mask
 from services.client.errors import JobStateError, UnknownMaskError
 from services.core.calibration import Calibration

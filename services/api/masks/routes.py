@@ -9,7 +9,7 @@ from services.api.auth.scopes import needs
 from services.api.http.artifacts import ANSWERS, artifact_response
 from services.api.http.problems import refusals
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.repository import Job
+from services.api.jobs.records import Job
 from services.api.masks.masks import MaskList, Masks
 
 PNG = "image/png"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.bench.figures.cases import job_of
 from services.bench.fits.tooth_capture import tissue_of
 from services.core.records import FitReport, JobSpec
@@ -25,7 +26,7 @@ from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.stage import fitted_teeth
 from services.fit.tooth.driver import dentin_shape
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, View
+from services.fit.transport.scene.recipe import View
 
 Image = tuple[str, str]
 """Camera and light."""

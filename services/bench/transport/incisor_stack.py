@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, View, single_tooth
+from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 
 TISSUE = Tissue(Medium(4.5, 0.997, 0.93, 0.82, -0.1), Medium(12.0, 0.9945, 1.0, 0.75))

@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.blend import dentin_blend_shape
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.bench import Row
 from services.core.geometry import Camera, Mesh
 from services.fit.optics.parameters import Medium, Stain, Tissue
 from services.fit.optics.phase_table import PhaseTable
 from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import DentinShape, View, single_tooth
+from services.fit.transport.scene.recipe import View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 
 if TYPE_CHECKING:

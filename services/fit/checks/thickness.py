@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Camera, Mesh
 from services.core.records import Estimate
 from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.scene.recipe import DentinShape
 
 LEAST_STEP = 0.01
 """Least half step of a difference by a blend weight: some micrometres of dentin, far above rounding."""

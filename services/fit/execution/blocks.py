@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import CorruptStoreError
 from services.core.geometry import Camera, Mesh
 from services.core.store import write_atomic
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 

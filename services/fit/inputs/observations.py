@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
@@ -16,7 +17,7 @@ from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import StoredArray, open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
 from services.fit.solve.losses import first_weights
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe, ToothSurfaces, View
+from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 

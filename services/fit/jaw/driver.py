@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Tooth
@@ -34,7 +35,6 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import SHAPE
 from services.fit.tooth.driver import blend_shape, viewpoints_mm
 from services.fit.tooth.schedule import ChannelSchedule
-from services.fit.transport.scene.recipe import DentinShape
 
 START_STEPS = 4
 """About so many steps start one tooth, for the progress shown."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from services.anatomy.dentin_shape import DentinShape
 from services.core.records import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.alignment import offsets_told
@@ -20,7 +21,6 @@ from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
 from services.fit.tooth.driver import shape_covariance
-from services.fit.transport.scene.recipe import DentinShape
 
 STATES = ("fitted", "tied", "failed")
 

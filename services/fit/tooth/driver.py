@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
 from services.core.records import FitReport, JobSpec
@@ -27,7 +28,6 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_m
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.tooth.schedule import ChannelSchedule
-from services.fit.transport.scene.recipe import DentinShape
 
 
 @dataclass

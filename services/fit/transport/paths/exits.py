@@ -7,8 +7,6 @@ neither where the collision happens nor how grazing the exit is adds noise. Betw
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -17,11 +15,9 @@ from services.fit.optics import fresnel
 from services.fit.optics.free_flight import one_minus_exp
 from services.fit.transport.paths.scores import Plan
 from services.fit.transport.paths.tally import Tally
+from services.fit.transport.paths.walker import Walker
 from services.fit.transport.scene.geometry import Hit, SlabGeometry
 from services.fit.transport.scene.media import Media, PhaseFunction
-
-if TYPE_CHECKING:
-    from services.fit.transport.paths.walk import Walker
 
 LEAST_RATE = 1e-6
 """Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand is constant."""

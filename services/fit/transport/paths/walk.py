@@ -6,76 +6,25 @@ slab that count what leaves either face. What a scene lacks is absent from its k
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
 from services.fit.optics import fresnel
 from services.fit.optics.free_flight import minus_log1m, one_minus_exp
-from services.fit.transport.gradients.border import BorderScattering, Crossing, inverse_cosine, no_crossing, offer
+from services.fit.transport.gradients.border import BorderScattering, inverse_cosine, no_crossing, offer
 from services.fit.transport.gradients.stains import FaceCrossing
 from services.fit.transport.lighting.lights import PointLights, shadow
 from services.fit.transport.paths.connections import Connections, Vertex
 from services.fit.transport.paths.exits import Exits
-from services.fit.transport.paths.scores import Plan, Scatterings, Scores
+from services.fit.transport.paths.scores import Plan, Scores
 from services.fit.transport.paths.starts import CameraStart, LightStart, SlabStart
 from services.fit.transport.paths.tally import Tally
-from services.fit.transport.scene.geometry import Geometry, Hit, SlabGeometry
+from services.fit.transport.paths.walker import Flight, Walker
+from services.fit.transport.scene.geometry import Geometry, SlabGeometry
 from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 ROULETTE_WEIGHT = 0.1
 """Paths below this fraction of their first weight survive in proportion to it."""
-
-
-@dataclass
-class Walker:
-    """State of every lane: a path under way, what it has scored, and which sample of the lane it is."""
-
-    rng: mi.PCG32
-    origin: mi.Point3f
-    omega: mi.Vector3f
-    place: mi.UInt32
-    weight: mi.Float
-    """Throughput without the albedos, which are counted."""
-    reference: mi.Float
-    """Throughput against which roulette compares."""
-    so_far: Scatterings
-    steps: list[mi.UInt32]
-    """Flights so far; empty unless they are limited."""
-    sums: list[mi.Float]
-    border_sums: list[mi.Float]
-    kept: Crossing
-    stains: list[FaceCrossing]
-    """One of the stained faces crossed; empty unless they are asked for."""
-    vertex: Vertex | None
-    """Waits for its connection to the lights."""
-    turn: mi.UInt32
-    """Steps since the last connection."""
-    secondary: mi.Bool
-    """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""
-    shape_factor: list[mi.Float]
-    """Of a secondary walk: dt_b of each mode relative to their sum, with the sign of the scattering difference."""
-    lane: mi.UInt32
-    sample: mi.UInt32
-    active: mi.Bool
-
-
-@dataclass
-class Flight:
-    """What one step of the walk met."""
-
-    medium: mi.UInt32
-    sigma: mi.Float
-    hit: Hit
-    distance: mi.Float
-    scatters: mi.Bool
-    meets: mi.Bool
-    """A surface is reached ..."""
-    reflects: mi.Bool
-    """... and reflects like a mirror, or ..."""
-    bounces: mi.Bool
-    """... is opaque and reflects diffusely, else it is crossed."""
 
 
 class Walk:

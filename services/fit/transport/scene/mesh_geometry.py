@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.scans.patches import areas_mm2
 from services.core.geometry import Mesh
 from services.fit.optics.parameters import Stain
@@ -21,7 +22,7 @@ from services.fit.transport.scene.media import Mixed
 from services.fit.transport.scene.mixed_border import MixedBorder
 from services.fit.transport.scene.names import media_numbers
 from services.fit.transport.scene.nesting import require_nested
-from services.fit.transport.scene.recipe import DentinShape, SceneRecipe
+from services.fit.transport.scene.recipe import SceneRecipe
 
 Shapes = tuple[tuple[float, ...], ...]
 """Blend weights of each tooth's dentin."""

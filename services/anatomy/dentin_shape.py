@@ -1,0 +1,28 @@
+"""The dentin surface as a record: a base mesh and the modes that move it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Mesh
+
+
+@dataclass(frozen=True)
+class DentinShape:
+    """The dentin surface as a blend shape V = B0 + sum_m c_m modes_m (teeth 2018 Eq. 5); no modes when it is known."""
+
+    base: Mesh
+    modes_mm: NDArray[np.float64]
+    """Displacements B_m - B0, (M, V, 3); M = 0 for a known surface."""
+
+    @staticmethod
+    def known(surface: Mesh) -> DentinShape:
+        """A surface that does not move."""
+        return DentinShape(surface, np.zeros((0, len(surface.vertices_mm), 3)))
+
+    def vertices_mm(self, shape: tuple[float, ...]) -> NDArray[np.float64]:
+        """Vertices (V, 3) for blend weights c."""
+        return self.base.vertices_mm + np.tensordot(np.asarray(shape, dtype=np.float64), self.modes_mm, axes=1)
