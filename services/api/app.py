@@ -53,8 +53,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
 
-    from services.api.auth.browser_protection import Shield
     from services.api.auth.access import refuse_open_network
+    from services.api.auth.browser_protection import Shield
     from services.api.auth.install import install
     from services.api.calibrations.routes import build_calibrations_router
     from services.api.captures.routes import build_captures_router

@@ -1,18 +1,35 @@
-"""``dentine run``, and ``dentine demo`` without a server: one job in this process's own workers, told on the terminal."""
+"""``dentine run``: a job to its asset, without a server."""
 
 from __future__ import annotations
 
 import json
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.arguments import JobFile, Json, Workers
 
 if TYPE_CHECKING:
     from services.core.records import AssetManifest, JobSpec
+    from services.core.stage import StageName
+
+
+def run(
+    job: JobFile,
+    out: Annotated[Path, typer.Option(help="Folder of the results; a folder of the same job resumes it.")],
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Run a job to its asset, without a server."""
+    from services.core.settings import read_job
+
+    run_and_tell(read_job(job), out, workers, as_json=as_json)
 
 
 def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool) -> None:
@@ -21,7 +38,7 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
     Raises:
         typer.Exit: the fit did not converge.
     """
-    from services.cli.client import require_converged
+    from services.cli.verdict import require_converged
     from services.client.progress import ProgressView
     from services.pipeline.stages import run_job
 
@@ -93,3 +110,12 @@ def cancelling_on_signals(out: Path) -> Iterator[None]:
     finally:
         for number, handler in earlier.items():
             signal.signal(number, handler)
+
+
+def run_some(stages: Sequence[StageName], spec: JobSpec, out: Path, *, again: bool) -> None:
+    """Run some stages of a job and show their progress."""
+    from services.client.progress import ProgressView
+    from services.pipeline.stages import run_stages
+
+    with cancelling_on_signals(out), ProgressView() as view:
+        run_stages(spec, out, stages, view, workers=1, again=again)

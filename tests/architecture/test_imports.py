@@ -50,7 +50,7 @@ def test_an_application_starts_without_the_stages(tmp_path: Path) -> None:
 
 
 def test_the_command_line_starts_light() -> None:
-    loaded = modules_after("from services.__main__ import build_app\nbuild_app()")
+    loaded = modules_after("from services.cli.app import build_app\nbuild_app()")
     assert not [name for name in loaded if name.startswith(SERVICES) or name.split(".")[0] in (*HEAVY, "fastapi", "distributed", "zarr", "sqlalchemy")]
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from services.cli.upload import upload_folder
+from services.cli.client.upload import upload_folder
 from services.client.client import Client
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import toy_server

@@ -14,7 +14,7 @@ import zarr
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from services.__main__ import build_app
+from services.cli.app import build_app
 from services.core.errors import CaptureInputError, MeshError
 from services.core.files.meshes import read_mesh, read_teeth, write_mesh
 from services.core.geometry import Camera, Mesh

@@ -11,8 +11,8 @@ import httpx
 import pytest
 from typer.testing import CliRunner
 
-from services.__main__ import build_app
 from services.api.app import create_app
+from services.cli.app import build_app
 from services.core.records import AssetManifest, FitReport, JobSpec, Verdict
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent

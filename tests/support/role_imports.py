@@ -19,7 +19,7 @@ from types import ModuleType
 
 from tests.support.roles import ROLES, distributions, normal
 
-REGISTRY = "services.__main__:build_app"
+REGISTRY = "services.cli.app:build_app"
 """Names every command, and calls none: what it imports is executed, but what those modules import when they are called is not theirs."""
 
 

@@ -29,7 +29,7 @@ class Role:
     entries: tuple[str, ...]
 
 
-_COMMANDS = ("services.__main__:build_app",)
+_COMMANDS = ("services.cli.app:build_app",)
 _WORKER = (
     *_COMMANDS,
     "services.cli.dask",
@@ -41,12 +41,12 @@ _WORKER = (
 _WORKER += ("services.fit.transport.engine", "services.pipeline.worker_setup", "services.pipeline.worker_check")
 
 ROLES: Mapping[str, Role] = {
-    "api": Role(("api", "capture"), (*_COMMANDS, "services.__main__:serve", "services.cli.token", DOME_AT_THE_SERVER)),
+    "api": Role(("api", "capture"), (*_COMMANDS, "services.cli.serve", "services.cli.token", DOME_AT_THE_SERVER)),
     "scheduler": Role((), (*_COMMANDS, "services.cli.dask")),
     "worker": Role(("worker",), _WORKER),
     "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
-    "dome": Role(("capture",), (*_COMMANDS, "services.__main__:dome_sim", "services.capture.dome.simulator")),
-    "client": Role((), (*_COMMANDS, "services.cli.client")),
+    "dome": Role(("capture",), (*_COMMANDS, "services.cli.dome_sim", "services.capture.dome.simulator")),
+    "client": Role((), (*_COMMANDS, "services.cli.client.submit", "services.cli.client.jobs", "services.cli.client.delete", "services.cli.client.download")),
 }
 
 

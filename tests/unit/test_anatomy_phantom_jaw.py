@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.__main__ import build_app
 from services.anatomy.distance import SurfaceDistance
+from services.cli.app import build_app
 from services.core.errors import CaptureInputError, InputError
 from services.core.files.meshes import read_teeth
 from services.core.records import FolderCapture

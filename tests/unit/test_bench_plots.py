@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-import services.__main__ as command
+import services.cli.bench as command
 from services.bench import Row
 from services.bench.plots import error_against_time, write_png
 from services.bench.transport.lights import LightsRow, picture, spread_lights

@@ -1,15 +1,32 @@
-"""``dentine upload`` and ``dentine submit --upload``: send a folder and show it."""
+"""``dentine upload``: send a folder to a server."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.arguments import Json, Server
+from services.cli.client.connection import connect
 
 if TYPE_CHECKING:
     from services.client.client import Client
     from services.client.uploader import UploadResult
     from services.core.records import JobSpec
+
+
+def upload(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder capture, or a published capture.")],
+    server: Server = None,
+    subject: Annotated[str | None, typer.Option(help="Pseudonymous label of the person; never a name.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Upload a capture to a server; the same command again goes on with an upload that broke."""
+    with connect(server) as client:
+        uploaded = upload_folder(client, folder, subject)
+    print(uploaded.model_dump_json() if as_json else uploaded.path)
 
 
 def upload_folder(client: Client, folder: Path, subject: str | None = None) -> UploadResult:

@@ -1,0 +1,107 @@
+"""Puts the commands together, and tells every error as one sentence."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.metadata import version as installed_version
+from types import MappingProxyType
+from typing import Annotated, NoReturn
+
+import typer
+
+from services.core.errors import DentineError, InputError, StoreError
+
+
+def main() -> NoReturn:
+    """Run the command line; every DentineError becomes one sentence on standard error and its exit status."""
+    try:
+        build_app()()
+    except DentineError as problem:
+        print(f"dentine: {problem.message}", file=sys.stderr)
+        sys.exit(problem.exit_status)
+    except ModuleNotFoundError as problem:
+        print(f"dentine: {_remedy(problem)}", file=sys.stderr)
+        sys.exit(4)
+    except RecursionError:
+        print("dentine: What was given nests too deeply to be read; simplify it.", file=sys.stderr)
+        sys.exit(InputError.exit_status)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except OSError as problem:
+        what = f"{problem.filename or 'A file'} cannot be used ({problem.strerror or problem})"
+        print(f"dentine: {what}; check its path, its permissions and the disk.", file=sys.stderr)
+        sys.exit(StoreError.exit_status)
+    sys.exit(0)
+
+
+def build_app() -> typer.Typer:
+    """Put the commands together."""
+    from services.cli.bench import bench
+    from services.cli.capture import capture
+    from services.cli.client.cancel import cancel
+    from services.cli.client.delete import delete
+    from services.cli.client.demo import demo
+    from services.cli.client.download import download
+    from services.cli.client.jobs import jobs
+    from services.cli.client.retry import retry
+    from services.cli.client.submit import submit
+    from services.cli.client.upload import upload
+    from services.cli.client.watch import watch
+    from services.cli.dask import add_dask_commands
+    from services.cli.dome_sim import dome_sim
+    from services.cli.export import export
+    from services.cli.phantom import phantom
+    from services.cli.run import run
+    from services.cli.secrets import build_secrets_app
+    from services.cli.serve import serve
+    from services.cli.slab import simulate_slab_command
+    from services.cli.token import build_token_app
+    from services.core.settings import read_settings
+
+    app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.callback()(_root)
+    local = serve, dome_sim, capture, run, export, phantom, bench
+    for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo):
+        app.command()(command)
+    add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
+    simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
+    simulate.callback()(_group)
+    simulate.command("slab")(simulate_slab_command)
+    app.add_typer(simulate, name="simulate")
+    app.add_typer(build_secrets_app(lambda: read_settings(os.environ).server), name="secrets")
+    app.add_typer(build_token_app(lambda: read_settings(os.environ).server.database_url), name="token")
+    return app
+
+
+_EXTRAS = MappingProxyType({"serve": "api", "token": "api", "capture": "capture", "dome-sim": "capture", "bench": "worker,bench"})
+"""What a command needs beside the base installation; of those that are not named here all that a worker has."""
+
+
+def _remedy(missing: ModuleNotFoundError) -> str:
+    """What to install for the command that was called; a module of our own that is missing is a fault.
+
+    Raises:
+        ModuleNotFoundError: it is one of our own.
+    """
+    if (missing.name or "services").partition(".")[0] == "services":
+        raise missing
+    extra = _EXTRAS.get(next(iter(sys.argv[1:]), ""), "worker")
+    return f"This command needs {missing.name}, which is not installed; pip install 'dentine[{extra}]' brings it."
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(installed_version("dentine"))
+        raise typer.Exit
+
+
+def _root(version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")] = False) -> None:
+    """From a capture of a person's teeth to a measured, renderable asset."""
+
+
+def _group() -> None:
+    """Keeps ``simulate`` a group while it has one command."""

@@ -1,0 +1,23 @@
+"""How well a fit went, as a sentence and an exit status."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from services.core.records import Verdict
+from services.core.verdict import NOT_CONVERGED_STATUS
+
+
+def require_converged(verdict: Verdict) -> None:
+    """Say on standard error how well a fit went.
+
+    Raises:
+        typer.Exit: it did not converge.
+    """
+    print(verdict.headline, file=sys.stderr)
+    if not verdict.converged:
+        if verdict.advice:
+            print(verdict.advice, file=sys.stderr)
+        raise typer.Exit(NOT_CONVERGED_STATUS)
