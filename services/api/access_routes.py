@@ -8,7 +8,7 @@ from pydantic import Field, SecretStr
 
 from services.api.access import Access
 from services.api.audit import AuditEntry, AuditLog
-from services.api.bodies import Sent
+from services.api.bodies import BodyRoute, Sent
 from services.api.database import MOST_ID
 from services.api.errors import SetupLinkError, UnauthenticatedError
 from services.api.guard import needs
@@ -54,7 +54,7 @@ class AuditPage(Record):
 
 def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, secure: bool) -> APIRouter:
     """Routes over the given callers; ``secure`` cookies travel over TLS only."""
-    router = APIRouter(prefix="/v1", responses=refusals(404, 422))
+    router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:

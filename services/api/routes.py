@@ -10,7 +10,7 @@ from pydantic import Field, StringConstraints
 
 from services.api.answers import in_json
 from services.api.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
-from services.api.bodies import Sent
+from services.api.bodies import BodyRoute, Sent
 from services.api.clerks import Clerks
 from services.api.database import MOST_ID
 from services.api.feed import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
@@ -81,7 +81,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         lookers: read their captures, which may hang.
         cancellers: cancel.
     """
-    router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
+    router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
 
     @in_json
