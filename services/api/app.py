@@ -92,6 +92,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             dome.close()
 
     readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
+    parsers = Clerks(1)
     # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
     darkeners, dark_auditors = Clerks(DARKENERS), Clerks(1)
     cancellers, operators = Clerks(CANCELLERS), Clerks(OPERATORS)
@@ -112,12 +113,12 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
-            everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators)
+            everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators, parsers)
             for close in (darken, *(clerks.close for clerks in everybody), jobs.close, workers.close):
                 await closing.ask(close)
 
     app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    app.state.darken = darken
+    app.state.darken, app.state.parsers = darken, parsers
     problems.install(app)
     app.include_router(build_router(jobs, feed, readers, openers, lookers, cancellers))
     app.include_router(build_captures_router(jobs.captures))

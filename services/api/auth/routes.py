@@ -12,7 +12,7 @@ from services.api.auth.scopes import needs
 from services.api.auth.sessions import COOKIE, Sessions
 from services.api.auth.setup_links import SetupLinks
 from services.api.auth.tokens import NAME, Caller, IssuedToken, Scope, Token
-from services.api.http.bodies import Sent
+from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.problems import refusals
 from services.client.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
@@ -54,7 +54,7 @@ class AuditPage(Record):
 
 def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, secure: bool) -> APIRouter:
     """Routes over the given callers; ``secure`` cookies travel over TLS only."""
-    router = APIRouter(prefix="/v1", responses=refusals(404, 422))
+    router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:

@@ -8,7 +8,8 @@ from fastapi import Path as PathParameter
 from services.api.auth.scopes import Asker, needs
 from services.api.calibrations.calibrations import NAME, CalibrationDetail, Calibrations, NamedCalibration
 from services.api.captures.captures import Captures
-from services.api.http.bodies import Sent
+from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import refusals
 from services.core.calibration import Calibration
 
@@ -17,27 +18,35 @@ Name = Annotated[str, PathParameter(pattern=f"^{NAME}$", description="1 to 60 le
 
 def build_calibrations_router(calibrations: Calibrations, captures: Captures) -> APIRouter:
     """Routes over the given calibrations, and those that captures bring along."""
-    router = APIRouter(prefix="/v1", tags=["calibrations"], responses=refusals(404, 409, 422))
+    router = APIRouter(prefix="/v1", route_class=BodyRoute, tags=["calibrations"], responses=refusals(404, 409, 422))
 
     @router.get("/calibrations", dependencies=[needs("read")])
+    @in_json
     def every(asker: Asker) -> list[NamedCalibration]:
         """List calibrations, newest first."""
         return calibrations.list(asker)
 
     @router.get("/calibrations/{name}", dependencies=[needs("read")])
+    @in_json
     def get(name: Name, asker: Asker) -> CalibrationDetail:
         """One calibration with its cameras and lights."""
         return calibrations.get(name, asker)
 
-    @router.put("/calibrations/{name}", status_code=201, responses={200: {"model": CalibrationDetail}}, dependencies=[needs("submit")])
-    def put(name: Name, calibration: Sent[Calibration], asker: Asker, response: Response) -> CalibrationDetail:
+    @router.put(
+        "/calibrations/{name}",
+        status_code=201,
+        response_model=CalibrationDetail,
+        responses={200: {"model": CalibrationDetail}},
+        dependencies=[needs("submit")],
+    )
+    def put(name: Name, calibration: Sent[Calibration], asker: Asker) -> Response:
         """Store a calibration under a new name: 201, or 200 where it is there already. A name never changes its content: 409."""
         creation = calibrations.put(name, calibration, asker)
-        response.status_code = 201 if creation.is_new else 200
-        response.headers["Location"] = f"/v1/calibrations/{name}"
-        return creation.detail
+        headers = {"Location": f"/v1/calibrations/{name}"}
+        return Response(creation.detail.model_dump_json(), 201 if creation.is_new else 200, headers, JSON)
 
     @router.get("/captures/{capture}/calibration", dependencies=[needs("read")])
+    @in_json
     def of_capture(capture: str) -> Calibration:
         """The calibration that a committed capture brings along."""
         return captures.calibration(capture)

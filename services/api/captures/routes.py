@@ -15,7 +15,8 @@ from services.api.auth.scopes import Asker, needs
 from services.api.captures.captures import Captures
 from services.api.captures.tus_routes import build_tus_router
 from services.api.http.awaited_threads import in_thread
-from services.api.http.bodies import Sent
+from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import MEDIA_TYPE, Problem, refusals
 from services.client.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.client.errors import IncompleteCaptureError
@@ -52,24 +53,23 @@ def build_captures_router(captures: Captures) -> APIRouter:
                 await task
 
     router = APIRouter(lifespan=sweeping)
-    under = APIRouter(prefix="/v1/captures", responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
+    under = APIRouter(prefix="/v1/captures", route_class=BodyRoute, responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
 
-    @under.post("", status_code=201, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
-    def create(
-        manifest: Sent[UploadManifest], asker: Asker, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None
-    ) -> CaptureDetail:
+    @under.post("", status_code=201, response_model=CaptureDetail, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
+    def create(manifest: Sent[UploadManifest], asker: Asker, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Response:
         """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
         creation = captures.create(manifest, idempotency_key, asker)
-        response.status_code = 201 if creation.is_new else 200
-        response.headers["Location"] = f"/v1/captures/{creation.capture.id}"
-        return creation.capture
+        headers = {"Location": f"/v1/captures/{creation.capture.id}"}
+        return Response(creation.capture.model_dump_json(), 201 if creation.is_new else 200, headers, JSON)
 
     @under.get("", dependencies=[needs("read")])
+    @in_json
     def page(asker: Asker, limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> CapturePage:
         """List captures, newest first."""
         return captures.page(limit, before, asker)
 
     @under.get("/{capture}", dependencies=[needs("read")])
+    @in_json
     def get(capture: str) -> CaptureDetail:
         """One capture, and how much of each file is here."""
         return captures.get(capture)
@@ -80,13 +80,13 @@ def build_captures_router(captures: Captures) -> APIRouter:
         response_model=CaptureDetail,
         dependencies=[needs("submit")],
     )
-    def commit(capture: str, request: Request) -> Any:
+    def commit(capture: str, request: Request) -> Response:
         """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused. Repeating it changes nothing."""
         if faults := captures.commit(capture):
             detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (f" It is one of {len(faults)} such files." if len(faults) > 1 else "")
             problem = IncompleteCapture.of(HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.scope["path"], files=faults)
             return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)
-        return captures.get(capture)
+        return Response(captures.get(capture).model_dump_json(), media_type=JSON)
 
     @under.delete("/{capture}", status_code=204, dependencies=[needs("submit")])
     def delete(capture: str) -> None:

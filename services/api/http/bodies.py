@@ -1,18 +1,37 @@
-"""Bodies in JSON, refused at their first faults.
+"""Bodies in JSON: bounded before they are parsed, long ones parsed off the loop, and refused at their first faults.
 
-To list hundreds of thousands of them takes seconds in which the loop serves nobody.
+To parse hundreds of thousands of values, or to list as many faults, takes seconds in which the loop serves nobody. A thread alone
+does not help, as parsers keep the interpreter for as long as they run: what they are given must be small.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, TypeVar
 
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from pydantic import ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 from pydantic_core import PydanticCustomError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from services.api.http.thread_pools import Clerks
+from services.core.errors import SettingsError
 
 MAX_FAULTS = 100
 """More are counted, and not listed: whoever sends so many has sent something else than was asked for. No record has so
 many members either."""
+MAX_MEMBERS = 1000
+"""Of any object in a body. The longest are a light's intensities, one a channel."""
+MAX_VALUES = 40_000
+"""In one body: a manifest of five thousand files, the most by default, has twenty thousand."""
+BYTES_PER_VALUE = 30
+"""A body may hold more values than that if it has so many bytes for each, as a longer manifest has where the settings let it pass."""
+SHORT_BYTES = 2**14
+"""A body up to here is parsed on the loop, in a millisecond; a longer one waits its turn in a thread."""
 T = TypeVar("T")
 
 
@@ -29,3 +48,56 @@ def _few_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
 
 Sent = Annotated[T, WrapValidator(_few_faults)]
 """A body of a record's kind. Sequences in it stop at their first fault by themselves (``fail_fast``)."""
+
+
+def parse(body: bytes) -> Any:
+    """What JSON in UTF-8 says.
+
+    Raises:
+        SettingsError: it has more values, or an object in it more members, than anything that is asked for.
+        ValueError, RecursionError: it is no JSON, or nested too deeply.
+    """
+    # Every value but the first of its list or object follows a comma, so that this counts no fewer than there are.
+    values, most = sum(map(body.count, (b",", b"[", b"{"))), max(MAX_VALUES, len(body) // BYTES_PER_VALUE)
+    if values > most:
+        raise SettingsError(f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route asks for.")
+    return json.loads(body, object_pairs_hook=_of_few_members)
+
+
+def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(members) > MAX_MEMBERS:
+        raise SettingsError(f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks for.")
+    return dict(members)
+
+
+class BodyRoute(APIRoute):
+    """A route whose body is parsed and checked by ``app.state.parsers`` where it is long."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The route's handler, which finds its record made."""
+        handler, field = super().get_route_handler(), self.body_field
+        if field is None:
+            return handler
+
+        def read(body: bytes) -> Any:
+            record, faults = field.validate(parse(body), {}, loc=("body",))
+            if faults:
+                raise RequestValidationError(faults)
+            return record
+
+        class ReadRequest(Request):
+            async def json(self) -> Any:
+                # FastAPI checks what this returns once more, but takes a record as it is.
+                parsers: Clerks = self.app.state.parsers
+                body = await self.body()
+                return read(body) if len(body) <= SHORT_BYTES else await parsers.ask(read, body)
+
+        async def answer(request: Request) -> Response:
+            try:
+                return await handler(ReadRequest(request.scope, request.receive))
+            except HTTPException as problem:  # FastAPI's for whatever a body's parser raises
+                if isinstance(problem.__cause__, SettingsError | RequestValidationError):
+                    raise problem.__cause__ from None
+                raise
+
+        return answer

@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints
 from services.api.auth.scopes import Asker, needs, require
 from services.api.auth.tokens import Scope
 from services.api.http.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
-from services.api.http.bodies import Sent
+from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.json_responses import in_json
 from services.api.http.problems import refusals
 from services.api.http.thread_pools import Clerks
@@ -81,7 +81,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         lookers: read their captures, which may hang.
         cancellers: cancel.
     """
-    router = APIRouter(prefix="/v1", responses=refusals(404, 409, 413, 422, 507))
+    router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
 
     @in_json

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
 from services.api.auth.scopes import needs
-from services.api.http.bodies import Sent
+from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.problems import refusals
 from services.api.webhooks.deliveries import Deliveries, Delivery
 from services.api.webhooks.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
@@ -26,7 +26,7 @@ class DeliveryPage(Record):
 
 def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRouter:
     """Routes over the given subscriptions and their log."""
-    router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], responses=refusals(404, 409, 422), dependencies=[needs("admin")])
+    router = APIRouter(prefix="/v1/webhooks", route_class=BodyRoute, tags=["webhooks"], responses=refusals(404, 409, 422), dependencies=[needs("admin")])
 
     @router.post("", status_code=201)
     def create(wanted: Sent[WebhookRequest], response: Response) -> NewWebhook:
