@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -112,7 +112,7 @@ def cancelling_on_signals(out: Path) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def run_some(stages: Sequence[StageName], spec: JobSpec, out: Path, *, again: bool) -> None:
+def run_some(stages: tuple[StageName, ...], spec: JobSpec, out: Path, *, again: bool) -> None:
     """Run some stages of a job and show their progress."""
     from services.client.progress import ProgressView
     from services.pipeline.stages import run_stages

@@ -1,4 +1,4 @@
-"""One typed tree of settings. ``services.__main__`` alone reads environment (prefix ``DENTINE__``) and files into it."""
+"""One typed tree of settings. ``services.cli`` alone reads environment (prefix ``DENTINE__``) and files into it."""
 
 from __future__ import annotations
 

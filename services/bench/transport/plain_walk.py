@@ -15,7 +15,8 @@ from services.fit.transport.lighting.lights import PointLights
 from services.fit.transport.paths.scores import Plan
 from services.fit.transport.paths.starts import CameraStart
 from services.fit.transport.paths.tally import Tally
-from services.fit.transport.paths.walk import ROULETTE_WEIGHT, Flight, Walk, Walker
+from services.fit.transport.paths.walk import ROULETTE_WEIGHT, Walk
+from services.fit.transport.paths.walker import Flight, Walker
 from services.fit.transport.scene.media import Media, PhaseFunction
 
 

@@ -29,7 +29,7 @@ def submit(
     spec = read_job(job)
     with connect(server) as client:
         if send:
-            from services.cli.upload import with_uploaded_source
+            from services.cli.client.upload import with_uploaded_source
 
             spec = with_uploaded_source(client, spec)
         if calibration is not None:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from services.fit.transport.paths.scores import Plan
 from services.fit.transport.paths.starts import CameraStart, LightStart
 from services.fit.transport.paths.tally import Tally
-from services.fit.transport.paths.walk import Flight, Walk, Walker
+from services.fit.transport.paths.walk import Walk
+from services.fit.transport.paths.walker import Flight, Walker
 from services.fit.transport.scene.geometry import Hit
 from services.fit.transport.scene.media import Media
 from services.fit.transport.scene.mesh_geometry import MeshGeometry
