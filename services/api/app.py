@@ -54,7 +54,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from starlette.staticfiles import StaticFiles
 
     from services.api.auth.access import refuse_open_network
-    from services.api.auth.browser_protection import Shield
+    from services.api.auth.browser_protection import BrowserProtection
     from services.api.auth.install import install
     from services.api.calibrations.routes import build_calibrations_router
     from services.api.captures.routes import build_captures_router
@@ -62,7 +62,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from services.api.dome.routes import build_dome_router
     from services.api.health.worker_routes import build_workers_router
     from services.api.http import problems
-    from services.api.http.thread_pools import Clerks
+    from services.api.http.thread_pools import ThreadPool
     from services.api.jobs.event_stream import EventFeed
     from services.api.jobs.routes import build_router
     from services.api.masks.masks import Masks
@@ -91,11 +91,11 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         finally:
             dome.close()
 
-    readers, openers, lookers, auditors = Clerks.reading(jobs.repository.engine), Clerks(1), Clerks(1), Clerks(1)
-    parsers = Clerks(1)
+    readers, openers, lookers, auditors = ThreadPool.reading(jobs.repository.engine), ThreadPool(1), ThreadPool(1), ThreadPool(1)
+    parsers = ThreadPool(1)
     # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
-    darkeners, dark_auditors = Clerks(DARKENERS), Clerks(1)
-    cancellers, operators = Clerks(CANCELLERS), Clerks(OPERATORS)
+    darkeners, dark_auditors = ThreadPool(DARKENERS), ThreadPool(1)
+    cancellers, operators = ThreadPool(CANCELLERS), ThreadPool(OPERATORS)
     feed = EventFeed(jobs.repository, readers.ask)
     observation = Observation(jobs, settings, readers, openers, certificates, None if run else workers.condition)
 
@@ -112,7 +112,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            closing = Clerks(1)  # a thread of its own, as all others may hang; darkness first
+            closing = ThreadPool(1)  # a thread of its own, as all others may hang; darkness first
             everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators, parsers)
             for close in (darken, *(clerks.close for clerks in everybody), jobs.close, workers.close):
                 await closing.ask(close)
@@ -130,6 +130,6 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     install(app, settings, jobs.repository.engine, auditors, dark_auditors)
     app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
     names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
-    app.add_middleware(Shield, names=names, secure=not settings.is_loopback)
+    app.add_middleware(BrowserProtection, names=names, secure=not settings.is_loopback)
     observation.watch_requests(app)
     return app

@@ -10,7 +10,7 @@ from services.api.health.metrics import RequestMetrics, build_registry
 from services.api.health.readiness import Readiness
 from services.api.health.routes import build_health_router
 from services.api.http.request_log import RequestLog
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.api.jobs.history_routes import build_observe_router
 from services.api.jobs.jobs import Jobs
 from services.api.webhooks.address import AddressPolicy
@@ -29,8 +29,8 @@ class Observation:
         self,
         jobs: Jobs,
         settings: ServerSettings,
-        readers: Clerks,
-        openers: Clerks,
+        readers: ThreadPool,
+        openers: ThreadPool,
         certificates: Certificates | None = None,
         workers: Callable[[], str] | None = None,
     ) -> None:

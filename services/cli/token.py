@@ -33,15 +33,15 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
         as_json: Json = False,
     ) -> None:
         """Make a token and print it; it is not shown again."""
-        from services.api.auth.audit import Deed
+        from services.api.auth.audit import AuditedAction
         from services.api.auth.tokens import Scope
         from services.core.errors import InputError
 
         if unknown := [one for one in scope if one not in set(Scope)]:
             raise InputError(f"Scope {unknown[0]!r} does not exist; known are {', '.join(Scope)}.")
         with _tokens(data, default_url) as tokens:
-            deed = Deed("dentine token create", "command line", "local")
-            issued = tokens.create(name, [Scope(one) for one in scope], expires_days, deed, group)
+            audited = AuditedAction("dentine token create", "command line", "local")
+            issued = tokens.create(name, [Scope(one) for one in scope], expires_days, audited, group)
         if group is None and set(scope) == {Scope.READ}:
             print(f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it with --group.", file=sys.stderr)
         print(issued.model_dump_json() if as_json else issued.token.get_secret_value())
@@ -62,10 +62,10 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
     @app.command()
     def revoke(token: Annotated[str, typer.Argument(metavar="ID", help="Id or name that list prints.")], data: Data = None) -> None:
         """End a token now."""
-        from services.api.auth.audit import Deed
+        from services.api.auth.audit import AuditedAction
 
         with _tokens(data, default_url) as tokens:
-            ended = tokens.revoke(token, Deed("dentine token revoke", "command line", "local"))
+            ended = tokens.revoke(token, AuditedAction("dentine token revoke", "command line", "local"))
         print(f"revoked: {ended.id} {ended.name}")
 
     return app

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 
 from services.client.errors import UploadError
 
-MOST_PATH_BYTES = 240
-MOST_PARTS = 12
+MAX_PATH_BYTES = 240
+MAX_PARTS = 12
 TEXTS = frozenset({".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
@@ -61,10 +61,10 @@ def path_fault(path: str) -> str | None:
         return "is hidden; leave it out or rename it"
     if any(part != part.strip(" ").rstrip(".") for part in parts):
         return "has a part that begins or ends with a space or ends with a dot; rename it"
-    if len(parts) > MOST_PARTS:
-        return f"lies {len(parts) - 1} folders deep and {MOST_PARTS - 1} are allowed; move it up"
-    if len(path.encode()) > MOST_PATH_BYTES:
-        return f"has a path of {len(path.encode())} bytes and {MOST_PATH_BYTES} are allowed; shorten it"
+    if len(parts) > MAX_PARTS:
+        return f"lies {len(parts) - 1} folders deep and {MAX_PARTS - 1} are allowed; move it up"
+    if len(path.encode()) > MAX_PATH_BYTES:
+        return f"has a path of {len(path.encode())} bytes and {MAX_PATH_BYTES} are allowed; shorten it"
     if PurePosixPath(path).suffix.lower() not in TEXTS | IMAGES | MESHES and not _CHUNK.fullmatch(path):
         return f"is no file of a capture; it holds {', '.join(sorted(TEXTS | IMAGES | MESHES))} and chunks of .zarr arrays, and archives are not unpacked"
     return None

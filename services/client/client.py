@@ -14,7 +14,7 @@ from pydantic import SecretStr
 
 from services.client.downloads import telling_lost, whole_file
 from services.client.flows import RECONNECT_S, Ask, EventCursor, Flow, Pause, Work, error_in
-from services.client.requests import Exchange
+from services.client.requests import Requests
 from services.core.events import JobEvent
 from services.core.records import JobSpec
 
@@ -28,7 +28,7 @@ class Client:
     """Speaks to one server; a context manager."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
-        self._exchange = Exchange(server, token)
+        self._exchange = Requests(server, token)
         connection = self._exchange.connection()
         import httpx
 
@@ -144,7 +144,7 @@ class AsyncClient:
     """The same for asyncio; an asynchronous context manager. Files are hashed and read in threads."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
-        self._exchange = Exchange(server, token)
+        self._exchange = Requests(server, token)
         connection = self._exchange.connection()
         import httpx
 

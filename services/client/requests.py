@@ -14,7 +14,7 @@ from services.client.uploader import Uploader, UploadProgress, UploadResult
 from services.core.records import JobSpec
 
 
-class Exchange:
+class Requests:
     """The requests to one server as flows."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:

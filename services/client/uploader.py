@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 CHUNK_BYTES = 4 * 2**20
-LEAST_CHUNK_BYTES = 2**18
+MIN_CHUNK_BYTES = 2**18
 """A chunk is recorded whole or not at all; one that failed is halved down to this, so that a bad connection still gets on."""
 PATIENCE_S = 300.0
 """How long a chunk is tried again while the server does not answer."""
 VERIFYING_S = 900.0
 """How long the server may take to answer, as after the last chunk it reads the whole file."""
-LEAST_WAIT_S, MOST_WAIT_S = 0.2, 5.0
+MIN_WAIT_S, MAX_WAIT_S = 0.2, 5.0
 """Between two tries; twice as long each time."""
 _PASSING = frozenset({408, 423, 429, 460, 502, 503, 504})
 
@@ -142,7 +142,7 @@ class Uploader:
         try:
             appended = yield from self._answer("PATCH", url, content=chunk, headers=headers)
         except PassingError:
-            self._chunk_bytes = max(self._chunk_bytes // 2, LEAST_CHUNK_BYTES)
+            self._chunk_bytes = max(self._chunk_bytes // 2, MIN_CHUNK_BYTES)
             raise
         self._chunk_bytes = min(2 * self._chunk_bytes, CHUNK_BYTES)
         return int(appended.headers["Upload-Offset"])
@@ -169,7 +169,7 @@ class Uploader:
 
     def _patiently(self, step: Callable[[], Flow[R]]) -> Flow[R]:
         """Take a step again while what keeps it may pass, at growing intervals."""
-        give_up_s, wait_s = time.monotonic() + self._patience_s, LEAST_WAIT_S
+        give_up_s, wait_s = time.monotonic() + self._patience_s, MIN_WAIT_S
         while True:
             try:
                 return (yield from step())
@@ -178,7 +178,7 @@ class Uploader:
                 if time.monotonic() + pause_s > give_up_s:
                     raise PlatformError(f"{problem}; start it again and repeat this command, what was sent is kept.") from problem
             yield Pause(pause_s)
-            wait_s = min(2 * wait_s, MOST_WAIT_S)
+            wait_s = min(2 * wait_s, MAX_WAIT_S)
 
     def _tell(self, phase: Literal["hashing", "sending"], path: str) -> None:
         if self._progress is not None:

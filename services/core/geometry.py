@@ -18,16 +18,16 @@ Vector3 = tuple[float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
-MOST_NAME_BYTES = 64
+MAX_NAME_BYTES = 64
 # Controls, halves of a character, and separators of lines and paragraphs
 UNWRITABLE = {"Cc", "Cs", "Zl", "Zp"}
 
 
 def _part_of_a_file_name(name: str) -> str:
     plain = not any(letter in "/\\" or unicodedata.category(letter) in UNWRITABLE for letter in name)
-    if plain and name not in {"", ".", ".."} and len(name.encode()) <= MOST_NAME_BYTES:
+    if plain and name not in {"", ".", ".."} and len(name.encode()) <= MAX_NAME_BYTES:
         return name
-    rule = f"a name has 1 to {MOST_NAME_BYTES} bytes, no slash, backslash or control character, and is neither '.' nor '..'"
+    rule = f"a name has 1 to {MAX_NAME_BYTES} bytes, no slash, backslash or control character, and is neither '.' nor '..'"
     raise PydanticCustomError("name", "{rule}", {"rule": rule})
 
 

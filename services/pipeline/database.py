@@ -24,11 +24,11 @@ BUSY_MS = 5000
 """How long a writer waits for one of another process before it gives up."""
 TURN_S = 5.0
 """How long it waits before that for those of its own."""
-MOST_CONNECTIONS = 64
+MAX_CONNECTIONS = 64
 """Kept open to a file: as many as a server has threads that ask."""
 WRITER_LOCK = 0x64656E74
 """Number of the advisory lock, "dent"."""
-MOST_ID = 2**31 - 1
+MAX_ID = 2**31 - 1
 """Largest number of a row: Postgres' INTEGER, to which it takes nothing larger for comparison either."""
 
 POSTGRES_SILENCE_S = 15
@@ -211,7 +211,7 @@ def _watchful(url: sql.URL) -> dict[str, Any]:
 def _sqlite(url: sql.URL) -> sql.Engine:
     # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take turns before they ask it. Connections
     # stay open, as opening one costs more than most questions. Errors end in logs, so they hide what was asked.
-    engine = sql.create_engine(url, hide_parameters=True, pool_size=MOST_CONNECTIONS, execution_options={"turn": threading.Lock()})
+    engine = sql.create_engine(url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()})
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:

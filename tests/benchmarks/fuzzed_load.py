@@ -34,12 +34,12 @@ from requests.structures import CaseInsensitiveDict
 
 from services.api.auth.tokens import Scope
 from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
+from tests.contracts.existing_ids import Living
 from tests.contracts.generated_requests import Sender, served
-from tests.contracts.living import Living
-from tests.contracts.witnesses import Witnesses, leave_witnesses
-from tests.load.mix import Ask
+from tests.contracts.kept_data import Witnesses, leave_witnesses
 from tests.load.open_loop import Answer, offer, poisson, run
 from tests.load.processes import Served
+from tests.load.request_mix import Ask
 from tests.support.mouth import write_mouth
 from tests.support.uploading import announce, contents_of, send
 

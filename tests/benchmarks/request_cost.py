@@ -24,7 +24,7 @@ from services.core.settings import ServerSettings
 from services.pipeline.logs import configure_logs
 from tests.load.bare_server import build
 from tests.load.library import fill
-from tests.load.mix import Ask, Mix
+from tests.load.request_mix import Ask, Mix
 from tests.support.guarded_server import make_token
 
 Row = dict[str, Any]

@@ -38,8 +38,8 @@ from services.api.auth.tokens import Scope
 from services.api.http.problems import MEDIA_TYPE, Problem
 from services.client.errors import error_of
 from services.client.tus import CHUNK_TYPE
-from tests.contracts.living import Living
-from tests.contracts.witnesses import finish_job, leave_witnesses
+from tests.contracts.existing_ids import ExistingIds
+from tests.contracts.kept_data import finish_job, leave_witnesses
 from tests.support.guarded_server import make_token
 from tests.support.live_server import toy_server
 from tests.support.mouth import write_mouth
@@ -55,7 +55,7 @@ CONFIG = {"checks": {"negative_data_rejection": {"expected-statuses": ["4xx", "5
 CALLERS = ("admin",) * 16 + ("read", "read", "wrong", "nobody")
 BORDER_SHARE = 0.2
 """Of the cases, at most: those along the borders of what the description allows."""
-MOST_AT_ONCE = 25
+MAX_AT_ONCE = 25
 """Cases of one operation and mode that are drawn together."""
 ANSWER_S, STREAM_S = 60.0, 3.0
 """How long an answer may take, and how long a stream of events is read."""
@@ -127,7 +127,7 @@ dressings = st.builds(
 class Sender:
     """Sends generated cases to one server and judges the answers."""
 
-    def __init__(self, address: str, tokens: Mapping[str, str | None], living: Living) -> None:
+    def __init__(self, address: str, tokens: Mapping[str, str | None], living: ExistingIds) -> None:
         self._address, self._tokens, self._living = address, tokens, living
         schemathesis.serializer.alias(CHUNK_TYPE, "application/octet-stream")
         self._session = requests.Session()
@@ -155,7 +155,7 @@ class Sender:
         pairs = [(operation, mode) for operation in self._operations for mode in GenerationMode if mode.is_positive or _takes_input(operation)]
         while (left := cases - len(border) - self.tally.cases) > 0:
             start += 1
-            most = min(MOST_AT_ONCE, -(-left // len(pairs)))
+            most = min(MAX_AT_ONCE, -(-left // len(pairs)))
             pairs = [(operation, mode) for operation, mode in pairs if self._draw(operation, mode, most, start)]
             tell(f"{self.tally.cases} cases, {len(self.tally.faults)} kinds of fault")
         for case in border:
@@ -279,7 +279,7 @@ def survey(folder: Path, cases: int, start: int, database: str | None = None, te
     with served(folder, database) as (client, process, tokens):
         witnesses = leave_witnesses(client, folder / "data", folder / "capture")
         write_mouth(folder / "mouth", lights=2)
-        living = Living(witnesses, folder / "data", folder / "mouth")
+        living = ExistingIds(witnesses, folder / "data", folder / "mouth")
         sender = Sender(str(client.base_url).rstrip("/"), tokens, living)
         sender.run(cases, start, tell)
         living.release()

@@ -21,9 +21,9 @@ import numpy as np
 from services.client.client import Client
 from services.core.errors import PlatformError
 from tests.load.library import Library, fill
-from tests.load.mix import Ask, Mix
 from tests.load.open_loop import Answer, send_one, session
 from tests.load.processes import Served, serving
+from tests.load.request_mix import Ask, RequestMix
 from tests.support.uploading import write_capture
 
 Row = dict[str, Any]
@@ -84,7 +84,7 @@ class _Day:
 
     def __init__(self, served: Served, library: Library, work: Path, rng: random.Random) -> None:
         self._served, self._library, self._work, self._rng = served, library, work, rng
-        self._mix = Mix(library, rng, "day")
+        self._mix = RequestMix(library, rng, "day")
         self._jobs: deque[str] = deque()
         self._requests, self._wrong = 0, Counter[str]()
         self._began_s = time.perf_counter()

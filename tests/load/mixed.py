@@ -18,9 +18,9 @@ import psutil
 
 from services.api.auth.tokens import Scope
 from tests.load.library import Library, fill
-from tests.load.mix import SUBMIT_PERIOD_S, Ask, Mix, periodic
 from tests.load.open_loop import Answer, offer, poisson, run, session
 from tests.load.processes import Served, serving, serving_bare
+from tests.load.request_mix import SUBMIT_PERIOD_S, Ask, RequestMix, periodic
 from tests.support.guarded_server import make_token
 
 OURS, GUARDED, BARE = "dentine", "dentine with tokens", "bare"
@@ -89,7 +89,7 @@ async def _round(name: str, served: Served, library: Library, seconds: float, rn
     times = list(poisson(RATE_PER_S, seconds, rng))
     if name == BARE:
         return await offer(served, [(due_s, Ask("read", "GET", f"/jobs/{rng.choice(library.jobs)}")) for due_s in times])
-    mix = Mix(library, rng, prefix)
+    mix = RequestMix(library, rng, prefix)
     plan = [(due_s, mix.draw()) for due_s in times]
     plan += [*periodic(seconds), *((due_s, mix.submit()) for due_s in np.arange(SUBMIT_PERIOD_S / 2, seconds, SUBMIT_PERIOD_S).tolist())]
     is_odd = False

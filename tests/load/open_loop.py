@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 import aiohttp
 
-from tests.load.mix import Ask
 from tests.load.processes import Served
+from tests.load.request_mix import Ask
 
 T = TypeVar("T")
 KEPT_S = 2.0

@@ -39,8 +39,8 @@ def test_the_small_mouth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
 def test_coarser_tables_of_larger_scenes_change_the_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     view = whole_view(camera_at((0.1, 1, 0.2), size=12, span_mm=15.0))
     fine = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=5, batches=BATCHES)
-    monkeypatch.setattr(MouthMaps, "MOST_BYTES", 2**14)
-    monkeypatch.setattr("services.fit.transport.scene.clearance.MOST_CELLS", 2000)
+    monkeypatch.setattr(MouthMaps, "MAX_BYTES", 2**14)
+    monkeypatch.setattr("services.fit.transport.scene.clearance.MAX_CELLS", 2000)
     coarse = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=6, batches=BATCHES)
     # One pixel is independent of the next; its two lights are not.
     spread = np.sqrt(sum(image.variance.sum(axis=1) for image in (fine, coarse)))

@@ -144,7 +144,7 @@ def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: st
 
 @pytest.mark.parametrize("at_once", [1000, 5], ids=["at once", "block by block"])
 def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.http.artifacts.MOST_BYTES_AT_ONCE", at_once)
+    monkeypatch.setattr("services.api.http.artifacts.MAX_BYTES_AT_ONCE", at_once)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
     finish(client, job_id)

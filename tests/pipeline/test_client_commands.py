@@ -98,7 +98,7 @@ def test_httpx_comes_with_the_base_install() -> None:
 
 
 def test_more_jobs_are_listed_than_one_answer_holds(server: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.cli.client.jobs.MOST_AT_ONCE", 2)
+    monkeypatch.setattr("services.cli.client.jobs.MAX_AT_ONCE", 2)
     from services.cli.client.jobs import _list
     from services.client.client import Client
 

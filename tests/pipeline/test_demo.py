@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import pytest
 
-from services.api.jobs.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, LEAST_DISK_BYTES, predict
+from services.api.jobs.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, MIN_DISK_BYTES, predict
 from services.api.jobs.size import size_of
 from services.api.presets import find_preset
 from services.core.errors import CrashError, JobCancelledError, SettingsError
@@ -58,7 +58,7 @@ def test_another_folder_called_demo_is_named_by_a_longer_path(tmp_path: Path) ->
 
 
 def test_little_disk_is_predicted_and_its_size_is_known() -> None:
-    assert predict(DEMO).disk_bytes == LEAST_DISK_BYTES + round(DISK_PER_CAPTURE * DEMO_CAPTURE_BYTES)
+    assert predict(DEMO).disk_bytes == MIN_DISK_BYTES + round(DISK_PER_CAPTURE * DEMO_CAPTURE_BYTES)
     size = size_of(DEMO)
     assert size is not None
     assert size.pixels > 10_000

@@ -26,7 +26,7 @@ from services.phantom.tooth import write_phantom
 from services.preprocess.stage import run as prepare
 
 PIXEL_MM, SEED = 0.8, 4
-LEAST_GAIN = 0.2
+MIN_GAIN = 0.2
 """Of the loss, by each stage."""
 JUDGE_SAMPLES = 2048
 """Held-out errors of 13 and 6 % come with 0.4 and 0.9 of Monte Carlo error; those of the fit's own steps, of at most 512 paths, with 3 to 9."""
@@ -58,10 +58,10 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
     tissues = similar_tissue(ends["homogeneous"], SIMILAR_G), ends["exact"], replace(reported, stain=found.textures["green"])
     fitted, held_out = zip(*(judge.errors(tissue, samples=JUDGE_SAMPLES, seed=SEED) for tissue in tissues), strict=True)
     homogeneous, media, stained = (sums.loss for sums in fitted)
-    assert media < (1 - LEAST_GAIN) * homogeneous
-    assert stained < (1 - LEAST_GAIN) * media
+    assert media < (1 - MIN_GAIN) * homogeneous
+    assert stained < (1 - MIN_GAIN) * media
     (before, before_se), (after, after_se) = ((sums.error, sums.error_se) for sums in held_out[1:])
-    assert after + CERTAINTY * np.hypot(after_se, before_se) < (1 - LEAST_GAIN) * before
+    assert after + CERTAINTY * np.hypot(after_se, before_se) < (1 - MIN_GAIN) * before
 
     # The texture against the painted one where light came through it; the common depth is the media's to share.
     painted = stain_layout(read_mesh(capture / "teeth" / "11" / "outer.ply"), TEXEL_MM)

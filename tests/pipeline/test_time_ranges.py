@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from services.api.app import create_app
-from services.api.jobs.forecast import LEAST
+from services.api.jobs.forecast import MIN_OBSERVATIONS
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent, StageName
@@ -82,11 +82,11 @@ def submit_held(client: httpx.Client, held: HeldJob, capture: str, **options: An
 
 
 def test_jobs_that_succeed_are_counted_until_they_suffice(server: httpx.Client, held: HeldJob, capture: str) -> None:
-    for seed in range(LEAST):
+    for seed in range(MIN_OBSERVATIONS):
         running = submit_held(server, held, capture, seed=seed)
         told = server.get(f"/v1/jobs/{running}").json()["remaining"]
         assert (told["low_s"], told["high_s"], told["past_jobs"]) == (None, None, seed)
-        assert f"{LEAST} are needed" in told["reason"]
+        assert f"{MIN_OBSERVATIONS} are needed" in told["reason"]
         held.goes_on.set()
         assert ended(server, running)["remaining"] is None
     unlike = submit_held(server, held, capture, stains=True)

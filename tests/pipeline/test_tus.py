@@ -20,7 +20,7 @@ from services.api.auth.install import install
 from services.api.captures.captures import Captures
 from services.api.captures.routes import build_captures_router
 from services.api.http import problems
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
 from tests.support.uploading import TUS, announce, checksum, create_upload, offset_of, patch, upgraded
@@ -61,7 +61,7 @@ def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
     app.include_router(build_captures_router(captures))
-    install(app, ServerSettings(data=tmp_path), engine, Clerks(1), Clerks(1))
+    install(app, ServerSettings(data=tmp_path), engine, ThreadPool(1), ThreadPool(1))
     with serving(app) as connected:
         yield connected
     engine.dispose()

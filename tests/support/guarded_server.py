@@ -12,7 +12,7 @@ import httpx
 from fastapi import FastAPI
 
 from services.api.app import create_app
-from services.api.auth.audit import Deed
+from services.api.auth.audit import AuditedAction
 from services.api.auth.tokens import Scope, Tokens
 from services.api.migrations import upgrade
 from services.core.owners import DEFAULT_GROUP
@@ -21,8 +21,8 @@ from services.pipeline.database import open_database
 from tests.support.live_server import serving
 
 
-def make_deed() -> Deed:
-    return Deed("test", "command line", "local")
+def make_deed() -> AuditedAction:
+    return AuditedAction("test", "command line", "local")
 
 
 def make_token(data: Path, name: str, *scopes: Scope, database: str | None = None, group: str | None = DEFAULT_GROUP) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from services.api.jobs.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, LEAST_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
+from services.api.jobs.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, MIN_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
 from services.api.jobs.size import size_of
 from services.client.errors import JobTooLargeError
 from services.core.errors import DentineError, DiskFullError, ReadOnlyStoreError, SchedulerLostError
@@ -42,14 +42,14 @@ def spec(tmp_path: Path) -> JobSpec:
 def test_the_prediction_counts_what_lies_on_the_disk(spec: JobSpec) -> None:
     needs = predict(spec)
     # Blocks of the file system round a file up by less than 64 KiB.
-    assert 0 <= needs.disk_bytes - LEAST_DISK_BYTES - DISK_PER_CAPTURE * 2**20 <= DISK_PER_CAPTURE * 2**16
+    assert 0 <= needs.disk_bytes - MIN_DISK_BYTES - DISK_PER_CAPTURE * 2**20 <= DISK_PER_CAPTURE * 2**16
     assert needs.memory_bytes == 2 * WORKER_BYTES
 
 
 def test_a_folder_that_is_no_capture_is_not_walked_through(spec: JobSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "capture.json").unlink()
     monkeypatch.setattr(Path, "rglob", lambda *_: pytest.fail("it was walked through"))
-    assert predict(spec).disk_bytes == LEAST_DISK_BYTES
+    assert predict(spec).disk_bytes == MIN_DISK_BYTES
 
 
 def test_a_mount_that_went_away_keeps_no_queue_from_moving(spec: JobSpec, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_what_cannot_even_be_looked_at_has_no_size(spec: JobSpec, monkeypatch: p
 
     monkeypatch.setattr(Path, "stat", fail)
     assert size_of(spec) is None
-    assert predict(spec).disk_bytes == LEAST_DISK_BYTES
+    assert predict(spec).disk_bytes == MIN_DISK_BYTES
 
 
 def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> None:
@@ -115,7 +115,7 @@ def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> No
     with pytest.raises(JobTooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB") as refusal:
         world.admission.refuse_too_large(spec.model_copy(update={"workers": 64}))
     assert refusal.value.evidence == {"needed_memory_bytes": 64 * WORKER_BYTES, "memory_bytes": 16 * GIB}
-    world.machine = Machine(0, LEAST_DISK_BYTES, 16 * GIB)
+    world.machine = Machine(0, MIN_DISK_BYTES, 16 * GIB)
     with pytest.raises(JobTooLargeError, match=r"of disk and there are 0\.1 GiB in all"):
         world.admission.refuse_too_large(spec)
 

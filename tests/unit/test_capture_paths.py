@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.client.capture_paths import MOST_PARTS, MOST_PATH_BYTES, path_fault, require_paths
+from services.client.capture_paths import MAX_PARTS, MAX_PATH_BYTES, path_fault, require_paths
 from services.client.errors import UploadError
 
 names = st.text(st.sampled_from(["a", "B", "ß", "é", "\u0301", ".", " ", "/", "\\", "\0", "\n", "\u202e", "\u2028", "~", "c", "0"]), max_size=8)
@@ -31,8 +31,8 @@ def test_an_accepted_path_is_plain_relative_and_visible(path: str) -> None:
     assert path.isprintable()
     assert "\\" not in path
     assert unicodedata.is_normalized("NFC", path)
-    assert len(path.encode()) <= MOST_PATH_BYTES
-    assert len(pure.parts) <= MOST_PARTS
+    assert len(path.encode()) <= MAX_PATH_BYTES
+    assert len(pure.parts) <= MAX_PARTS
     assert Path("/data/captures/x", path).resolve().is_relative_to("/data/captures/x")
 
 

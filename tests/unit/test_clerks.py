@@ -7,12 +7,12 @@ import threading
 
 import pytest
 
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 
 
 def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.api.http.thread_pools.CLOSE_S", 0.01)
-    clerks, goes_on = Clerks(1), threading.Event()
+    clerks, goes_on = ThreadPool(1), threading.Event()
 
     async def close_while_it_works() -> bool:
         work = asyncio.create_task(clerks.ask(goes_on.wait, 30))
@@ -26,7 +26,7 @@ def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pyte
 
 
 def test_what_is_under_way_is_awaited() -> None:
-    clerks, is_done = Clerks(1), threading.Event()
+    clerks, is_done = ThreadPool(1), threading.Event()
 
     async def close_after_asking() -> None:
         asked = asyncio.create_task(clerks.ask(is_done.set))

@@ -90,7 +90,7 @@ def events_in(text: str) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize("most", [1000, 7])
 def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(repository: Repository, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
-    monkeypatch.setattr(feed, "MOST_EVENTS", most)
+    monkeypatch.setattr(feed, "MAX_EVENTS", most)
     monkeypatch.setattr(feed, "PING_S", 0.05)
     leases = [start(repository, seed) for seed in range(3)]
     known = repository.events_of(leases[2].job.id).read()[0].id
@@ -126,7 +126,7 @@ def test_streams_that_are_equally_far_share_a_read(repository: Repository, monke
 
 
 def test_what_does_not_fit_into_one_read_follows_in_others(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "MOST_EVENTS", 16)
+    monkeypatch.setattr(feed, "MAX_EVENTS", 16)
     lease = start(repository)
     work(repository, lease)
 
@@ -171,7 +171,7 @@ def test_a_stream_of_a_job_that_is_deleted_ends(repository: Repository, monkeypa
 
 def test_a_stalled_stream_keeps_little_and_is_told_everything_later(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feed, "PERIOD_S", 0.0)
-    monkeypatch.setattr(feed, "MOST_TURNS", 4)
+    monkeypatch.setattr(feed, "MAX_TURNS", 4)
     lease = start(repository)
     log = repository.events_of(lease.job.id)
 

@@ -7,7 +7,7 @@ import pytest
 
 from services.anatomy.templates.incisor import build_incisor
 from services.fit.execution.blocks import PixelParts
-from services.fit.inputs.observations import CELL_EDGE, LEAST_CELLS, ViewStack, comparison_cells, on_coarse_grid
+from services.fit.inputs.observations import CELL_EDGE, MIN_CELLS, ViewStack, comparison_cells, on_coarse_grid
 from services.phantom.dome_rig import dome_cameras
 
 
@@ -40,7 +40,7 @@ def test_a_finer_image_has_the_same_cells_with_more_pixels_in_each() -> None:
 
 def test_few_pixels_have_smaller_cells() -> None:
     # Of 96 pixels squares of four leave 24; of a dozen, and of one, every pixel stands alone.
-    assert len(np.unique(comparison_cells(view(12, 8), 600))) == LEAST_CELLS
+    assert len(np.unique(comparison_cells(view(12, 8), 600))) == MIN_CELLS
     assert len(np.unique(comparison_cells(view(4, 3), 600))) == 12
     np.testing.assert_array_equal(comparison_cells(view(1, 1), 600), [0])
 

@@ -18,7 +18,7 @@ from services.fit.execution.closing import _with_cosine
 from services.fit.jaw.driver import jaw_dentins
 from services.fit.jaw.neighbours import Neighbours, arch_place
 from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import LEAST_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
+from services.fit.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
 from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
@@ -53,9 +53,9 @@ def test_hidden_teeth_are_tied_and_faults_of_their_own_are_told() -> None:
     def broken() -> Tissue:
         raise MeshError("Its dentin sticks out; repair it.")
 
-    hidden = start_tooth(17, LEAST_TOOTH_PIXELS - 1, broken)
+    hidden = start_tooth(17, MIN_TOOTH_PIXELS - 1, broken)
     assert (hidden.state, hidden.tissue, hidden.drops_dentin) == ("tied", None, False)
-    failed = start_tooth(11, LEAST_TOOTH_PIXELS, broken)
+    failed = start_tooth(11, MIN_TOOTH_PIXELS, broken)
     assert (failed.state, failed.drops_dentin) == ("failed", True)
     assert "Its dentin sticks out" in failed.sentence
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.fit.execution.channel_fit import CLOSING_LEAST_SHARE, CLOSING_TRIALS, last_step
+from services.fit.execution.channel_fit import CLOSING_MIN_SHARE, CLOSING_TRIALS, last_step
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.normal_equations import LossChange
 
@@ -77,7 +77,7 @@ def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
 def test_a_step_is_shortened_to_a_tenth_at_most(change: float) -> None:
     problem = FakeProblem(change)
     taken(problem, things=1)
-    assert problem.asked == pytest.approx([1, CLOSING_LEAST_SHARE])
+    assert problem.asked == pytest.approx([1, CLOSING_MIN_SHARE])
 
 
 def test_a_step_that_promises_nothing_is_not_compared() -> None:

@@ -10,11 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from services.api.jobs.forecast import LEAST, SHARE, Observation, foresee, survival
+from services.api.jobs.forecast import MIN_OBSERVATIONS, SHARE, Observation, foresee, survival
 
 SECONDS = st.floats(0.01, 1e6)
 LOGARITHMS = st.floats(-5, 15)
-PAST = st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), min_size=LEAST, max_size=20)
+PAST = st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), min_size=MIN_OBSERVATIONS, max_size=20)
 SLOPES = (0.5, 0.5)
 some = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -71,7 +71,7 @@ def test_what_has_lasted_does_not_end_earlier(past: list[Observation], share: fl
 
 
 @some
-@given(st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), max_size=LEAST - 1))
+@given(st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), max_size=MIN_OBSERVATIONS - 1))
 def test_a_few_cases_tell_nothing(past: list[Observation]) -> None:
     assert foresee(past, (0.0, 0.0), SLOPES) is None
 
@@ -90,7 +90,7 @@ def test_a_job_unlike_the_others_gets_a_wider_range() -> None:
     assert widths[0] < widths[1] < widths[2]
 
 
-@pytest.mark.parametrize("count", [LEAST, 10, 40])
+@pytest.mark.parametrize("count", [MIN_OBSERVATIONS, 10, 40])
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_ranges_hold_the_truth_as_often_as_they_say(count: int, noise: float) -> None:
     """Durations with a fixed part and one in proportion to the size, which is not quite what the model says."""

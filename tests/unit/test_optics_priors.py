@@ -10,7 +10,7 @@ import pytest
 
 from services.fit.optics.domain import HELD_G, similar_medium
 from services.fit.optics.parameters import Medium
-from services.fit.optics.priors import LEAST_SD, LITERATURE_TABLE, WEAK, literature, priors_of, towards
+from services.fit.optics.priors import LITERATURE_TABLE, MIN_SD, WEAK, literature, priors_of, towards
 from services.fit.tooth.schedule import media_domain, shared_domain
 from tests.support.shared_data import shared_path
 
@@ -43,8 +43,8 @@ def test_teeth_that_agree_give_no_narrower_a_prior_than_stated() -> None:
     medium = Medium(4.5, 0.997, g1=0.8)
     for media in ([medium], [medium, medium]):
         prior = towards("3.enamel", media)
-        assert prior["3.enamel.sigma"] == (pytest.approx(math.log(similar_medium(medium, HELD_G).sigma)), LEAST_SD["sigma"])
-        assert prior["3.enamel.alpha"][1] == LEAST_SD["alpha"]
+        assert prior["3.enamel.sigma"] == (pytest.approx(math.log(similar_medium(medium, HELD_G).sigma)), MIN_SD["sigma"])
+        assert prior["3.enamel.alpha"][1] == MIN_SD["alpha"]
 
 
 def test_a_fits_coordinates_carry_the_chosen_prior() -> None:

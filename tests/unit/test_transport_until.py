@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.transport.paths.until import FIRST_ROUND, GROWTH, LEAST_GROWTH, Effort, trace_until
+from services.fit.transport.paths.until import FIRST_ROUND, GROWTH, MIN_GROWTH, Effort, trace_until
 from services.fit.transport.scene.recipe import StackEstimate, relative_error
 
 PIXELS = 400
@@ -34,7 +34,7 @@ def test_rounds_follow_on_and_grow_within_bounds() -> None:
     assert walk.rounds[0] == range(FIRST_ROUND)
     for last, following in zip(walk.rounds, walk.rounds[1:], strict=False):
         assert following.start == last.stop
-        assert LEAST_GROWTH <= following.stop / last.stop <= GROWTH
+        assert MIN_GROWTH <= following.stop / last.stop <= GROWTH
     # An error of 5 % takes 200^2 paths; 6000 degrees of freedom know it to 2 %, and the last round leaves a margin of 5 to 25 %.
     assert found.samples == 16 * walk.rounds[-1].stop
     assert 0.95 * 200**2 <= found.samples <= 1.35 * 200**2

@@ -31,7 +31,7 @@ MESH_POINTS, CROWN_POINTS = 3000, 2500
 """Of the mesh and of the average, in which closest points are looked for: 0.3 mm apart."""
 REVERSE_STEP = 4
 """Every so many of the mesh's points are compared with the average."""
-LEAST_REVERSE_POINTS = 20
+MIN_REVERSE_POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class CrownMatch:
         for g, (axes, centre, scale) in enumerate(zip(placed.axes, placed.centres_mm, placed.scales, strict=True)):
             seen = SurfacePoints((points - centre) @ axes.T / scale, normals @ axes.T).features
             seen = seen[seen[:, 2] > low + NECK * (high - low)]
-            if len(seen) >= LEAST_REVERSE_POINTS:
+            if len(seen) >= MIN_REVERSE_POINTS:
                 misfits[g] = np.minimum(self._average_tree.query(seen)[0], FARTHEST_MM).mean()
         return misfits
 

@@ -25,7 +25,7 @@ RIGHT, LEFT = 10, 20
 PLACES = range(1, 8)
 GAP_MM = 0.07
 """Between neighbours, at their nearest."""
-MOST_MOVES = 60
+MAX_MOVES = 60
 GAP_ERROR_MM = 0.005
 SEPARATION_MM = 1.0
 """By how much more than their half widths two teeth are apart before they are moved together."""
@@ -125,7 +125,7 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
         arc_mm -= d.md_crown_mm / 2 + SEPARATION_MM
         facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > d.md_crown_mm / 4]
         frame, spare_mm = _standing(arch, arc_mm, solid, d, stance), SEPARATION_MM
-        for _ in range(MOST_MOVES):
+        for _ in range(MAX_MOVES):
             if abs(spare_mm) < GAP_ERROR_MM:
                 break
             points = frame.world_from_canonical(facing)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from services.api.auth.sessions import COOKIE, Sessions
 from services.api.auth.tokens import LOCAL, Caller, Tokens
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.client.errors import UnauthenticatedError
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings
@@ -23,7 +23,7 @@ class Access:
     """The callers of one server; ``sessions`` is None where access is open."""
 
     def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
-        self.tokens, self.sessions, self.lookers = tokens, sessions, Clerks(LOOKERS)
+        self.tokens, self.sessions, self.lookers = tokens, sessions, ThreadPool(LOOKERS)
 
     async def identify(self, request: HTTPConnection) -> Caller:
         """The caller, by the Authorization header or else by the session cookie.

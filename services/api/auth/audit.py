@@ -49,7 +49,7 @@ class AuditEntry(Record):
 
 
 @dataclass
-class Deed:
+class AuditedAction:
     """Something that a caller does; whoever makes the change writes it in the same transaction if that is simple."""
 
     action: str
@@ -74,11 +74,11 @@ class AuditLog:
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine
 
-    def append(self, deed: Deed, outcome: int) -> None:
-        """Append a deed that is in no other transaction."""
-        if not deed.is_written:
+    def append(self, audited: AuditedAction, outcome: int) -> None:
+        """Append an action that is in no other transaction."""
+        if not audited.is_written:
             with writing(self._engine) as connection:
-                deed.write(connection, outcome)
+                audited.write(connection, outcome)
 
     def page(self, limit: int, before: int | None = None, who: str | None = None) -> list[AuditEntry]:
         """Newest rows first, those with an id below ``before``."""

@@ -15,7 +15,7 @@ from starlette.requests import HTTPConnection
 from starlette.responses import Response
 
 from services.api.auth.access import Access
-from services.api.auth.audit import AuditLog, Deed
+from services.api.auth.audit import AuditedAction, AuditLog
 from services.api.auth.browser_protection import SAFE_METHODS
 from services.api.auth.ownership import Ownership
 from services.api.auth.scopes import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
@@ -23,7 +23,7 @@ from services.api.auth.tokens import Caller, public_id
 from services.api.http.problems import MEDIA_TYPE, Problem, database_lost, response_of
 from services.api.http.rate_limits import Rates, network_of
 from services.api.http.request_log import method_of
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.client.errors import RateError, ScopeError, UnauthenticatedError
 from services.core.errors import PlatformError
 
@@ -35,10 +35,10 @@ RECHECK_S = 5.0
 """A stream of a token that was revoked ends at its first message after this time."""
 
 
-class Gate:
+class AuthenticationMiddleware:
     """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
 
-    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: Clerks, dark_auditors: Clerks) -> None:
+    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: ThreadPool, dark_auditors: ThreadPool) -> None:
         self._app, self._owner, self._access, self._rates = app, owner, access, rates
         self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
         self._ownership = Ownership(access.tokens.engine)
@@ -53,42 +53,42 @@ class Gate:
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        deed = Deed(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
+        audited = AuditedAction(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
         try:
-            refusal = await (self._stranger_refusal(request, deed) if _is_setup(found) else self._refusal(request, found, deed))
+            refusal = await (self._stranger_refusal(request, audited) if _is_setup(found) else self._refusal(request, found, audited))
         except SQLAlchemyError:
             refusal = database_lost(scope["path"])
         if refusal is not None:
             await refusal(scope, receive, send)
             return
-        await self._pass(request, found.route, deed, receive, send)
+        await self._pass(request, found.route, audited, receive, send)
 
     @cached_property
     def _routes(self) -> Sequence[GuardedRoute]:
         return guarded_routes(self._owner.routes)
 
-    async def _refusal(self, request: HTTPConnection, found: Found, deed: Deed) -> Response | None:
+    async def _refusal(self, request: HTTPConnection, found: Found, audited: AuditedAction) -> Response | None:
         """The answer to a request that may not pass."""
         path, is_change = request.scope["path"], request.scope["method"] not in SAFE_METHODS
         try:
             caller = await self._access.identify(request)
         except UnauthenticatedError as problem:
-            return await self._refuse_unknown(request, problem, deed)
-        deed.who, deed.token = caller.name, caller.token.id if caller.token else None
-        if wait_s := self._rates.count(deed.token or network_of(deed.address), is_change=is_change):
-            return _too_many(f"Token {caller.name} asked" if caller.token else f"Address {deed.address} asked", wait_s, path)
+            return await self._refuse_unknown(request, problem, audited)
+        audited.who, audited.token = caller.name, caller.token.id if caller.token else None
+        if wait_s := self._rates.count(audited.token or network_of(audited.address), is_change=is_change):
+            return _too_many(f"Token {caller.name} asked" if caller.token else f"Address {audited.address} asked", wait_s, path)
         if found.route is None:
             return _nothing_there(found, path, request.scope["method"])
         try:
             found.route.admit(caller)
         except ScopeError as problem:
-            await self._auditors.ask(self._audit.append, deed, HTTPStatus.FORBIDDEN)
+            await self._auditors.ask(self._audit.append, audited, HTTPStatus.FORBIDDEN)
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
             return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
-        request.scope["caller"], request.scope["deed"] = caller, deed
-        return await self._hidden(request, found.route, found.ids, caller, deed)
+        request.scope["caller"], request.scope["audited"] = caller, audited
+        return await self._hidden(request, found.route, found.ids, caller, audited)
 
-    async def _hidden(self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, deed: Deed) -> Response | None:
+    async def _hidden(self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction) -> Response | None:
         """The answer to a request that names something of others: the same as if it were not there, and before anything else of it is looked at."""
         named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
         if named is None:
@@ -99,33 +99,33 @@ class Gate:
         if caller.viewer.may_see(owner):
             return None
         if _is_audited(request.scope, route):
-            await self._auditors.ask(self._audit.append, deed, HTTPStatus.NOT_FOUND)
+            await self._auditors.ask(self._audit.append, audited, HTTPStatus.NOT_FOUND)
         return response_of(thing.absent(name), request.scope["path"])
 
-    async def _stranger_refusal(self, request: HTTPConnection, deed: Deed) -> Response | None:
+    async def _stranger_refusal(self, request: HTTPConnection, audited: AuditedAction) -> Response | None:
         """The answer to somebody with a setup link who may not even try it: each try counts as a request without a valid token."""
-        deed.who, request.scope["deed"] = "setup link", deed
-        if wait_s := self._rates.count_refusal(network_of(deed.address)):
-            await self._tell_of_many(deed)
-            return _too_many(f"Address {deed.address} asked", wait_s, request.scope["path"])
+        audited.who, request.scope["audited"] = "setup link", audited
+        if wait_s := self._rates.count_refusal(network_of(audited.address)):
+            await self._tell_of_many(audited)
+            return _too_many(f"Address {audited.address} asked", wait_s, request.scope["path"])
         return None
 
-    async def _tell_of_many(self, deed: Deed) -> None:
-        if self._rates.is_worth_telling(network_of(deed.address)):
-            await self._auditors.ask(self._audit.append, deed, HTTPStatus.TOO_MANY_REQUESTS)
+    async def _tell_of_many(self, audited: AuditedAction) -> None:
+        if self._rates.is_worth_telling(network_of(audited.address)):
+            await self._auditors.ask(self._audit.append, audited, HTTPStatus.TOO_MANY_REQUESTS)
 
-    async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, deed: Deed) -> Response:
+    async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction) -> Response:
         """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
         credential = Access.credential(request)
-        deed.token = public_id(credential) if credential else None
-        if wait_s := self._rates.count_refusal(network_of(deed.address)):
-            await self._tell_of_many(deed)
-            return _too_many(f"Address {deed.address} was refused", wait_s, request.scope["path"])
-        await self._auditors.ask(self._audit.append, deed, HTTPStatus.UNAUTHORIZED)
+        audited.token = public_id(credential) if credential else None
+        if wait_s := self._rates.count_refusal(network_of(audited.address)):
+            await self._tell_of_many(audited)
+            return _too_many(f"Address {audited.address} was refused", wait_s, request.scope["path"])
+        await self._auditors.ask(self._audit.append, audited, HTTPStatus.UNAUTHORIZED)
         challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
         return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
 
-    async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, deed: Deed, receive: Receive, send: Send) -> None:
+    async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, audited: AuditedAction, receive: Receive, send: Send) -> None:
         scope = request.scope
         is_audited = _is_audited(scope, route)
         auditors = self._dark_auditors if route is not None and route.needs is not None and route.needs.darkens else self._auditors
@@ -136,9 +136,9 @@ class Gate:
             if is_over:
                 return
             if message["type"] == "http.response.start" and is_audited:
-                deed.ids |= _made(message)
+                audited.ids |= _made(message)
                 try:
-                    await auditors.ask(self._audit.append, deed, message["status"])
+                    await auditors.ask(self._audit.append, audited, message["status"])
                 except SQLAlchemyError:
                     is_over = True
                     full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
@@ -158,7 +158,7 @@ class Gate:
             except Exception:
                 if is_audited:
                     with suppress(SQLAlchemyError):
-                        await auditors.ask(self._audit.append, deed, HTTPStatus.INTERNAL_SERVER_ERROR)
+                        await auditors.ask(self._audit.append, audited, HTTPStatus.INTERNAL_SERVER_ERROR)
                 raise
 
     async def _is_still_known(self, request: HTTPConnection) -> bool:

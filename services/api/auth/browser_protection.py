@@ -32,7 +32,7 @@ _BY_TLS_ONLY = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
 _NOT_KEPT = (b"cache-control", b"no-store")
 
 
-class Shield:
+class BrowserProtection:
     """Adds security headers; refuses other names for this server (DNS rebinding), and changes that another site's page asks a visitor's browser to make.
 
     Args:

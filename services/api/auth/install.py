@@ -7,18 +7,18 @@ from fastapi import FastAPI
 
 from services.api.auth.access import Access
 from services.api.auth.audit import AuditLog
-from services.api.auth.authentication import Gate
+from services.api.auth.authentication import AuthenticationMiddleware
 from services.api.auth.routes import build_access_router
 from services.api.auth.sessions import Sessions, read_key
 from services.api.auth.setup_links import SetupLinks
 from services.api.auth.tokens import Tokens
 from services.api.http.body_limit import BodyLimit
 from services.api.http.rate_limits import Rates
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.core.settings import ServerSettings
 
 
-def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: Clerks, dark_auditors: Clerks) -> None:
+def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: ThreadPool, dark_auditors: ThreadPool) -> None:
     """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
 
     Args:
@@ -28,4 +28,6 @@ def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
     app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
     app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
-    app.add_middleware(Gate, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors)
+    app.add_middleware(
+        AuthenticationMiddleware, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors
+    )

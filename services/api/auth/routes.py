@@ -17,7 +17,7 @@ from services.api.http.problems import refusals
 from services.client.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
 from services.core.records import Number
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 
 
 class TokenRequest(Record):
@@ -59,7 +59,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:
         """Make a token. Its secret is in this answer and nowhere else."""
-        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["deed"], wanted.group)
+        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["audited"], wanted.group)
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
         return issued
 
@@ -71,7 +71,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     @router.delete("/tokens/{token_id}", tags=["access"], dependencies=[needs("admin")])
     def revoke(token_id: str, request: Request) -> Token:
         """End a token now, with the sessions and streams that it has opened."""
-        return access.tokens.revoke(token_id, request.scope["deed"])
+        return access.tokens.revoke(token_id, request.scope["audited"])
 
     def open_session(sessions: Sessions, token: Token, response: Response) -> None:
         value, lifetime_s = sessions.issue(token)
@@ -82,7 +82,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         """Make the first administrator's token by the link in the server's log, which works once, and open a browser session for it."""
         if access.sessions is None:
             raise SetupLinkError("This server asks nobody for a token, so there is nothing to set up; open its page.")
-        issued = links.redeem(link.secret.get_secret_value(), request.scope["deed"])
+        issued = links.redeem(link.secret.get_secret_value(), request.scope["audited"])
         open_session(access.sessions, issued, response)
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
         return issued
@@ -113,7 +113,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
 
     @router.get("/audit", tags=["access"], dependencies=[needs("admin")])
     def page(
-        limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, le=MOST_ID)] = None, who: str | None = None
+        limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, le=MAX_ID)] = None, who: str | None = None
     ) -> AuditPage:
         """Who did what, newest first."""
         found = audit.page(limit + 1, before, who)

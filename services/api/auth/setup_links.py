@@ -15,7 +15,7 @@ from collections.abc import Callable
 import sqlalchemy as sql
 from pydantic import SecretStr
 
-from services.api.auth.audit import Deed
+from services.api.auth.audit import AuditedAction
 from services.api.auth.tokens import IssuedToken, Scope, insert_token, token_table
 from services.client.errors import SetupLinkError
 from services.core.settings import ServerSettings
@@ -49,7 +49,7 @@ class SetupLinks:
             connection.execute(setup_link_table.insert().values(sha256=_hash(secret), expires_s=self._clock() + LIFETIME_S))
         return SecretStr(secret)
 
-    def redeem(self, secret: str, deed: Deed) -> IssuedToken:
+    def redeem(self, secret: str, audited: AuditedAction) -> IssuedToken:
         """The administrator's token that a link stands for; no link holds after this.
 
         Raises:
@@ -63,7 +63,7 @@ class SetupLinks:
                 what = "This setup link was used, has expired or is unknown"
                 raise SetupLinkError(f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for one.")
             connection.execute(setup_link_table.delete())
-            return insert_token(connection, NAME, (Scope.ADMIN,), self._clock(), None, deed)
+            return insert_token(connection, NAME, (Scope.ADMIN,), self._clock(), None, audited)
 
 
 def setup_address(settings: ServerSettings, port: int) -> str:

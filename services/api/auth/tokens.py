@@ -25,7 +25,7 @@ from typing import Annotated, Any, NamedTuple, Self
 import sqlalchemy as sql
 from pydantic import Field, SecretStr, WithJsonSchema, field_serializer
 
-from services.api.auth.audit import Deed
+from services.api.auth.audit import AuditedAction
 from services.api.auth.ended_sessions import EndedSessions
 from services.client.errors import UnauthenticatedError, UnknownTokenError
 from services.core.errors import InputError
@@ -35,7 +35,7 @@ from services.pipeline.database import Query, metadata, writing
 
 TRUSTED_S = 1.0
 """How long a server goes on trusting a token that it has looked up; one that is revoked at this server ends at once."""
-MOST_TRUSTED = 1000
+MAX_TRUSTED = 1000
 LAST_USE_STEP_S = 3600.0
 """The last use is noted once in this time, so that reading stays reading."""
 DAY_S = 86400.0
@@ -157,7 +157,7 @@ class Tokens:
         self._trusted: dict[_Credential, _Trust] = {}
         self._revocations = 0
 
-    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, deed: Deed, group: str | None = None) -> IssuedToken:
+    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, audited: AuditedAction, group: str | None = None) -> IssuedToken:
         """Make a token; the result is the only place where its secret is.
 
         Args:
@@ -179,14 +179,14 @@ class Tokens:
             if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
                 raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
             expires_s = None if expires_days is None else now + expires_days * DAY_S
-            return insert_token(connection, name, wanted, now, expires_s, deed, group)
+            return insert_token(connection, name, wanted, now, expires_s, audited, group)
 
     def list(self) -> list[Token]:
         """Every token, newest first, revoked and expired ones too."""
         with self.engine.connect() as connection:
             return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
 
-    def revoke(self, token_id: str, deed: Deed) -> Token:
+    def revoke(self, token_id: str, audited: AuditedAction) -> Token:
         """End a token now, by its id, else by the name of one that is not revoked; ending it again changes nothing.
 
         Raises:
@@ -203,8 +203,8 @@ class Tokens:
             if row["revoked_s"] is None:
                 row["revoked_s"] = now
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(revoked_s=now))
-            deed.ids["token_id"] = row["id"]
-            deed.write(connection, 200)
+            audited.ids["token_id"] = row["id"]
+            audited.write(connection, 200)
         self._revocations += 1
         return Token(**_fields(row))
 
@@ -250,7 +250,7 @@ class Tokens:
     def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
         token = Token(**_fields(row))
         left_s = math.inf if token.expires_s is None else token.expires_s - self._clock()
-        if len(self._trusted) >= MOST_TRUSTED:
+        if len(self._trusted) >= MAX_TRUSTED:
             self._trusted.clear()
         self._trusted[credential] = _Trust(token, self._ticks() + min(TRUSTED_S, left_s), revocations)
         return token
@@ -267,7 +267,7 @@ class Tokens:
 
 
 def insert_token(
-    connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, deed: Deed, group: str | None = None
+    connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, audited: AuditedAction, group: str | None = None
 ) -> IssuedToken:
     """Add a token, and the audit's row of it, inside the caller's transaction."""
     token_id = secrets.token_hex(6)
@@ -275,8 +275,8 @@ def insert_token(
     row = {"id": token_id, "name": name, "scopes": " ".join(scopes), "sha256": _hash(secret.get_secret_value()), "created_s": now_s}
     row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None, "group": group}
     connection.execute(token_table.insert().values(row))
-    deed.ids["token_id"] = token_id
-    deed.write(connection, 201)
+    audited.ids["token_id"] = token_id
+    audited.write(connection, 201)
     return IssuedToken(**_fields(row), token=secret)
 
 

@@ -20,7 +20,7 @@ import sqlalchemy as sql
 
 from services.api.captures.blobs import Blobs, Write, sync_folders
 from services.api.captures.descriptions import CaptureReader, ReadHere
-from services.api.captures.file_locks import Claims
+from services.api.captures.file_locks import FileLocks
 from services.api.captures.table import CaptureTable, FileRow, unknown_capture
 from services.api.captures.uploads import Uploads, upload_path
 from services.client.capture_paths import TEXTS, require_paths
@@ -64,7 +64,7 @@ class Captures:
     ) -> None:
         self._reader: CaptureReader = reader or ReadHere()
         self._limits, self._data, self._now_s = limits, data, now_s
-        self._table, self._blobs, self._claims = CaptureTable(engine), Blobs(data, write), Claims()
+        self._table, self._blobs, self._claims = CaptureTable(engine), Blobs(data, write), FileLocks()
         self.uploads = Uploads(self._table, self._blobs, self._claims, limits, now_s)
         self._free_bytes = free_bytes or (lambda: shutil.disk_usage(data).free)
         self._guard = threading.RLock()

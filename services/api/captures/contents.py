@@ -15,7 +15,7 @@ from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
 from services.core.slab_folder import SlabFolder
 
-MOST_TIMES_PACKED = 1100
+MAX_TIMES_PACKED = 1100
 """Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""
 _ITEM_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "float16": 2, "int32": 4, "uint32": 4, "float32": 4}
 _PIXEL_BYTES, _SLAB_PIXEL_BYTES = 4, 8
@@ -57,7 +57,7 @@ def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> st
         return f"Image {name} declares {image.size}, more than {limits.largest_image_bytes} bytes when decoded; crop or bin it."
     if image.file_bytes is not None and image.file_bytes != size:
         return f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
-    if image.decoded_bytes > MOST_TIMES_PACKED * size:
+    if image.decoded_bytes > MAX_TIMES_PACKED * size:
         return f"Image {name} declares {image.size} in {size} bytes, which no photograph packs to; export it again."
     return metadata_fault(path, name, suffix)
 

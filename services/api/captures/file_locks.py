@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from services.client.errors import LockedError
 
 
-class Claims:
+class FileLocks:
     """Files of captures that some request is working on."""
 
     def __init__(self) -> None:

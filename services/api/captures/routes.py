@@ -20,7 +20,7 @@ from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import MEDIA_TYPE, Problem, refusals
 from services.client.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
 from services.client.errors import IncompleteCaptureError
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 
 SWEEP_S = 600.0
 
@@ -64,7 +64,7 @@ def build_captures_router(captures: Captures) -> APIRouter:
 
     @under.get("", dependencies=[needs("read")])
     @in_json
-    def page(asker: Asker, limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> CapturePage:
+    def page(asker: Asker, limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None) -> CapturePage:
         """List captures, newest first."""
         return captures.page(limit, before, asker)
 

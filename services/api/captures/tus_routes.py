@@ -15,9 +15,9 @@ from services.api.captures.uploads import Upload, Uploads, upload_path
 from services.api.http.problems import refusals
 from services.client import tus
 from services.client.errors import UploadError
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 
-FileNumber = Annotated[int, Path(ge=0, le=MOST_ID, description="number of the file in the capture's manifest, from 0")]
+FileNumber = Annotated[int, Path(ge=0, le=MAX_ID, description="number of the file in the capture's manifest, from 0")]
 
 
 class TusRoute(APIRoute):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from services.api.captures.blobs import Blobs, PartialFile
-from services.api.captures.file_locks import Claims
+from services.api.captures.file_locks import FileLocks
 from services.api.captures.table import CaptureTable, FileRow, unknown_capture
 from services.client.capture_records import CaptureState
 from services.client.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
@@ -37,7 +37,7 @@ class Upload:
 class Uploads:
     """Offsets are recorded only once their bytes are durable, so a dead server loses no acknowledged byte."""
 
-    def __init__(self, table: CaptureTable, blobs: Blobs, claims: Claims, limits: UploadLimits, now_s: Callable[[], float]) -> None:
+    def __init__(self, table: CaptureTable, blobs: Blobs, claims: FileLocks, limits: UploadLimits, now_s: Callable[[], float]) -> None:
         self.limits, self.claims = limits, claims
         self._table, self._blobs, self._now_s = table, blobs, now_s
 

@@ -6,12 +6,12 @@ from services.api.auth.scopes import needs
 from services.api.dome.dome import AllOff, Dome, DomeState, LightRequest, PreflightResult
 from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.problems import refusals
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.core.dome import DomeStatus
 from services.core.records import RigSpec
 
 
-def build_dome_router(dome: Dome, darkeners: Clerks, operators: Clerks) -> APIRouter:
+def build_dome_router(dome: Dome, darkeners: ThreadPool, operators: ThreadPool) -> APIRouter:
     """Routes over the given dome; ``darkeners`` do nothing but switch off, ``operators`` all else."""
     router = APIRouter(prefix="/v1/dome", route_class=BodyRoute, tags=["dome"], responses=refusals(404, 409, 422, 502))
 

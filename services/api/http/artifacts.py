@@ -32,7 +32,7 @@ ANSWERS = refusals(416) | {
 }
 """What the description says of routes that answer with a file."""
 
-MOST_BYTES_AT_ONCE = 2**20
+MAX_BYTES_AT_ONCE = 2**20
 """Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread each."""
 
 REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
@@ -87,7 +87,7 @@ def artifact_response(request: Request, path: Path) -> Response:
         problem = RangeError(f"The file has {stat.st_size} bytes, not those that '{asked}' names; ask for others.")
         return response_of(problem, request.scope["path"], {"Content-Range": f"bytes */{stat.st_size}"})
     first, end = (0, stat.st_size) if ranges is None else ranges[0]
-    if (ranges is None or len(ranges) == 1) and end - first <= MOST_BYTES_AT_ONCE:
+    if (ranges is None or len(ranges) == 1) and end - first <= MAX_BYTES_AT_ONCE:
         if ranges is not None:
             headers["Content-Range"] = f"bytes {first}-{end - 1}/{stat.st_size}"
         return Response(_read(path, first, end), 200 if ranges is None else 206, headers, _media_type(path))

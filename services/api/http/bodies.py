@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.core.errors import SettingsError
 
 MAX_FAULTS = 100
@@ -88,7 +88,7 @@ class BodyRoute(APIRoute):
         class ReadRequest(Request):
             async def json(self) -> Any:
                 # FastAPI checks what this returns once more, but takes a record as it is.
-                parsers: Clerks = self.app.state.parsers
+                parsers: ThreadPool = self.app.state.parsers
                 body = await self.body()
                 return read(body) if len(body) <= SHORT_BYTES else await parsers.ask(read, body)
 

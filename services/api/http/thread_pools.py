@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 import sqlalchemy as sql
 
-MOST_READERS = 8
+MAX_READERS = 8
 """Of a database over a network, where most of the time is waiting."""
 CLOSE_S = 5.0
 """How long the server's end waits for work that is under way."""
@@ -20,7 +20,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class Clerks:
+class ThreadPool:
     """So many threads, begun when there is work. What may take long, or waits for others, belongs elsewhere."""
 
     def __init__(self, count: int) -> None:
@@ -29,7 +29,7 @@ class Clerks:
     @classmethod
     def reading(cls, engine: sql.Engine) -> Self:
         """One where the database is a file: it answers sooner than threads wrest the interpreter from each other, which each of them must after every query."""
-        return cls(1 if engine.dialect.name == "sqlite" else MOST_READERS)
+        return cls(1 if engine.dialect.name == "sqlite" else MAX_READERS)
 
     async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
         """What the work returns."""

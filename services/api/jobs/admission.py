@@ -26,7 +26,7 @@ from services.core.store import MANIFEST
 
 DISK_PER_CAPTURE = 6.0
 """Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are most."""
-LEAST_DISK_BYTES = 64 * 2**20
+MIN_DISK_BYTES = 64 * 2**20
 """What a job stores of a small capture: pictures, checkpoint and asset."""
 RIG_CAPTURE_BYTES = 2 * 2**30
 """A capture that a rig is about to take."""
@@ -34,7 +34,7 @@ DEMO_CAPTURE_BYTES = 2**20
 """What the demonstration's rig takes: 0.3 MB were measured."""
 WORKER_BYTES = 3 * 2**29
 """Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
-MOST_FILES = 5_000
+MAX_FILES = 5_000
 """Of a capture that are looked at."""
 _DESCRIPTIONS = ("capture.json", "slab.json", MANIFEST, f"capture/{MANIFEST}")
 """One of these makes a folder a capture, or a job that holds one."""
@@ -65,7 +65,7 @@ def predict(spec: JobSpec) -> Needs:
     """Prediction from the size of the capture and the number of workers."""
     rigs = DEMO_CAPTURE_BYTES if spec.is_demo else RIG_CAPTURE_BYTES
     size = rigs if spec.capture is None else _stored_bytes(spec.capture)
-    return Needs(LEAST_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
+    return Needs(MIN_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
 
 
 def _stored_bytes(folder: Path) -> int:
@@ -75,7 +75,7 @@ def _stored_bytes(folder: Path) -> int:
     with suppress(OSError):
         if not any((folder / one).is_file() for one in _DESCRIPTIONS):
             return 0
-        for path in itertools.islice(folder.rglob("*"), MOST_FILES):
+        for path in itertools.islice(folder.rglob("*"), MAX_FILES):
             with suppress(OSError):
                 status = path.lstat()
                 total += 512 * status.st_blocks if stat.S_ISREG(status.st_mode) else 0

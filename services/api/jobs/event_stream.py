@@ -23,9 +23,9 @@ from services.client.errors import UnknownJobError
 PERIOD_S = 0.2
 PING_S = 15.0
 """A silent stream says that it lives this often, and looks whether its job still does."""
-MOST_EVENTS = 1000
+MAX_EVENTS = 1000
 """Read and sent at once."""
-MOST_TURNS = 64
+MAX_TURNS = 64
 """Remembered; a stream that was stalled for longer reads again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {"itemSchema": {"type": "object", "properties": {name: {"type": "string"} for name in ("data", "event", "id")}}}}}
@@ -82,7 +82,7 @@ class EventFeed:
 
     def __init__(self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread) -> None:
         self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
-        self._turns = deque([Turn(0)], MOST_TURNS)
+        self._turns = deque([Turn(0)], MAX_TURNS)
 
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
@@ -200,9 +200,9 @@ class EventFeed:
 
 def _read(repository: Repository, job_id: str, after: int) -> Chapter:
     state = repository.get(job_id).state  # before its events: those of a final state are then among them
-    events = repository.events_of(job_id).read(after, MOST_EVENTS)
+    events = repository.events_of(job_id).read(after, MAX_EVENTS)
     told = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
-    is_full = len(events) == MOST_EVENTS
+    is_full = len(events) == MAX_EVENTS
     has_ended = (state.is_final or state is JobState.DELETING) and not is_full
     return Chapter(told, events[-1].id if events else after, state if has_ended else None, is_full)
 

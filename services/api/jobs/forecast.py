@@ -19,7 +19,7 @@ Array = NDArray[np.floating]
 
 SHARE = 0.8
 """Of all cases that a range is to hold."""
-LEAST = 5
+MIN_OBSERVATIONS = 5
 """Observations below which nothing is said."""
 OUTLIVED = 0.02
 """Share of cases below which those that lasted as long are too few to learn from."""
@@ -63,13 +63,13 @@ class Outlook:
 
 
 def foresee(past: Sequence[Observation], features: Sequence[float], slopes: Sequence[float]) -> Outlook | None:
-    """Outlook of a case with these features; None with fewer than ``LEAST`` observations.
+    """Outlook of a case with these features; None with fewer than ``MIN_OBSERVATIONS`` observations.
 
     Args:
         past: oldest first, as what was unexpected of one case is expected to go on in part in the next.
         slopes: expected ones, by how much log T grows with each feature.
     """
-    if len(past) < LEAST:
+    if len(past) < MIN_OBSERVATIONS:
         return None
     x, y = np.array([one.features for one in past]), np.log([one.seconds for one in past])
     surprises = _regress(x, y, slopes).residuals

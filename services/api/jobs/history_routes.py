@@ -10,20 +10,20 @@ from services.api.auth.scopes import needs
 from services.api.http.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
 from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import refusals
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.api.http.zip_stream import stream_zip
 from services.api.jobs.history import Histories, History, LogPage, PreviewPage, read_log, read_previews
 from services.api.jobs.jobs import Jobs
 from services.api.presets import Preset, find_preset, list_presets
 from services.client.errors import UnknownJobError
 from services.core.stage import StageName
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 from services.pipeline.event_log import EventLog
 
-After = Annotated[int, Query(ge=0, le=MOST_ID, description="id of the last one that is known already")]
+After = Annotated[int, Query(ge=0, le=MAX_ID, description="id of the last one that is known already")]
 
 
-def build_observe_router(jobs: Jobs, readers: Clerks, openers: Clerks) -> APIRouter:
+def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -> APIRouter:
     """Routes over the given jobs; ``openers`` read their files."""
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
     histories = Histories()
@@ -39,7 +39,7 @@ def build_observe_router(jobs: Jobs, readers: Clerks, openers: Clerks) -> APIRou
         after: After = 0,
         limit: Annotated[int, Query(ge=1, le=1000)] = 200,
         stage: StageName | None = None,
-        attempt: Annotated[int | None, Query(ge=1, le=MOST_ID)] = None,
+        attempt: Annotated[int | None, Query(ge=1, le=MAX_ID)] = None,
     ) -> LogPage:
         """What the job's stages said, oldest first."""
         return read_log(events_of(job_id), after, limit, stage, attempt)
@@ -66,7 +66,7 @@ def build_observe_router(jobs: Jobs, readers: Clerks, openers: Clerks) -> APIRou
     )
     @openers.answering
     def preview(
-        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, le=MOST_ID)], picture: Literal["render", "photo", "residual"], request: Request
+        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, le=MAX_ID)], picture: Literal["render", "photo", "residual"], request: Request
     ) -> Response:
         """One picture; takes Range and If-None-Match."""
         events = events_of(job_id).read(preview_id - 1, 1, kind="preview")

@@ -40,7 +40,7 @@ from services.pipeline.machine_class import machine_class
 from services.pipeline.stages import request_cancel, stages_of
 
 DAY_S = 86400.0
-MOST_RUNNING = 1000
+MAX_RUNNING = 1000
 """More jobs are not run at once: each is one thread of a server."""
 
 
@@ -191,7 +191,7 @@ class Jobs:
 
     def capturing(self) -> list[Job]:
         """Jobs under way, of any server of the database, whose capture is not published yet."""
-        return self._to_capture(self.repository.page(MOST_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
+        return self._to_capture(self.repository.page(MAX_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
 
     def lights_again(self, job_id: str) -> bool:
         """Whether a retry of a job would light a dome that is not simulated.

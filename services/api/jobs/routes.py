@@ -14,7 +14,7 @@ from services.api.http.artifacts import ANSWERS, Artifact, artifact_response, li
 from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.json_responses import in_json
 from services.api.http.problems import refusals
-from services.api.http.thread_pools import Clerks
+from services.api.http.thread_pools import ThreadPool
 from services.api.jobs.event_stream import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
 from services.api.jobs.jobs import Jobs, StageProgress
 from services.api.jobs.lifecycle import JobState
@@ -24,7 +24,7 @@ from services.api.jobs.time_ranges import TimeRange
 from services.core.geometry import Record
 from services.core.owners import Viewer
 from services.core.records import JobName, JobSpec, KindName
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 
 LOOK_S = 2.0
 """How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
@@ -73,7 +73,7 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, lookers: Clerks, cancellers: Clerks) -> APIRouter:
+def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: ThreadPool, lookers: ThreadPool, cancellers: ThreadPool) -> APIRouter:
     """Routes over the given jobs.
 
     Args:
@@ -122,7 +122,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
     def page(
         asker: Asker,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
-        before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None,
+        before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None,
         state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
         kind: KindName | None = None,
         created_after_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
@@ -174,7 +174,7 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: Clerks, openers: Clerks, 
         return jobs.repository.deletion(job_id)
 
     @router.get("/jobs/{job_id}/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
-    async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MOST_ID)] = None) -> Response:
+    async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MAX_ID)] = None) -> Response:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         return await feed.answer(job_id, last_event_id or 0)
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from services.api.captures.descriptions import Describe, describe
 from services.api.jobs.admission import turn
-from services.api.jobs.forecast import LEAST, Observation, foresee
+from services.api.jobs.forecast import MIN_OBSERVATIONS, Observation, foresee
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.past_runs import TENTHS, PastRun, tenth_of
 from services.api.jobs.records import Job
@@ -96,7 +96,7 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
     outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
     if outlook is None:
-        what = f"{len(past)} jobs like this one have succeeded on such a machine, and {LEAST} are needed to tell a time."
+        what = f"{len(past)} jobs like this one have succeeded on such a machine, and {MIN_OBSERVATIONS} are needed to tell a time."
         return TimeRange(past_jobs=len(past), reason=what)
     left = outlook.remaining_s(position.since_s)
     if left is None:

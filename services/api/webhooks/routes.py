@@ -12,9 +12,9 @@ from services.api.http.problems import refusals
 from services.api.webhooks.deliveries import Deliveries, Delivery
 from services.api.webhooks.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
 from services.core.geometry import Record
-from services.pipeline.database import MOST_ID
+from services.pipeline.database import MAX_ID
 
-DeliveryId = Annotated[int, Path(ge=1, le=MOST_ID)]
+DeliveryId = Annotated[int, Path(ge=1, le=MAX_ID)]
 
 
 class DeliveryPage(Record):
@@ -61,7 +61,7 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
         return deliveries.test(webhook_id, time.time())
 
     @router.get("/{webhook_id}/deliveries")
-    def log(webhook_id: str, limit: Annotated[int, Query(ge=1, le=100)] = 50, before: Annotated[int | None, Query(ge=0, le=MOST_ID)] = None) -> DeliveryPage:
+    def log(webhook_id: str, limit: Annotated[int, Query(ge=1, le=100)] = 50, before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None) -> DeliveryPage:
         """The webhook's deliveries with every try, newest first."""
         found = deliveries.page(webhook_id, limit + 1, before)
         return DeliveryPage(deliveries=found[:limit], next_before=found[limit - 1].id if len(found) > limit else None)

@@ -23,7 +23,7 @@ from services.api.webhooks.webhooks import KEY_PREFIX
 from services.client.errors import WebhookAddressError
 
 PERIOD_S = 0.5
-MOST_AT_ONCE = 16
+MAX_AT_ONCE = 16
 CONNECT_S = 5.0
 TOTAL_S = 10.0
 """From resolving the name to the head of the answer; well below the time that a delivery is claimed for."""
@@ -76,7 +76,7 @@ class WebhookSender:
                     sending = {webhook: task for webhook, task in sending.items() if not task.done()}
                     try:
                         await in_thread(self._deliveries.collect, self._clock())
-                        most = MOST_AT_ONCE - len(sending)
+                        most = MAX_AT_ONCE - len(sending)
                         for claim in await in_thread(self._deliveries.claim, self._clock(), tuple(sending), most) if most else ():
                             sending[claim.webhook] = asyncio.create_task(self._deliver(http, claim))
                     except sql.exc.SQLAlchemyError as problem:

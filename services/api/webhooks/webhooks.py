@@ -20,7 +20,7 @@ from services.core.geometry import Record
 from services.pipeline.database import writing
 from services.pipeline.event_log import event_table
 
-MOST_WEBHOOKS = 100
+MAX_WEBHOOKS = 100
 KEY_PREFIX = "whsec_"
 _SECRET_BYTES = 32
 
@@ -81,8 +81,8 @@ class Webhooks:
         self._policy.check_url(request.url)
         secret = KEY_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
         with writing(self._engine) as connection:
-            if (connection.scalar(sql.select(sql.func.count()).select_from(webhook_table)) or 0) >= MOST_WEBHOOKS:
-                raise JobStateError(f"There are {MOST_WEBHOOKS} webhooks already; delete one first.")
+            if (connection.scalar(sql.select(sql.func.count()).select_from(webhook_table)) or 0) >= MAX_WEBHOOKS:
+                raise JobStateError(f"There are {MAX_WEBHOOKS} webhooks already; delete one first.")
             newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
             row = {"id": f"wh_{secrets.token_hex(8)}", "url": request.url, "states": _states(request.states), "secret": secret, "created_s": time.time()}
             row |= {"active": True, "after_event": newest, "failing_since_s": None, "note": ""}

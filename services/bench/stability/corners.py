@@ -11,7 +11,7 @@ from services.fit.optics.parameters import Medium
 
 SIGMA = (1e-4, 1e4)
 """Extinction, per mm."""
-LEAST_ABSORBED = 1e-7
+MIN_ABSORBED = 1e-7
 """Of 1 - alpha, beside 0 itself."""
 NARROWEST = 1e-4
 """Of 1 - |g|."""
@@ -94,11 +94,11 @@ def draw(count: int, seed: int) -> Corners:
         sigma=pick({"clear": decades(SIGMA[0], 1e-2), "opaque": decades(1e2, SIGMA[1]), "all at an end": one_of(*SIGMA)}, decades(*SIGMA)),
         absorbed=pick(
             {
-                "alpha near 1": np.where(rng.random(count) < 0.3, 0.0, decades(LEAST_ABSORBED, 1e-4)),
+                "alpha near 1": np.where(rng.random(count) < 0.3, 0.0, decades(MIN_ABSORBED, 1e-4)),
                 "alpha near 0": 1 - np.where(rng.random(count) < 0.3, 0.0, decades(1e-7, 1e-2)),
-                "all at an end": one_of(0, LEAST_ABSORBED, 1),
+                "all at an end": one_of(0, MIN_ABSORBED, 1),
             },
-            decades(LEAST_ABSORBED, 1.0),
+            decades(MIN_ABSORBED, 1.0),
         ),
         beta=pick({"unequal lobes": np.abs(one_of(0, 1) - decades(1e-7, 1e-2)), "all at an end": one_of(0, 1, 1e-7)}, rng.random(pair)),
         g1=pick({"g near 1": narrow, "g near 0": weak, "unequal lobes": np.abs(narrow), "all at an end": g_end}, free[0]),

@@ -15,7 +15,7 @@ from services.cli.client.watch import shown_state
 if TYPE_CHECKING:
     from services.client.client import Client
 
-MOST_AT_ONCE = 500
+MAX_AT_ONCE = 500
 """Jobs that a server lists in one answer."""
 
 
@@ -38,7 +38,7 @@ def _list(client: Client, limit: int, only: dict[str, Any]) -> list[dict[str, An
     found: list[dict[str, Any]] = []
     before = None
     while len(found) < limit:
-        page = client.jobs(min(limit - len(found), MOST_AT_ONCE), before, **only)
+        page = client.jobs(min(limit - len(found), MAX_AT_ONCE), before, **only)
         found += page["jobs"]
         if (before := page["next_before"]) is None:
             break

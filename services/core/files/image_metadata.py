@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from services.core.files.image_headers import HEADER_BYTES, PNG_SIGNATURE, exr_parts, tiff_layout
 
-_MOST_PARTS = 250_000
+_MAX_PARTS = 250_000
 _PNG_PLAIN = frozenset(
     b"IHDR PLTE IDAT IEND tRNS cHRM gAMA iCCP sBIT sRGB cICP mDCV cLLI bKGD hIST pHYs sPLT acTL fcTL fdAT".split()  # colours, animation, aspect
 )
@@ -93,7 +93,7 @@ def plain_png(content: bytes) -> bytes:
 
 def _png(stream: BinaryIO) -> Iterator[str]:
     size, place = os.fstat(stream.fileno()).st_size, len(PNG_SIGNATURE)
-    for _ in range(_MOST_PARTS):
+    for _ in range(_MAX_PARTS):
         stream.seek(place)
         head = stream.read(8 + len(_SOFTWARE) + 1)
         if len(head) < 8:
@@ -108,7 +108,7 @@ def _png(stream: BinaryIO) -> Iterator[str]:
             if place < size:
                 yield f"{size - place} bytes after its end"
             return
-    raise ValueError(f"it has more than {_MOST_PARTS} parts")
+    raise ValueError(f"it has more than {_MAX_PARTS} parts")
 
 
 def _tiff(stream: BinaryIO) -> Iterator[str]:
@@ -147,8 +147,8 @@ def _sub_images(stream: BinaryIO, offset: str, entry: bytes) -> list[int]:
 
 
 def _counted(parts: int) -> int:
-    if parts > _MOST_PARTS:
-        raise ValueError(f"it has more than {_MOST_PARTS} directories and entries")
+    if parts > _MAX_PARTS:
+        raise ValueError(f"it has more than {_MAX_PARTS} directories and entries")
     return parts
 
 

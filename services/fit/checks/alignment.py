@@ -21,9 +21,9 @@ from services.fit.inputs.observations import Observations, ViewStack
 
 LOOKED_AT = 0.05
 """Relative image error above which a fit asks for its offset: what is explained better shows no shift that matters."""
-LEAST_MM = 0.5
+MIN_MM = 0.5
 """Least offset that is told, if it is more than a pixel; a registration of scan and photographs is good to about 0.1 mm."""
-LEAST_GAIN = 0.55
+MIN_GAIN = 0.55
 """Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 1 mm gave 0.53 to
 1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the scattering."""
 MIN_Z = 3.0
@@ -31,7 +31,7 @@ MIN_Z = 3.0
 300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
 MIN_SE_MM = 0.01
 """Least ± that is told: what an offset is off by besides noise, such as by its pixels, is more."""
-LEAST_PIXELS = 16
+MIN_PIXELS = 16
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,15 @@ def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64]
         pixels: (N, 2) of the render that are compared.
         pixel_mm: edge of a pixel at the tooth.
     """
-    if len(pixels) < LEAST_PIXELS or not images:
+    if len(pixels) < MIN_PIXELS or not images:
         return None
     found = best_offset(Slide(images, pixels), pixel_mm)
     return None if found is None or not _is_clear(found, pixel_mm) else _in_mm(camera, found, pixel_mm)
 
 
 def _is_clear(found: FoundOffset, pixel_mm: float) -> bool:
-    is_large = found.length_px * pixel_mm > max(LEAST_MM, pixel_mm)
-    return is_large and found.gain >= LEAST_GAIN and found.z >= MIN_Z and np.isfinite(found.length_se_px)
+    is_large = found.length_px * pixel_mm > max(MIN_MM, pixel_mm)
+    return is_large and found.gain >= MIN_GAIN and found.z >= MIN_Z and np.isfinite(found.length_se_px)
 
 
 def _in_mm(camera: str, found: FoundOffset, pixel_mm: float) -> Offset:

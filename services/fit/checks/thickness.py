@@ -13,7 +13,7 @@ from services.core.geometry import Camera, Mesh
 from services.core.records import Estimate
 from services.fit.transport.rays import RayScene, pixel_rays
 
-LEAST_STEP = 0.01
+MIN_STEP = 0.01
 """Least half step of a difference by a blend weight: some micrometres of dentin, far above rounding."""
 
 
@@ -47,7 +47,7 @@ def uncertain_thickness(
         return enamel_thickness_mm(points_mm, Mesh(shape.vertices_mm(tuple(at.tolist())), shape.base.faces))
 
     slopes = np.zeros((len(points_mm), len(weights)))
-    for k, step in enumerate(np.clip(np.sqrt(np.diag(covariance)), LEAST_STEP, None)):
+    for k, step in enumerate(np.clip(np.sqrt(np.diag(covariance)), MIN_STEP, None)):
         low, high = weights.copy(), weights.copy()
         low[k], high[k] = max(weights[k] - step, 0.0), min(weights[k] + step, 1.0)
         slopes[:, k] = (thickness(high) - thickness(low)) / (high[k] - low[k])

@@ -38,9 +38,9 @@ CLOSING_SHARE = 2
 """The closing measurement has so many times fewer paths: it joins what all exact steps know."""
 CLOSING_TRIALS = 2
 """Lengths tried of the step after the closing measurement."""
-CLOSING_LEAST_SHARE = 0.1
+CLOSING_MIN_SHARE = 0.1
 """No step is tried that is shorter than so much of the one before."""
-LEAST_SAMPLES = 4
+MIN_SAMPLES = 4
 """Paths per pixel, however many pixels there are."""
 
 
@@ -92,7 +92,7 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, things:
             break
         # Least on the parabola of slope and comparison (Nocedal and Wright 2006, section 3.5).
         slope = model.slope(step)
-        step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_LEAST_SHARE) * step
+        step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_MIN_SHARE) * step
     return np.zeros(len(x))
 
 
@@ -188,7 +188,7 @@ class Stages(ABC, Generic[Optics]):
 
     def fewer(self, samples: int) -> int:
         """Paths per pixel of full images, for as many in all as ``samples`` are per pixel of coarse ones."""
-        return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), LEAST_SAMPLES)
+        return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), MIN_SAMPLES)
 
     def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int, before: Solution | None = None) -> tuple[Optics, Solution]:
         if problem.jacobian_g != problem.image_g:

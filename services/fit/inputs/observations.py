@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 
 CELL_EDGE = 4
 """Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and noise is not."""
-LEAST_CELLS = 24
+MIN_CELLS = 24
 """Squares are smaller where a view would have about fewer, so that they still tell the comparison's error."""
-LEAST_BLOCKS = 4
-LEAST_BLOCK_PIXELS = 128
+MIN_BLOCKS = 4
+MIN_BLOCK_PIXELS = 128
 COARSE_PIXELS = 600
 """Most pixels of a view, for each of its teeth, in all stages but the last, and while the fit is watched."""
 SEARCH_PIXELS = 210
@@ -306,7 +306,7 @@ def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
     if not len(coarse):
         return np.zeros(len(view.pixels), dtype=np.int32)
     pitch = max(1, int(np.gcd.reduce((coarse - coarse[0]).ravel())))
-    edge = pitch * max(1, min(CELL_EDGE, round(np.sqrt(len(coarse) / LEAST_CELLS))))
+    edge = pitch * max(1, min(CELL_EDGE, round(np.sqrt(len(coarse) / MIN_CELLS))))
     part = np.zeros(len(view.pixels), dtype=np.int64) if view.parts is None else view.parts.shown.astype(np.int64)
     place = np.column_stack([view.pixels // edge, part])
     return np.unique(place, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
@@ -314,7 +314,7 @@ def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
 
 def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
     # Enough blocks for two workers, none too small to fill a kernel, none too large to travel; independent of how many workers there are.
-    wanted = min(-(-LEAST_BLOCKS // views), max(1, len(pixels) // LEAST_BLOCK_PIXELS))
+    wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
     return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
 
 

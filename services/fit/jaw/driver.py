@@ -29,7 +29,7 @@ from services.fit.inputs.observations import (
 )
 from services.fit.jaw.report import JawFit, report
 from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import GUMS_START, LEAST_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
+from services.fit.jaw.starts import GUMS_START, MIN_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
 from services.fit.jaw.views import fitted_pixels, label_views, showing, without
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import SHAPE
@@ -191,7 +191,7 @@ class _ChannelRun:
         gums, views = self.observations.gums, showing(self.channel.views, GUMS)
         if gums is None:
             return None
-        if fitted_pixels(views) < LEAST_TOOTH_PIXELS:
+        if fitted_pixels(views) < MIN_TOOTH_PIXELS:
             self.attempt.log(f"{self.channel.name}: gums show in {fitted_pixels(views)} usable pixels and start from the literature.")
             return GUMS_START
         try:

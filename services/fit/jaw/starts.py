@@ -12,7 +12,7 @@ from services.fit.optics.domain import HELD_G, similar_tissue, to_dual, to_natur
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 
-LEAST_TOOTH_PIXELS = 16
+MIN_TOOTH_PIXELS = 16
 """A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so few."""
 FRONT_PLACES = (1, 2, 3)
 """Incisors and canines, the last digit of their FDI numbers: lit and seen best (teeth 2018, section 7)."""
@@ -43,7 +43,7 @@ class ToothStart:
 
 def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
     """Fit one tooth alone, unless too little of it is seen; what its own data or meshes cause becomes its state."""
-    if pixels < LEAST_TOOTH_PIXELS:
+    if pixels < MIN_TOOTH_PIXELS:
         seen = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
         return ToothStart(fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None)
     try:

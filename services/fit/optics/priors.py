@@ -16,7 +16,7 @@ import numpy as np
 from services.fit.optics.domain import HELD_G, similar_medium, to_dual
 from services.fit.optics.parameters import Medium
 
-LEAST_SD = {"sigma": 0.2, "alpha": 0.1}
+MIN_SD = {"sigma": 0.2, "alpha": 0.1}
 """However well few teeth agree, a prior towards them is no narrower."""
 
 Priors = Mapping[str, tuple[float, float]]
@@ -70,7 +70,7 @@ def towards(part: str, media: Iterable[Medium]) -> Priors:
     """
     seen = [similar_medium(medium, HELD_G) for medium in media]
     priors = {}
-    for leaf, least in LEAST_SD.items():
+    for leaf, least in MIN_SD.items():
         x = np.array([to_dual(leaf, getattr(medium, leaf)) for medium in seen])
         spread = float(x.std(ddof=1)) if len(x) > 1 else 0.0
         priors[f"{part}.{leaf}"] = (float(x.mean()), max(spread, least))

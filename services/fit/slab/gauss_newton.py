@@ -26,7 +26,7 @@ LARGEST_CHANGE = 1.0
 """Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
 TOLERATED_RISE = 2.0
 """Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
-MOST_HALVINGS = 4
+MAX_HALVINGS = 4
 
 
 WORTHWHILE = 2.0
@@ -118,7 +118,7 @@ class GaussNewton:
             return state, True
         paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
-        for halving in range(MOST_HALVINGS + 1):
+        for halving in range(MAX_HALVINGS + 1):
             y = x + change / 2**halving
             equations = self.linearised(material_at(y), paths, self.budget.batches)
             after = equations.misfit + 0.5 * float(y @ prior @ y)

@@ -30,8 +30,8 @@ GRADIENT_ERROR = 0.003
 GRADIENT_FLOOR = 1e-3
 EXIT_FLOOR = 0.1
 """Standard errors of radiances and of rings are relative to the value, or to this fraction of the largest of its kind."""
-MOST_SAMPLES = 4096
-MOST_PATHS = 2**37
+MAX_SAMPLES = 4096
+MAX_PATHS = 2**37
 
 
 class Layer(Record):
@@ -236,7 +236,7 @@ def accumulate(
     from_scores: bool | None = False if border_terms_only or not border else None
     begun_s = time.monotonic()
     samples, missing = FIRST_SAMPLES, math.inf
-    while missing > 1 and sums.samples < MOST_PATHS and time.monotonic() < begun_s + max_seconds:
+    while missing > 1 and sums.samples < MAX_PATHS and time.monotonic() < begun_s + max_seconds:
         start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend, cosine=mu_incident)
         slots, slopes = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
         table = np.stack([faces[:, :2] for faces in (slots, *slopes)], axis=1)
@@ -251,7 +251,7 @@ def accumulate(
         # As many paths as the error asks for, but no pass far beyond the time that is left.
         elapsed_s = time.monotonic() - begun_s
         affordable = sums.samples / LANES * (max_seconds - elapsed_s) / elapsed_s
-        wanted = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MOST_SAMPLES)
+        wanted = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MAX_SAMPLES)
         samples = max(FIRST_SAMPLES, int(wanted))
     return (*names, "c") if border else names, sums
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
 """Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
 HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
-LEAST_SIGNAL = 0.1
+MIN_SIGNAL = 0.1
 """Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
 LARGEST_SHARE = 0.1
 """Standard error, as a share of the value, up to which a value of the phase function is determined."""
@@ -66,7 +66,7 @@ def _covariance(solution: Solution, prior: Array) -> Array:
     signals, vectors = linalg.eigh(solution.quadratic.matrix, reference)
     # With vectors V, V^T reference V = 1, so that matrix = reference V signals V^T reference.
     told = reference @ vectors
-    curvature = (told * np.where(signals > LEAST_SIGNAL, signals, 0)) @ told.T
+    curvature = (told * np.where(signals > MIN_SIGNAL, signals, 0)) @ told.T
     return np.asarray(np.linalg.inv(curvature + prior + ridge))
 
 

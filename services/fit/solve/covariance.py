@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 NOISE_FACTOR = 3.0
 """An eigenvalue below so many of its own standard deviations is not told from zero."""
-LEAST_DATA_SHARE = 0.5
+MIN_DATA_SHARE = 0.5
 """A parameter is determined where data, not prior, give at least this part of the information."""
 
 
@@ -97,7 +97,7 @@ class Uncertainty:
         # a'C Lambda C a / a'C a is the prior's share of the information: lambda / (d + lambda) for one coordinate.
         seen = self.posterior @ slope
         prior_share = float((precision * seen) @ seen) / max(float(slope @ seen), 1e-300)
-        return along_open < 0.1 * size and float((scaled[on_bound] ** 2).sum()) < 0.1 * size and prior_share < 1 - LEAST_DATA_SHARE
+        return along_open < 0.1 * size and float((scaled[on_bound] ** 2).sum()) < 0.1 * size and prior_share < 1 - MIN_DATA_SHARE
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ FLOOR = 0.1
 CAUCHY = 2.385
 """Tuning constant: 95 % of least squares' efficiency under Gaussian noise (Holland and Welsch 1977)."""
 MEDIAN_OF_NORMAL = 0.6745
-LEAST_RESIDUAL = 0.1
+MIN_RESIDUAL = 0.1
 """Residuals of l1 count as at least this share of their own standard deviation."""
 
 
@@ -64,7 +64,7 @@ def weights(loss: Loss, reference: Array, variance: Array, residual: Array, resi
         deviation = residual / spread
         scale = max(float(np.median(np.abs(deviation))) / MEDIAN_OF_NORMAL, 1e-12)
         return _scaled(1 / (1 + (deviation / (CAUCHY * scale)) ** 2), variance)
-    size = np.maximum(np.abs(residual), LEAST_RESIDUAL * spread)
+    size = np.maximum(np.abs(residual), MIN_RESIDUAL * spread)
     return _scaled(1 / size if loss == "l1" else 1 / (size * _floored(reference)), variance)
 
 

@@ -50,7 +50,7 @@ START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
 """Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise asks."""
-LEAST_EXACT_SAMPLES = 32
+MIN_EXACT_SAMPLES = 32
 """With fewer, where the limit allows them, comparisons of full images decide little: a large stack takes longer from 11 to its 21 than at 21 alone."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
@@ -126,7 +126,7 @@ class ChannelSchedule(Stages[Tissue]):
             tissue, before = self._iterate(problem, options, reached)
 
         options = self.at_full_resolution()
-        exact_samples = max(self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))), LEAST_EXACT_SAMPLES)
+        exact_samples = max(self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))), MIN_EXACT_SAMPLES)
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         is_same = self.files.full.blocks == self.files.coarse.blocks and not is_reweighted(spec.loss)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.paths.until import MOST_SAMPLES, Effort, Sums, trace_until
+from services.fit.transport.paths.until import MAX_SAMPLES, Effort, Sums, trace_until
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.checks import require_cotangent, require_finite, require_finite_gradient, require_lights, require_surfaces, require_view
 from services.fit.transport.scene.names import media_of, parameter_names, whitened
@@ -73,7 +73,7 @@ class Engine:
         samples: int | None = None,
         rel_error: float | None = None,
         max_seconds: float = 600.0,
-        max_samples: int = MOST_SAMPLES,
+        max_samples: int = MAX_SAMPLES,
         batches: int = 16,
     ) -> StackEstimate:
         """Radiance of ``view``'s pixels under each light.
@@ -109,7 +109,7 @@ class Engine:
         samples: int | None = None,
         rel_error: float | None = None,
         max_seconds: float = 600.0,
-        max_samples: int = MOST_SAMPLES,
+        max_samples: int = MAX_SAMPLES,
         batches: int = 4,
     ) -> JacobianEstimate:
         """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).

@@ -10,8 +10,8 @@ import type { FolderFile } from "./folder";
 import { inUploadLane } from "./lanes";
 
 const BLOCK_BYTES = 4 * 2 ** 20;
-const LEAST_WAIT_MS = 500;
-const MOST_WAIT_MS = 8000;
+const MIN_WAIT_MS = 500;
+const MAX_WAIT_MS = 8000;
 /** How long one file is tried without any of its bytes arriving. */
 const PATIENCE_MS = 5 * 60_000;
 const TUS = { "Tus-Resumable": "1.0.0" };
@@ -122,7 +122,7 @@ async function offsetAfter(method: string, path: string, headers: Record<string,
 /** Take a step again while what keeps it may pass, at growing intervals. */
 async function patiently<T>(step: () => Promise<T>): Promise<T> {
   const until = Date.now() + PATIENCE_MS;
-  for (let wait = LEAST_WAIT_MS; ; wait = Math.min(2 * wait, MOST_WAIT_MS)) {
+  for (let wait = MIN_WAIT_MS; ; wait = Math.min(2 * wait, MAX_WAIT_MS)) {
     try {
       return await step();
     } catch (problem) {

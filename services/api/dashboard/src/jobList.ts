@@ -6,7 +6,7 @@ import { badgeOf, when } from "./format";
 
 const PAGE = 50;
 /** The server lists no more at once; what lies below is not asked for again. */
-const MOST = 500;
+const MAX_LISTED = 500;
 
 export class JobList {
   private readonly items = element("ul");
@@ -35,7 +35,7 @@ export class JobList {
 
   /** Load what is shown again, as older jobs change too; returns the newest one's id. */
   async refresh(): Promise<string | null> {
-    const { jobs, next_before: last } = await listJobs(this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MOST) : PAGE);
+    const { jobs, next_before: last } = await listJobs(this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MAX_LISTED) : PAGE);
     const joint = this.jobs.findIndex((job) => job.number === last);
     const below = this.showsOlder && joint >= 0 ? this.jobs.slice(joint + 1) : [];
     if (!below.length) this.more.hidden = last === null;

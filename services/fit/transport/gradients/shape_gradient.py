@@ -20,7 +20,7 @@ LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
 """Numbers in a table of light by pixel, about 200 MB; more pixels are done in turn."""
-MOST_LANES_PER_GROUP = 64
+MAX_LANES_PER_GROUP = 64
 
 
 class ShapeGradients:
@@ -54,7 +54,7 @@ class ShapeGradients:
 
     def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int) -> NDArray[np.float32]:
         per_group = -(-photons // LIGHT_BATCHES)
-        lanes = min(MOST_LANES_PER_GROUP, per_group)
+        lanes = min(MAX_LANES_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]
         start = LightStart(positions, intensities, self.recipe.vertices_mm(), LIGHT_BATCHES, lanes, seed)
         return LightWalk(self.geometry, media, start, texels, order, self.ior).gather(-(-per_group // lanes))

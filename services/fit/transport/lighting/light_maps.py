@@ -116,7 +116,7 @@ class LightMaps:
 
     WORDS = 2
     """Of 32 bits per grid point."""
-    MOST_BYTES = 2**29
+    MAX_BYTES = 2**29
     """Of all maps; larger scenes under more lights have a coarser grid."""
 
     def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]) -> None:
@@ -128,7 +128,7 @@ class LightMaps:
         # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the map is not certain.
         half_mm = float((radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max())
         self.count = len(positions_mm)
-        self.texel_mm = max(TEXEL_MM, 2 * half_mm / math.sqrt(self.MOST_BYTES / (4 * self.WORDS * self.count)))
+        self.texel_mm = max(TEXEL_MM, 2 * half_mm / math.sqrt(self.MAX_BYTES / (4 * self.WORDS * self.count)))
         self.size = 2 * int(np.ceil(half_mm / self.texel_mm)) + 3
 
         helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

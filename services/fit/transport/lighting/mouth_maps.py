@@ -26,7 +26,7 @@ class MouthMaps(LightMaps):
     """One depth map per light of several teeth, gums or a wall."""
 
     WORDS = 3
-    MOST_BYTES = 2**26
+    MAX_BYTES = 2**26
 
     def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
         """Fill the maps for surfaces as they now are."""

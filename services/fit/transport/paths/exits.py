@@ -19,7 +19,7 @@ from services.fit.transport.paths.walker import Walker
 from services.fit.transport.scene.geometry import Hit, SlabGeometry
 from services.fit.transport.scene.media import Media, PhaseFunction
 
-LEAST_RATE = 1e-6
+MIN_RATE = 1e-6
 """Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand is constant."""
 
 
@@ -65,7 +65,7 @@ class Exits:
             for side, sign in enumerate((-1, 1)):
                 # Collisions come at rate exp(-depth flown), and their light gets out by exp(-depth to the face / cosine).
                 rate = 1 + (-sign / inside) * omega.z
-                size = dr.maximum(dr.abs(rate), LEAST_RATE)
+                size = dr.maximum(dr.abs(rate), MIN_RATE)
                 brightest = dr.select(rate > 0, begin[side] / inside, end[side] / inside + flown)
                 chance = dr.exp(-brightest) * one_minus_exp(size * flown) / size
                 sent.append(chance * phase.density(omega, mi.Vector3f(across.x * sine, across.y * sine, sign * inside)))

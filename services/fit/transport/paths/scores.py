@@ -12,7 +12,7 @@ from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.scene.media import Media, Mixed, Score
 
 NEARLY_ONE = 1 - 2.0**-24
-MOST_COUNTED = 3
+MAX_COUNTED = 3
 """Media of which each keeps a count of its own scatterings."""
 
 
@@ -68,7 +68,7 @@ class Scores:
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
         # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
         self.mixing = mixing
-        self.counts_all = media.count <= MOST_COUNTED and not mixing
+        self.counts_all = media.count <= MAX_COUNTED and not mixing
         asked = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
         self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(asked))
 

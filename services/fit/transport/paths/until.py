@@ -18,11 +18,11 @@ FIRST_ROUND = 4
 """Paths per batch in the first round."""
 GROWTH = 4.0
 """A round makes all paths so far at most this many times more: an early estimate of the error is not trusted further."""
-LEAST_GROWTH = 1.25
+MIN_GROWTH = 1.25
 """And at least this: every look at the error is a chance to stop on one that is too small by luck."""
 SAFETY = 1.05
 """More paths than the error so far asks for."""
-MOST_SAMPLES = 2**31
+MAX_SAMPLES = 2**31
 """Paths per pixel that sample numbers of 32 bits tell apart, with room to spare."""
 
 Sums = list[NDArray[np.float64]]
@@ -41,7 +41,7 @@ class Effort:
     samples: int | None = None
     rel_error: float | None = None
     max_seconds: float = math.inf
-    max_samples: int = MOST_SAMPLES
+    max_samples: int = MAX_SAMPLES
     batches: int = 16
 
     def __post_init__(self) -> None:
@@ -55,10 +55,10 @@ class Effort:
             raise InputError(f"rel_error = {self.rel_error:g} must lie between 0 and 1; 0.01 is usual.")
         if self.batches < 2:
             raise InputError(f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between batches.")
-        if not self.max_seconds >= 0 or not self.batches <= self.max_samples <= MOST_SAMPLES:
+        if not self.max_seconds >= 0 or not self.batches <= self.max_samples <= MAX_SAMPLES:
             raise InputError(
                 f"max_seconds = {self.max_seconds:g} must not be negative, and max_samples = {self.max_samples} must lie in "
-                f"batches = {self.batches} to {MOST_SAMPLES}; correct the limits."
+                f"batches = {self.batches} to {MAX_SAMPLES}; correct the limits."
             )
 
     def shares(self, samples: int) -> tuple[int, int]:
@@ -97,7 +97,7 @@ def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums],
         elapsed_s = time.monotonic() - begun_s
         if done >= most or elapsed_s >= effort.max_seconds:
             return estimate
-        wanted = done * (np.clip(SAFETY * missing, LEAST_GROWTH, GROWTH) - 1)
+        wanted = done * (np.clip(SAFETY * missing, MIN_GROWTH, GROWTH) - 1)
         affordable = done * (effort.max_seconds - elapsed_s) / elapsed_s
         following = max(1, min(math.ceil(min(wanted, affordable)), most - done))
 

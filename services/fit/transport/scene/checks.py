@@ -12,7 +12,7 @@ FARTHEST_MM = 1e12
 """A million kilometres; farther away, squares of distances leave what single precision holds."""
 INTENSITIES = (1e-30, 1e30)
 """Likewise."""
-MOST_TEETH = 15
+MAX_TEETH = 15
 """A place in the scene is 32 bits: two for each tooth, one for gums."""
 
 
@@ -48,8 +48,8 @@ def require_surfaces(recipe: SceneRecipe) -> None:
     Raises:
         MeshError: names the surface. InputError: no tooth, or too many.
     """
-    if not 0 < len(recipe.teeth) <= MOST_TEETH:
-        raise InputError(f"The scene has {len(recipe.teeth)} teeth; give 1 to {MOST_TEETH}.")
+    if not 0 < len(recipe.teeth) <= MAX_TEETH:
+        raise InputError(f"The scene has {len(recipe.teeth)} teeth; give 1 to {MAX_TEETH}.")
     for number, tooth in enumerate(recipe.teeth):
         which = "" if len(recipe.teeth) == 1 else f" of tooth {number}"
         tooth.outer.require_solid(f"outer surface{which}")

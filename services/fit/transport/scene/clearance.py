@@ -18,7 +18,7 @@ from scipy import ndimage
 from services.core.geometry import Mesh
 
 CELL_MM = 0.1
-MOST_CELLS = 6_000_000
+MAX_CELLS = 6_000_000
 """Larger scenes have larger cells."""
 SPACING_PER_CELL = 0.3
 """Surfaces are sampled so densely that no surface point is farther than this from a sample, over the size of a cell."""
@@ -58,7 +58,7 @@ class Clearance:
         """Take the surfaces that never move, and the solids' vertices (V, 3) where not all of those bound one."""
         solids_mm = outer_vertices_mm if solids_mm is None else solids_mm
         low, extent = solids_mm.min(axis=0), np.ptp(solids_mm, axis=0)
-        self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MOST_CELLS)))
+        self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
         self._shape = np.ceil(extent / self._cell_mm).astype(int) + 1
         self._corner = low
         self._outer = self._distance(outer_vertices_mm, outer_faces, self._window(None))

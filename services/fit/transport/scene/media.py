@@ -16,7 +16,7 @@ from services.fit.optics.parameters import Medium
 from services.fit.transport.scene.tables import PhaseTables
 
 LOBE_FIELDS = frozenset({"beta", "g1", "g2"})
-MOST_SELECTED = 3
+MAX_SELECTED = 3
 """Values of more media than this are gathered from a table."""
 
 
@@ -97,7 +97,7 @@ class Media:
         self.g1 = opaque(lambda m: m.g1)
         self.g2 = opaque(lambda m: m.g2)
         self._tables: dict[int, mi.Float] = {}
-        if self.count > MOST_SELECTED:
+        if self.count > MAX_SELECTED:
             columns = (self.sigma, self.sigma_s, self.log_alpha, self.absorbed, self.beta, self.g1, self.g2)
             self._tables = {id(column): dr.concat(column) for column in columns}
             dr.eval(self._tables)

@@ -17,7 +17,7 @@ from services.core.geometry import Mesh
 WIDTHS_PER_SCALE = 8.0
 """The border's width over s: l goes from 2 % to 98 % across it."""
 PITCH_MM = 0.15
-MOST_CELLS = 8_000_000
+MAX_CELLS = 8_000_000
 MARGIN_WIDTHS = 1.5
 """How far the grid reaches beyond the dentin, in widths; there l is 1 within 1e-5."""
 ON_SURFACE_MM = 1e-6
@@ -36,7 +36,7 @@ class MixedBorder:
         """Measure distances to the surface at its present place, whose vertices its modes (M, V, 3) displace."""
         margin = MARGIN_WIDTHS * self.width_mm
         extent = np.ptp(dentin.vertices_mm, axis=0) + 2 * margin
-        pitch = max(PITCH_MM, float(np.cbrt(extent.prod() / MOST_CELLS)))
+        pitch = max(PITCH_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
         grid = SignedDistanceGrid(dentin, pitch, margin)
         low, high = grid.bounds_mm
         self._low, self._inverse_pitch = dr.opaque(mi.Point3f, low.tolist()), dr.opaque(mi.Float, 1 / pitch)

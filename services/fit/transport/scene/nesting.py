@@ -12,7 +12,7 @@ from services.anatomy.distance import SurfaceDistance
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
-MOST_CHECKED = 64
+MAX_CHECKED = 64
 
 
 def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
@@ -27,7 +27,7 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
     above = np.einsum("ij,ij->i", points - nearest, np.cross(b - a, c - a)) > 0
     # Where the nearest point is a corner a face's normal can mislead; the winding number cannot.
     suspects = np.flatnonzero(above)
-    suspects = suspects[np.argsort(distance[suspects])[::-1][:MOST_CHECKED]]
+    suspects = suspects[np.argsort(distance[suspects])[::-1][:MAX_CHECKED]]
     outside = suspects[winding_number(outer, points[suspects]) < 0.5]
     if len(outside):
         raise MeshError(

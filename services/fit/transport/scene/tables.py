@@ -15,7 +15,7 @@ from services.fit.optics.phase_table import PhaseTable
 ISOTROPIC = PhaseTable((0.0, np.pi), (1.0, 1.0))
 """Stands where a medium has no table."""
 BELOW_ONE = 1 - 2.0**-24
-LEAST_WIDTH = 1e-30
+MIN_WIDTH = 1e-30
 """Nodes may fall together in single precision."""
 
 
@@ -49,7 +49,7 @@ class PhaseTables:
         m = phase.deviation(sign, omega, omega_out)
         node = self._last_not_above(self._deviations, self._half(medium, sign < 0), m)
         (m0, m1), (p0, p1) = self._ends(self._deviations, node), self._ends(self._values, node)
-        return dr.lerp(p0, p1, dr.clip((m - m0) / dr.maximum(m1 - m0, LEAST_WIDTH), 0, 1))
+        return dr.lerp(p0, p1, dr.clip((m - m0) / dr.maximum(m1 - m0, MIN_WIDTH), 0, 1))
 
     def sample(self, medium: mi.UInt32, omega: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Vector3f:
         """Direction distributed as the table, by its inverse distribution function."""

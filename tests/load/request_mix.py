@@ -28,7 +28,7 @@ class Ask:
     statuses: tuple[int, ...] = (200,)
 
 
-class Mix:
+class RequestMix:
     """Draws requests over a library; what is new in it is named by ``prefix``, so that no two mixes submit the same job."""
 
     def __init__(self, library: Library, rng: random.Random, prefix: str) -> None:

@@ -17,10 +17,10 @@ from services.api.masks.images import picture_of
 from services.api.presets import list_presets
 from services.client.tus import CHUNK_TYPE, format_metadata
 from services.core.geometry import Camera
-from tests.contracts.witnesses import Witnesses
+from tests.contracts.kept_data import KeptData
 from tests.support.uploading import CAMERA, TUS, checksum, manifest_of
 
-MOST = 200
+MAX_KEPT = 200
 """Newest things that are named again."""
 SPARED = 3
 """Newest things of a kind that are not deleted yet."""
@@ -42,10 +42,10 @@ def content_of(choice: int) -> bytes:
     return json.dumps(_UNITS | {"lights": [light]}).encode() + b" " * (choice % 5000)
 
 
-class Living:
+class ExistingIds:
     """Parameters of paths that exist on the server. Those of the witnesses are not deleted."""
 
-    def __init__(self, witnesses: Witnesses, data: Path, mouth: Path) -> None:
+    def __init__(self, witnesses: KeptData, data: Path, mouth: Path) -> None:
         self._jobs, self._mouth, self._job_count = data / "jobs", mouth, 0
         job, capture = {"job_id": witnesses.job["id"]}, {"capture": witnesses.capture["id"]}
         self._kept: list[dict[str, Any]] = [job, capture, *(job | {"path": path} for path in witnesses.artifacts)]
@@ -106,7 +106,7 @@ class Living:
             return
         if case.method.upper() == "DELETE":
             self._made = [one for one in self._made if not case.path_parameters.items() <= one.items()]
-            self._deleted = [*self._deleted[-MOST:], case.path_parameters]
+            self._deleted = [*self._deleted[-MAX_KEPT:], case.path_parameters]
             if "number" not in case.path_parameters:
                 self._contents.pop(case.path_parameters.get("capture", ""), None)
         if case.method.upper() != "POST":
@@ -122,7 +122,7 @@ class Living:
                 self._contents[made] = content_of(response.json()["bytes"] - len(content_of(0)))
         elif case.path == "/v1/webhooks/{webhook_id}/test":
             self._made.append(case.path_parameters | {"delivery_id": response.json()["id"]})
-        self._made = self._made[-MOST:]
+        self._made = self._made[-MAX_KEPT:]
 
     def release(self) -> None:
         """Let the jobs go on that wait."""

@@ -13,7 +13,7 @@ from tests.support.uploading import announce, contents_of, send, write_capture
 
 
 @dataclass(frozen=True)
-class Witnesses:
+class KeptData:
     """All that the server tells of one capture and one job, and what lies on its disk of the capture."""
 
     capture: dict[str, Any]
@@ -24,7 +24,7 @@ class Witnesses:
     previews: list[int]
 
     @classmethod
-    def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> Witnesses:
+    def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> KeptData:
         """What is there now."""
         paths = [file["path"] for file in client.get(f"/v1/jobs/{job}/artifacts").raise_for_status().json()]
         return cls(
@@ -39,21 +39,21 @@ class Witnesses:
     def losses(self, client: httpx.Client, data: Path) -> list[str]:
         """What is gone or different now."""
         try:
-            now = Witnesses.of(client, data, self.capture["id"], self.job["id"])
+            now = KeptData.of(client, data, self.capture["id"], self.job["id"])
         except httpx.HTTPError as problem:
             return [f"the witnesses cannot be read: {problem}"]
         of = ("capture", "contents", "job", "artifacts", "events", "previews")
         return [f"{name} of the witnesses changed" for name in of if getattr(now, name) != getattr(self, name)]
 
 
-def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> Witnesses:
+def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> KeptData:
     """Upload a capture and run a job on it."""
     contents = contents_of(write_capture(folder))
     capture = announce(client, contents)["id"]
     for path, content in contents.items():
         send(client, capture, path, content).raise_for_status()
     client.post(f"/v1/captures/{capture}/commit").raise_for_status()
-    return Witnesses.of(client, data, capture, finish_job(client, f"captures/{capture}"))
+    return KeptData.of(client, data, capture, finish_job(client, f"captures/{capture}"))
 
 
 def finish_job(client: httpx.Client, capture: str) -> str:

@@ -1,0 +1,72 @@
+"""Every name that is written as text leads somewhere, and modules import each other in one direction."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NAME = re.compile(r"services(\.\w+)+(:\w+)?")
+MAX_SIDE_BY_SIDE = 20
+FILES_PAST = 400
+
+
+def sources(*folders: str) -> Iterator[Path]:
+    return (path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")) if "node_modules" not in path.parts)
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def named_in_text() -> list[str]:
+    """What strings of the code name: modules to import, functions to call, and attributes that tests replace."""
+    trees = (ast.parse(path.read_text()) for path in sources("services", "tests"))
+    texts = (node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    return sorted({text for text in texts if NAME.fullmatch(text)})
+
+
+@pytest.mark.parametrize("name", named_in_text())
+def test_a_name_in_text_leads_somewhere(name: str) -> None:
+    parts = re.split(r"[.:]", name)
+    for length in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError as problem:
+            assert (problem.name or "").startswith("services"), problem
+            continue
+        for attribute in parts[length:]:
+            found = getattr(found, attribute, None) or getattr(__builtins__, attribute, None) or vars(__import__("builtins"))[attribute]
+        return
+    raise AssertionError(f"Nothing is called {name}.")
+
+
+def test_no_module_reaches_itself_by_its_imports() -> None:
+    """Neither by those inside functions nor by those for type checking."""
+    paths = {module_of(path): path for path in sources("services")}
+    graph: dict[str, set[str]] = {}
+    for module, path in paths.items():
+        imported = set[str]()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {name.name for name in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                below = {f"{node.module}.{name.name}" for name in node.names}
+                imported |= below & paths.keys() or {node.module}
+        graph[module] = imported & paths.keys()
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as circle:
+        pytest.fail(" imports ".join(circle.args[1]))
+
+
+def test_no_folder_is_so_full_that_a_file_cannot_be_found() -> None:
+    counts = {folder: len(list(folder.glob("*.py"))) for folder in {path.parent for path in sources("services")}}
+    assert not {str(folder.relative_to(ROOT)): count for folder, count in counts.items() if count > MAX_SIDE_BY_SIDE}
