@@ -12,8 +12,8 @@ import math
 import numpy as np
 import pytest
 
-from services.fit.slab.dictionary import henyey_greenstein
-from services.fit.slab.forward import render
+from services.fit.slab.model.dictionary import henyey_greenstein
+from services.fit.slab.model.forward import render
 from services.fit.transport.platform import prepare_device
 from tests.support.small_slab import small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal

@@ -18,11 +18,11 @@ from services.core.settings import job_from_tree
 from services.core.slab_folder import SlabFolder
 from services.core.stage import CANCEL_FLAG, LocalContext
 from services.core.store import open_stage
-from services.fit.slab.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
-from services.fit.slab.forward import render
-from services.fit.slab.rig import rig_of
+from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
+from services.fit.slab.model.forward import render
+from services.fit.slab.model.rig import rig_of
+from services.fit.slab.results.tabphase import tabphase_values
 from services.fit.slab.stage import CHECKPOINT, export, run
-from services.fit.slab.tabphase import tabphase_values
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
 from tests.support.small_slab import description, write_folder

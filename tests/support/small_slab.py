@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from services.core.slab_folder import SlabFolder
-from services.fit.slab.rig import Rig, rig_of
+from services.fit.slab.model.rig import Rig, rig_of
 
 WAVELENGTH_NM = 532.0
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab_folder import Beam, PixelGrid
-from services.fit.slab.dictionary import Material
+from services.fit.slab.model.dictionary import Material
 
 Array = NDArray[np.float64]
 

@@ -14,15 +14,15 @@ from services.core.geometry import Record
 from services.core.slab_folder import SlabFolder, read_folder
 from services.core.store import write_atomic
 from services.fit.slab.diagnosis import sample_faults
-from services.fit.slab.dictionary import Material
-from services.fit.slab.forward import Blocks, render
-from services.fit.slab.gauss_newton import Budget, GaussNewton
 from services.fit.slab.images import Measurements, read_images
-from services.fit.slab.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
-from services.fit.slab.rig import Rig, rig_of
-from services.fit.slab.start import start
+from services.fit.slab.model.dictionary import Material
+from services.fit.slab.model.forward import Blocks, render
+from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.start import start
+from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
-from services.fit.slab.uncertainty import uncertainty_of
 
 LAST_LOOK = 2**30
 """Number of the render, counted apart from the solver's, that errors are taken from."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.slab_folder import SlabFolder, SlabImage
 from services.fit.slab.diagnosis import grid_faults, image_faults
-from services.fit.slab.rig import Grid, grid_of
+from services.fit.slab.model.rig import Grid, grid_of
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from services.core.verdict import VERDICT
 
 if TYPE_CHECKING:
     from services.fit.slab.fit import SlabOptions
-    from services.fit.slab.forward import Block, BlockSums
-    from services.fit.slab.result import SlabReport
+    from services.fit.slab.model.forward import Block, BlockSums
+    from services.fit.slab.results.result import SlabReport
 
 CHECKPOINT = "fit-checkpoint"
 """Below the job's folder: one folder for every wavelength that is done, so that a new attempt goes on after them."""
@@ -33,8 +33,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     from services.fit.execution.executors import executor
     from services.fit.slab.fit import SlabOptions
     from services.fit.slab.images import read_images
-    from services.fit.slab.kept import IMAGES, read_kept
-    from services.fit.slab.result import SlabReport
+    from services.fit.slab.results.kept import IMAGES, read_kept
+    from services.fit.slab.results.result import SlabReport
     from services.fit.slab.through_beam import index_of
 
     context.report(StageEvent(stage="fit", kind="started"))
@@ -74,7 +74,7 @@ def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions,
     """
     from services.fit.slab.fit import fit_images
     from services.fit.slab.images import read_images
-    from services.fit.slab.kept import fingerprint, keep, read_kept
+    from services.fit.slab.results.kept import fingerprint, keep, read_kept
 
     mark = fingerprint(root, wavelength_nm, options)
     kept = read_kept(place)
@@ -92,10 +92,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         StoreError: the fit is missing or damaged. CaptureInputError: the folder is gone.
     """
     from services.fit.slab.fit import write_results
-    from services.fit.slab.kept import read_images_of
-    from services.fit.slab.report import write_report
-    from services.fit.slab.result import SlabReport
-    from services.fit.slab.tabphase import scene_xml, values_text
+    from services.fit.slab.results.kept import read_images_of
+    from services.fit.slab.results.report import write_report
+    from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.results.tabphase import scene_xml, values_text
 
     context.report(StageEvent(stage="export", kind="started"))
     context.raise_if_cancelled()

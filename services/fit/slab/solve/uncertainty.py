@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from services.fit.slab.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
-from services.fit.slab.gauss_newton import Solution
-from services.fit.slab.normal import UNKNOWNS
-from services.fit.slab.prior import RIDGE, precision
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
+from services.fit.slab.solve.gauss_newton import Solution
+from services.fit.slab.solve.normal import UNKNOWNS
+from services.fit.slab.solve.prior import RIDGE, precision
 
 Array = NDArray[np.float64]
 

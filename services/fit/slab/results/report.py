@@ -14,9 +14,9 @@ from services.core.store import write_atomic
 from services.core.verdict import percent
 from services.fit.export.pictures import DIVERGING, data_uri, enlarge, signed_map, tone_map, white_level
 from services.fit.export.report import cell, gradient, page_template
-from services.fit.slab.chart import phase_chart
-from services.fit.slab.kept import Images
-from services.fit.slab.result import Quantity, SlabFit, SlabReport
+from services.fit.slab.results.chart import phase_chart
+from services.fit.slab.results.kept import Images
+from services.fit.slab.results.result import Quantity, SlabFit, SlabReport
 
 LABELS = {
     "sigma_t": "extinction σt",

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.slab.dictionary import KNOTS, Material
-from services.fit.slab.interface import Interface
-from services.fit.slab.rig import Rig, Views
-from services.fit.slab.single import single_scattering
-from services.fit.slab.tables import tables_of
+from services.fit.slab.model.dictionary import KNOTS, Material
+from services.fit.slab.model.interface import Interface
+from services.fit.slab.model.rig import Rig, Views
+from services.fit.slab.model.single import single_scattering
+from services.fit.slab.model.tables import tables_of
 
 Array = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ class Batches:
 
 def run_block(block: Block) -> BlockSums:
     """Trace one block."""
-    from services.fit.slab.streams import block_key
-    from services.fit.slab.walk import trace
+    from services.fit.slab.model.streams import block_key
+    from services.fit.slab.model.walk import trace
 
     rig, views = block.rig, block.rig.lights[block.light]
     images = np.zeros((len(views.images), rig.grid.pixels))

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import KNOTS, SPACING_RAD
-from services.fit.slab.normal import UNKNOWNS
+from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD
+from services.fit.slab.solve.normal import UNKNOWNS
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab_folder import Cell, Light, PixelGrid, SlabCamera, SlabFolder
-from services.fit.slab.interface import Interface
+from services.fit.slab.model.interface import Interface
 
 Array = NDArray[np.float64]
 

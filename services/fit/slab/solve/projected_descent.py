@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import KNOTS, LARGEST_EXTINCTION_PER_MM, Material, mixture, tent_solid_angles
-from services.fit.slab.forward import Blocks, render
 from services.fit.slab.images import Measurements
-from services.fit.slab.rig import Rig
+from services.fit.slab.model.dictionary import KNOTS, LARGEST_EXTINCTION_PER_MM, Material, mixture, tent_solid_angles
+from services.fit.slab.model.forward import Blocks, render
+from services.fit.slab.model.rig import Rig
 
 Array = NDArray[np.float64]
 

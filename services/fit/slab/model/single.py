@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from services.fit.slab.dictionary import KNOTS, SPACING_RAD, Material
-from services.fit.slab.interface import Interface
-from services.fit.slab.rig import Beam, Grid, Rig, Views
+from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD, Material
+from services.fit.slab.model.interface import Interface
+from services.fit.slab.model.rig import Beam, Grid, Rig, Views
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from pydantic import Field
 from services.core.geometry import Record
 from services.core.records import FitReport, Verdict
 from services.core.verdict import verdict_of
-from services.fit.slab.dictionary import ANGLES_RAD, Material
+from services.fit.slab.model.dictionary import ANGLES_RAD, Material
+from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 from services.fit.slab.through_beam import Index
-from services.fit.slab.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 
 
 class Quantity(Record):

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import KNOTS, Material, henyey_greenstein, hg_values
-from services.fit.slab.forward import Blocks, render
 from services.fit.slab.images import Measurements
-from services.fit.slab.normal import normal_equations, smoothed_variance
-from services.fit.slab.rig import Rig
+from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein, hg_values
+from services.fit.slab.model.forward import Blocks, render
+from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.normal import normal_equations, smoothed_variance
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import KNOTS, Material
-from services.fit.slab.forward import Blocks, render
 from services.fit.slab.images import Measurements
-from services.fit.slab.normal import NormalEquations, normal_equations, smoothed_variance
-from services.fit.slab.prior import Quadratic, precision, scales_for
-from services.fit.slab.rig import Rig
+from services.fit.slab.model.dictionary import KNOTS, Material
+from services.fit.slab.model.forward import Blocks, render
+from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.normal import NormalEquations, normal_equations, smoothed_variance
+from services.fit.slab.solve.prior import Quadratic, precision, scales_for
 
 Array = NDArray[np.float64]
 

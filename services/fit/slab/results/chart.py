@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from html import escape
 
-from services.fit.slab.result import PhaseFunction
+from services.fit.slab.results.result import PhaseFunction
 
 WIDTH, HEIGHT = 640, 300
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 40

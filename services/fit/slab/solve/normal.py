@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import KNOTS, Material, tent_solid_angles
-from services.fit.slab.forward import Batches
+from services.fit.slab.model.dictionary import KNOTS, Material, tent_solid_angles
+from services.fit.slab.model.forward import Batches
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numba import njit
 
-from services.fit.slab.dictionary import KNOTS, SPACING_RAD
-from services.fit.slab.streams import path_state, uniform
-from services.fit.slab.tables import GUIDE
+from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD
+from services.fit.slab.model.streams import path_state, uniform
+from services.fit.slab.model.tables import GUIDE
 
 MAX_SCATTERS = 8192
 """A path ends there; what it still carries is reported."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.dictionary import ANGLES_RAD, KNOTS, Material
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
 
 Array = NDArray[np.float64]
 

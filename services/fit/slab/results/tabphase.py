@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab_folder import Cell
-from services.fit.slab.dictionary import ANGLES_RAD
-from services.fit.slab.result import SlabFit
+from services.fit.slab.model.dictionary import ANGLES_RAD
+from services.fit.slab.results.result import SlabFit
 
 COSINES = 20_001
 """Nodes of the table, at equal steps of the cosine: at the forward peak they are then 0.6 degrees apart, less than the

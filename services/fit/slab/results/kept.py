@@ -16,7 +16,7 @@ from services.core.slab_folder import read_folder
 from services.core.store import write_atomic, write_record
 from services.fit.execution.numerics import numerics_name
 from services.fit.slab.fit import SlabOptions, Wavelength
-from services.fit.slab.result import SlabFit
+from services.fit.slab.results.result import SlabFit
 
 RESULT, IMAGES = "fit.json", "images.npz"
 

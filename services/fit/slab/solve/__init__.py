@@ -1,0 +1,1 @@
+"""The inverse: normal equations of independent batches, Gauss-Newton, the prior, the ±."""
