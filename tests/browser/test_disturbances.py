@@ -128,10 +128,12 @@ def test_a_late_answer_leaves_the_view_that_was_opened_since(page: Page, is_refu
 
 
 def test_a_view_that_is_left_lets_go_of_its_curve(page: Page, job: ScriptedJob) -> None:
-    first, second = submit(page), submit(page)
+    first = submit(page)
     job.steps.release()
     page.goto(f"/#/{first}")
     expect(page.locator(".chart canvas")).to_be_visible()
+    second = submit(page)  # not before: jobs run side by side, and it might have taken the first one's step
+    expect(page.locator(f"#jobs a[href='#/{second}']")).to_be_visible()
     chart = page.evaluate_handle("document.querySelector('.chart')")
     listeners = page.evaluate("listeners")
     page.locator(f"#jobs a[href='#/{second}']").click()
