@@ -16,6 +16,7 @@ from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
 from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
 from services.core.calibration import require_consistent
+from services.core.choices import chosen
 from services.core.errors import CaptureInputError, RigError, SettingsError
 from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec
 from services.core.store import read_record
@@ -76,10 +77,16 @@ class PlannedRig:
     def _cameras(self, host: str, port: int, wait: Callable[[float], None]) -> PlaybackCameras | SimulatedCameras:
         spec, plan = self.spec, self.plan
         level = next(frame.level for frame in plan if frame.kind == "light")
-        if spec.cameras == "playback":
+
+        def playback() -> PlaybackCameras:
             return PlaybackCameras(self.stills, spec, level, plan, wait)
-        motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
-        return SimulatedCameras(self.stills, spec, level, motion, host, port, wait)
+
+        def simulated() -> SimulatedCameras:
+            motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
+            return SimulatedCameras(self.stills, spec, level, motion, host, port, wait)
+
+        kinds: dict[str, Callable[[], PlaybackCameras | SimulatedCameras]] = {"playback": playback, "simulated": simulated}
+        return chosen("rig.cameras", spec.cameras, kinds)()
 
 
 def _require_sensor(sensor: SimulatedCameraSpec) -> None:

@@ -1,13 +1,18 @@
 """The kinds of job: what each goes through, who does it, and which options are its own.
 
-A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``.
+A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``. An installed
+package adds a kind by an entry point of the group ``dentine.job_kinds`` that leads to a ``JobKind``. Every process reads the
+entry points for itself, so a worker knows the kind where that package is installed, and names the ones it knows where not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
 from types import MappingProxyType
+from typing import Any
 
 from services.core.stage import StageName
 
@@ -27,6 +32,8 @@ class JobKind:
     """``module:function`` of each stage; imported by the worker alone."""
     own_options: frozenset[str] | None
     """Besides the common ones; None for all that no other kind claims."""
+    fixed_options: Mapping[str, Any] = field(default_factory=dict)
+    """Options that its fit knows at this value alone."""
 
     @property
     def has_rig(self) -> bool:
@@ -43,13 +50,25 @@ _TEETH: Mapping[StageName, str] = {
 }
 _SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export": "services.fit.slab.stage:export"}
 
+_OF_A_JAW: Mapping[str, Any] = {"lobes": 1, "held": {}, "stains": False, "solver": "gauss-newton", "loss": "l2"}
+
+ENTRY_POINTS = "dentine.job_kinds"
+"""Group of entry points by which installed packages add kinds."""
 JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
     {
         "tooth": JobKind("one tooth alone", ("prepare", "fit", "export"), _TEETH, None),
-        "jaw": JobKind("all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None),
+        "jaw": JobKind("all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW),
         "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, frozenset({"effort"})),
     }
 )
+"""The kinds of this package."""
+
+
+@cache
+def job_kinds() -> Mapping[str, JobKind]:
+    """All kinds that this process knows: this package's, which nobody replaces, and those of installed packages."""
+    added = {point.name: point.load() for point in entry_points(group=ENTRY_POINTS)}
+    return MappingProxyType({**added, **JOB_KINDS})
 
 
 def known_kind(name: str) -> str:
@@ -58,13 +77,13 @@ def known_kind(name: str) -> str:
     Raises:
         ValueError: there is no such kind; the message lists those that there are.
     """
-    if name not in JOB_KINDS:
-        raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(JOB_KINDS)}")
+    if name not in job_kinds():
+        raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(sorted(job_kinds()))}")
     return name
 
 
 def foreign_options(kind: str, options: frozenset[str]) -> frozenset[str]:
     """Those of some options that jobs of this kind do not have."""
-    own = JOB_KINDS[kind].own_options
-    others = frozenset().union(*(other.own_options or () for name, other in JOB_KINDS.items() if name != kind))
+    own = job_kinds()[kind].own_options
+    others = frozenset().union(*(other.own_options or () for name, other in job_kinds().items() if name != kind))
     return options - COMMON_OPTIONS - own if own is not None else options & others

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from services.core.choices import chosen
 from services.core.geometry import Mesh
 from services.core.installed import require_packages
 from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest, ToothReport
@@ -64,7 +66,8 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     context.raise_if_cancelled()
     writer = StageWriter(context.root, "fit", context.attempt)
     attempt = Attempt(spec, context, writer, engine)
-    driver = FitDriver(attempt) if spec.kind == "tooth" else JawDriver(attempt)
+    kinds: dict[str, Callable[[Attempt], FitDriver | JawDriver]] = {"tooth": FitDriver, "jaw": JawDriver}
+    driver = chosen("Kind of fit", spec.kind, kinds)(attempt)
     notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
     report = driver.run(time.time()).model_copy(update={"notes": notes})
     writer.publish(report)

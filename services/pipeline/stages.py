@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from services.core.errors import CorruptStoreError, InputError, JobCancelledError, MissingStageError, PlatformError, SchedulerLostError, WorkerLostError
 from services.core.events import JobEvent
-from services.core.job_kinds import JOB_KINDS
+from services.core.job_kinds import job_kinds
 from services.core.masks import is_stale
 from services.core.placement import DOME, STAGES, rank
 from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
@@ -63,7 +63,7 @@ _EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
     """The stages a job goes through, in order."""
     made = (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()))
-    return (*made, *JOB_KINDS[spec.kind].stages)
+    return (*made, *job_kinds()[spec.kind].stages)
 
 
 def first_stage(spec: JobSpec, root: Path) -> StageName | None:
@@ -132,7 +132,7 @@ def run_stages(
         with address.open() as log:
             watch = _Watch(log, listener, log.newest_id())
             if todo:
-                entered = {**JOB_KINDS[spec.kind].doors, **doors}
+                entered = {**job_kinds()[spec.kind].doors, **doors}
                 tasks = [StageTask(stage, entered[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged) for stage in todo]
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)

@@ -9,14 +9,16 @@ import hashlib
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
+from services.core.choices import chosen
 from services.core.errors import CorruptStoreError
 from services.core.geometry import Camera, Mesh
+from services.core.records import Boundary, Device
 from services.core.store import write_atomic
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
@@ -186,9 +188,9 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         teeth=tuple(tooth(k) for k in range(int(np.asarray(a["teeth"], dtype=int)))),
         light_positions_mm=a["light_positions"].astype(float),
         light_intensities=a["light_intensities"].astype(float),
-        boundary="thin" if str(a["boundary"]) == "thin" else "matched",
+        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in get_args(Boundary)}),
         ior=float(np.asarray(a["ior"], dtype=float)),
-        device="cuda" if str(a["device"]) == "cuda" else "llvm" if str(a["device"]) == "llvm" else None,
+        device=chosen("Device", str(a["device"]), {"": None, **{name: name for name in get_args(Device)}}),
         gums=mesh("gums"),
         gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
         cavity=mesh("cavity"),

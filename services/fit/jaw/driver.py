@@ -11,6 +11,7 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Tooth
+from services.core.job_kinds import job_kinds
 from services.core.records import FitReport, JobSpec
 from services.fit.execution.attempt import Attempt
 from services.fit.execution.blocks import GUMS
@@ -94,7 +95,7 @@ def require_jaw_options(spec: JobSpec) -> None:
     Raises:
         SettingsError: names the option and what it must be.
     """
-    for option, usual in (("lobes", 1), ("held", {}), ("stains", False), ("solver", "gauss-newton"), ("loss", "l2")):
+    for option, usual in job_kinds()["jaw"].fixed_options.items():
         if (asked := getattr(spec, option)) != usual:
             raise SettingsError(f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one with kind 'tooth'.")
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.choices import chosen
 from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.paths.until import MAX_SAMPLES, Effort, Sums, trace_until
@@ -61,7 +62,7 @@ class Engine:
         self._shape_gradients: dict[int, ShapeGradients] = {}
         self._radius_mm = reach_mm
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
-        self._ior = recipe.ior if recipe.boundary == "thin" and refracts else None
+        self._ior = chosen("Boundary", recipe.boundary, {"matched": None, "thin": recipe.ior if refracts else None})
         self._lights.maps.trace(self._geometry, self._ior)
 
     def images(
