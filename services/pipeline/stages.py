@@ -218,16 +218,14 @@ def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
 
 
 class _Watch:
-    """Passes new rows of the event table to the listener and remembers which stage runs."""
+    """Passes new rows of the event table to the listener."""
 
     def __init__(self, log: EventLog, listener: Listener | None, after: int) -> None:
         self._log, self._listener, self._after = log, listener, after
-        self.stage: StageName | None = None
 
     def tell(self) -> None:
         while new := patiently(lambda: self._log.read(self._after)):
             for event in new:
-                self.stage = event.stage or self.stage
                 if self._listener is not None:
                     self._listener(event)
             self._after = new[-1].id
@@ -252,31 +250,49 @@ def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _W
 
 
 def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: _Watch) -> None:
-    from distributed import KilledWorker, wait
+    from distributed import KilledWorker
 
     key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
-    while not stage.done():
-        with suppress(TimeoutError):
-            wait([stage], timeout=POLL_S)
+    has_ended = False
+    while not has_ended:
+        has_ended = _has_ended(stage)
         watch.tell()
         if time.monotonic() > keep_at:
             keep_workers()
             keep_at = time.monotonic() + KEEP_S
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S
-        if give_up_at is not None and time.monotonic() > give_up_at and watch.stage != "capture":
+        # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
+        if not has_ended and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
             _stop_workers_of(client, key)
             raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
     try:
-        stage.result()
+        if stage.status != "finished":
+            stage.result()
     except KilledWorker as problem:
         raise WorkerLostError(
             f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
             {"stage": task.stage, "deaths": problem.allowed_failures + 1},
         ) from problem
+
+
+def _has_ended(stage: Future) -> bool:
+    """Whether a task has failed, or its result is here; asks for ``POLL_S`` at most.
+
+    A task that has finished has not ended before that: its worker may die with the result, and then the task runs again.
+    """
+    from distributed import wait
+
+    try:
+        wait([stage], timeout=POLL_S)
+        if stage.status == "finished":
+            stage.result(timeout=POLL_S)
+    except TimeoutError:
+        return False
+    return True
 
 
 def _stop_workers_of(client: Client, stage: str) -> None:
