@@ -66,12 +66,14 @@ def build_app() -> typer.Typer:
     from services.dask_command import add_dask_commands
     from services.secrets_command import build_secrets_app
     from services.slab_command import simulate_slab_command
+    from services.sphere_command import sphere_command
     from services.token_command import build_token_app
 
     app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_root)
     for command in (serve, dome_sim, capture, run, export, phantom, bench):
         app.command()(command)
+    app.command("sphere")(sphere_command)
     add_client_commands(app, lambda: read_settings(os.environ))
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
