@@ -59,6 +59,7 @@ def build_app() -> typer.Typer:
     from services.cli.secrets import build_secrets_app
     from services.cli.serve import serve
     from services.cli.slab import simulate_slab_command
+    from services.cli.sphere import sphere_command
     from services.cli.token import build_token_app
     from services.core.settings import read_settings
 
@@ -68,6 +69,7 @@ def build_app() -> typer.Typer:
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
+    app.command("sphere")(sphere_command)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)

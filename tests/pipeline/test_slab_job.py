@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from services.core.errors import CaptureInputError, JobCancelledError, SettingsE
 from services.core.records import AssetManifest, JobSpec
 from services.core.settings import job_from_tree
 from services.core.slab_folder import SlabFolder
-from services.core.stage import CANCEL_FLAG, LocalContext
+from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
 from services.fit.slab.model.forward import render
@@ -107,6 +108,23 @@ def test_the_report_opens_alone_and_shows_phase_functions_and_images(job: Path) 
     assert page.count("<img ") == 3 * 4
     assert page.index("held out") < page.index(">fitted<")
     assert "shot noise of 1 % at a pixel" in page
+
+
+def test_phase_functions_are_pictures_that_stand_alone(job: Path) -> None:
+    picture = ElementTree.fromstring((job / "phase_532.svg").read_text())
+    assert picture.tag == "{http://www.w3.org/2000/svg}svg"
+    assert [part.get("class") for part in picture if part.tag.endswith("}polyline")] == ["series s0"]
+    (band,) = (part for part in picture if part.tag.endswith("}polygon"))
+    assert len((band.get("points") or "").split()) == 2 * len(ANGLES_RAD)
+    assert "prefers-color-scheme:dark" in (picture[0].text or "")
+
+
+def test_a_job_tells_of_each_wavelength_that_is_done(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    told: list[StageEvent] = []
+    run(spec, LocalContext(copied_checkpoint(job, tmp_path), attempt=2, listener=told.append))
+    (event,) = (event for event in told if event.kind == "progress")
+    assert event.data == {"wavelength_nm": 532.0, "wavelengths": 1}
+    assert event.message.startswith("532 nm: σs ")
 
 
 def test_the_table_is_in_the_order_of_mitsubas_cosines() -> None:

@@ -36,7 +36,7 @@ MAX_BYTES_AT_ONCE = 2**20
 """Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread each."""
 
 REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
-"""A report opens alone and carries all it needs; it may reach nothing, this server included, and no page may show it inside itself."""
+"""A report or a drawing opens alone and carries all it needs; it may reach nothing, this server included, and no page may show it inside itself."""
 
 
 class Artifact(Record):
@@ -75,7 +75,7 @@ def artifact_response(request: Request, path: Path) -> Response:
     stat = path.stat()
     tag, modified = f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"', formatdate(stat.st_mtime, usegmt=True)
     headers = {"ETag": tag, "Last-Modified": modified, "Accept-Ranges": "bytes"}
-    if path.suffix == ".html":
+    if path.suffix in {".html", ".svg"}:
         headers["Content-Security-Policy"] = REPORT_POLICY
     if tag in (request.headers.get("if-none-match") or ""):
         return Response(status_code=304, headers=headers)

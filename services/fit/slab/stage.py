@@ -57,7 +57,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
         fits.append(kept.fit)
         write_atomic(writer.folder / f"{place.name}.npz", (place / IMAGES).read_bytes())
         done = (number + 1) / len(places)
-        context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit)))
+        which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}
+        context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit), data=which))
     report = SlabReport(fits=tuple(fits))
     writer.publish(report)
     verdict = report.verdict()
@@ -86,12 +87,13 @@ def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions,
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Write parameters.json, phase.json, errors.json and report.html, and tables and scenes for Mitsuba as the asset.
+    """Write parameters.json, phase.json and its pictures, errors.json and report.html, and tables and scenes for Mitsuba as the asset.
 
     Raises:
         StoreError: the fit is missing or damaged. CaptureInputError: the folder is gone.
     """
     from services.fit.slab.fit import write_results
+    from services.fit.slab.results.chart import phase_picture
     from services.fit.slab.results.kept import read_images_of
     from services.fit.slab.results.report import write_report
     from services.fit.slab.results.result import SlabReport
@@ -113,6 +115,9 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     provenance = {"Source": root.name, "Seed": str(spec.seed)}
     write_report(context.root / "report.html", report, verdict, images, provenance)
     write_results(report.fits, context.root)
+    for fit in report.fits:
+        picture = phase_picture(f"Phase function at {fit.wavelength_nm:g} nm", fit.phase)
+        write_atomic(context.root / f"phase_{fit.wavelength_nm:g}.svg", picture.encode())
     manifest = AssetManifest(
         files=tuple(files),
         held_out_error=verdict.error.value,

@@ -37,7 +37,7 @@ export interface Job {
   state: JobState;
   created_s: number;
   changed_s: number;
-  spec: { capture: string | null; rig: { mouth: string } | null };
+  spec: { kind: string; capture: string | null; rig: { mouth: string } | null };
   failure: { code: string; message: string; stage: string | null } | null;
   /** Label that a person gave it. */
   name: string | null;

@@ -20,6 +20,7 @@ import { badgeOf, bytes, remaining, when } from "./format";
 import { JobActions } from "./jobActions";
 import { LossChart } from "./lossChart";
 import { ParameterTable } from "./parameterTable";
+import { SlabView } from "./slabView";
 import { StageList } from "./stageList";
 import { VerdictCard } from "./verdictCard";
 
@@ -40,6 +41,8 @@ export class JobView {
   private readonly chart = new LossChart();
   private readonly parameters = new ParameterTable();
   private readonly comparison: Comparison;
+  private readonly slab: SlabView;
+  private isSlab = false;
   private readonly filesRefusal = element("p", { class: "failure", role: "alert" });
   private readonly files = element("ul", { class: "files" });
   /** Of a jaw: the tooth that is looked at alone, null for all together; undefined before the first step. */
@@ -57,6 +60,7 @@ export class JobView {
     mayChange: boolean,
   ) {
     this.comparison = new Comparison(id);
+    this.slab = new SlabView(id);
     this.failure.hidden = true;
     this.refusal.hidden = true;
     this.filesRefusal.hidden = true;
@@ -70,6 +74,7 @@ export class JobView {
   async start(): Promise<void> {
     const job = await getJob(this.id);
     if (this.isStopped) return;
+    this.isSlab = job.spec.kind === "slab";
     const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
     const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
     this.root.replaceChildren(
@@ -81,8 +86,9 @@ export class JobView {
       this.refusal,
       this.actions.root,
       section("Stages", this.stages.root, this.remaining),
-      section("Fit", this.chart.root),
-      section("Render and photograph", this.comparison.root),
+      ...(this.isSlab
+        ? [section("Fit", this.slab.progress), section("Phase function", this.slab.phases)]
+        : [section("Fit", this.chart.root), section("Render and photograph", this.comparison.root)]),
       section("Parameters", this.parameters.root),
       section("Files", this.filesRefusal, this.files),
     );
@@ -109,6 +115,7 @@ export class JobView {
 
   private take(event: JobEvent): void {
     this.stages.take(event);
+    this.slab.take(event);
     if (event.kind === "step") this.takeStep(event);
     if (event.kind === "preview") this.comparison.add(event);
     if (event.kind === "finished") void this.showFiles();
@@ -200,7 +207,9 @@ export class JobView {
       const files = await listArtifacts(this.id);
       if (this.isStopped) return;
       this.list(files);
-      if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id));
+      this.slab.list(files);
+      const heading = (channel: string) => (this.isSlab ? `${channel} nm` : channel);
+      if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id), heading);
       this.filesRefusal.hidden = true;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;

@@ -25,8 +25,8 @@ export class ParameterTable {
     this.current.clear();
   }
 
-  /** The published result. */
-  showResult(result: Parameters): void {
+  /** The published result; `heading` is what stands above a channel's column. */
+  showResult(result: Parameters, heading: (channel: string) => string = (channel) => channel): void {
     this.isFinal = true;
     const channels = Object.keys(result);
     const names = [...new Set(channels.flatMap((channel) => Object.keys(result[channel] ?? {})))];
@@ -39,7 +39,7 @@ export class ParameterTable {
       if (!estimate) return ["–"];
       const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";
       return flag ? [valueOf(estimate), element("span", { class: "flag" }, flag)] : [valueOf(estimate)];
-    });
+    }, heading);
   }
 
   private fill(
@@ -48,8 +48,9 @@ export class ParameterTable {
     names: string[],
     unit: (name: string) => string,
     cell: (name: string, channel: string) => (string | HTMLElement)[],
+    heading: (channel: string) => string = (channel) => channel,
   ): void {
-    const head = element("tr", {}, ...["parameter", "unit", ...channels].map((text) => element("th", { scope: "col" }, text)));
+    const head = element("tr", {}, ...["parameter", "unit", ...channels.map(heading)].map((text) => element("th", { scope: "col" }, text)));
     const rows = names.map((name) =>
       element(
         "tr",

@@ -9,6 +9,13 @@ from services.fit.slab.results.result import PhaseFunction
 
 WIDTH, HEIGHT = 640, 300
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 40
+PICTURE_STYLE = (
+    "text{fill:#595e68;font:12px system-ui,sans-serif}.grid{stroke:#d9d6d0}.series{fill:none;stroke:#0b63a5;stroke-width:2}"
+    ".band{fill:#0b63a5;opacity:.25}.prior{fill:#d9d6d0;opacity:.6}"
+    "@media(prefers-color-scheme:dark){text{fill:#a9b4b7}.grid{stroke:#3a4549}.series{stroke:#6db5ea}.band{fill:#6db5ea}.prior{fill:#3a4549}}"
+    "@media(max-width:450px){text{font-size:17px}}"
+)
+"""Of a chart that stands alone; where a phone shows it at half its size, its letters are larger."""
 DECADES_BELOW = 4
 """Decades below the peak that are drawn at most: what lies lower is not seen against it in any image."""
 
@@ -42,6 +49,13 @@ def phase_chart(title: str, phase: PhaseFunction) -> str:
     parts.append(f'<polygon class="band" points="{_points(band)}"/>')
     parts.append(f'<polyline class="series s0" points="{_points([(x(t), y(p)) for t, p, _ in rows])}"/>')
     return "".join(parts) + "</svg>"
+
+
+def phase_picture(title: str, phase: PhaseFunction) -> str:
+    """The chart as a file of its own, with the colours of the report, light or dark as the page that shows it."""
+    chart = phase_chart(title, phase)
+    opening = f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" class="chart"'
+    return chart.replace('<svg class="chart"', opening, 1).replace(">", f"><style>{PICTURE_STYLE}</style>", 1)
 
 
 def _limits(phase: PhaseFunction) -> tuple[float, float]:

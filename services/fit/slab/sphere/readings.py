@@ -1,0 +1,167 @@
+"""What a laboratory hands in: a JSON file of the project's own vocabulary, or the .rxt file of Prahl's IAD."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Record
+from services.core.slab_folder import Cell, Glass, Positive
+from services.core.store import read_record
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Reading = Annotated[float, Field(ge=0, le=1.2)]
+Wall = Annotated[float, Field(ge=0, lt=1)]
+
+RXT_MARK = "IAD1"
+RXT_HEADER = 18
+"""Numbers before the readings of an .rxt file."""
+MAX_RXT_COLUMNS = 5
+"""M_R, M_T, M_U, and the wall's reflectance in either sphere."""
+
+
+class Sphere(Record):
+    """An integrating sphere used in the substitution method: one reading of the sample, one of the standard."""
+
+    diameter_mm: Positive
+    sample_port_mm: Positive = Field(description="diameter")
+    third_port_mm: Annotated[float, Field(ge=0)] = Field(description="diameter of the port opposite the sample")
+    detector_port_mm: Annotated[float, Field(ge=0)] = Field(description="diameter")
+    wall_reflectance: Wall
+    detector_reflectance: Share = 0.0
+    baffle: bool = Field(default=True, description="between sample and detector, so that light must meet the wall first")
+
+    @model_validator(mode="after")
+    def _ports_fit(self) -> Sphere:
+        for name in ("sample_port_mm", "third_port_mm", "detector_port_mm"):
+            if getattr(self, name) >= self.diameter_mm:
+                raise ValueError(f"{name} must be below diameter_mm, {self.diameter_mm:g}")
+        return self
+
+
+class TotalsReading(Record):
+    """Readings of one wavelength, as shares of the incident power."""
+
+    wavelength_nm: Positive | None = None
+    R: Reading
+    R_se: Positive | None = None
+    T: Reading
+    T_se: Positive | None = None
+    T_unscattered: Annotated[float, Field(gt=0, le=1)] | None = Field(default=None, description="collimated transmittance")
+    T_unscattered_se: Positive | None = None
+    source: Literal["normal", "diffuse"] = "normal"
+    reflection_wall: Wall | None = Field(default=None, description="of the reflection sphere at this wavelength")
+    transmission_wall: Wall | None = Field(default=None, description="of the transmission sphere at this wavelength")
+
+
+class SphereFile(Record):
+    """A sample, the instrument, and its readings."""
+
+    kind: Literal["sphere"]
+    units: Literal["mm"]
+    cell: Cell
+    totals: Annotated[tuple[TotalsReading, ...], Field(min_length=1)]
+    g: Annotated[float, Field(gt=-1, lt=1)] = Field(default=0.0, description="mean cosine where T_unscattered is not given")
+    reflection_sphere: Sphere | None = Field(default=None, description="null where R is corrected already")
+    transmission_sphere: Sphere | None = Field(default=None, description="null where T is corrected already")
+    standard_reflectance: Annotated[float, Field(gt=0, le=1)] = Field(default=1.0, description="of the standard R is told by")
+    specular_included: bool = Field(default=True, description="whether R holds the mirror reflection of the faces")
+    unscattered_included: bool = Field(default=True, description="whether T holds the unscattered light")
+
+    @model_validator(mode="after")
+    def _one_index(self) -> SphereFile:
+        if self.cell.boundary == "smooth" and self.cell.index is None:
+            raise ValueError("cell.index is null, and totals do not tell it; give the sample's index")
+        names = [reading.wavelength_nm for reading in self.totals]
+        if twice := {nm for nm in names if nm is not None and names.count(nm) > 1}:
+            raise ValueError(f"wavelength {min(twice):g} nm is listed twice; keep one")
+        return self
+
+    def named(self) -> list[tuple[str, TotalsReading]]:
+        """Readings by wavelength in nm, or by their number where none is given."""
+        return [
+            (f"{number}" if reading.wavelength_nm is None else f"{reading.wavelength_nm:g}", reading) for number, reading in enumerate(self.totals, start=1)
+        ]
+
+
+def read_readings(path: Path) -> SphereFile:
+    """Read either format; an .rxt file is known by its first four characters.
+
+    Raises:
+        CaptureInputError: names the file, the line or field, and what is wrong.
+    """
+    if not path.is_file():
+        raise CaptureInputError(f"{path} does not exist or is a folder; name a JSON or .rxt file of readings.")
+    with path.open("rb") as file:
+        is_rxt = file.read(len(RXT_MARK)) == RXT_MARK.encode()
+    if path.suffix == ".rxt" and not is_rxt:
+        raise CaptureInputError(f"{path} does not begin with {RXT_MARK}, as an .rxt file must; check that it is one.")
+    return _read_rxt(path) if is_rxt else read_record(path, SphereFile)
+
+
+def _read_rxt(path: Path) -> SphereFile:
+    rows = _numbers(path)
+    header: list[float] = []
+    while rows and len(header) < RXT_HEADER:
+        header += rows.pop(0)[1]
+    if len(header) != RXT_HEADER:
+        raise CaptureInputError(f"{path}: {RXT_HEADER} numbers come before the readings, this file has {len(header)}; complete it.")
+    index, slide_index, width_mm, slide_mm, _beam_mm, standard = header[:6]
+    spheres, columns = int(header[6]), int(header[17])
+    if spheres not in {0, 1}:
+        raise CaptureInputError(f"{path}: readings with {spheres} spheres at once are not understood; measure R and T one after the other.")
+    if not 2 <= columns <= MAX_RXT_COLUMNS:
+        raise CaptureInputError(f"{path}: {columns} readings a line are not understood; give M_R and M_T, then M_U and the wall of either sphere.")
+    reflection, transmission = (_sphere(header[first : first + 5]) if spheres else None for first in (7, 12))
+    slide = {"index": slide_index, "thickness_mm": slide_mm} if slide_mm > 0 and slide_index > 1 else None
+    try:
+        return SphereFile(
+            kind="sphere", units="mm",
+            cell=Cell(width_mm=width_mm, index=index, boundary="smooth", glass=Glass(**slide) if slide else None),
+            totals=tuple(_reading(path, line, row, columns) for line, row in rows),
+            reflection_sphere=Sphere.model_validate(reflection) if reflection else None,
+            transmission_sphere=Sphere.model_validate(transmission) if transmission else None,
+            standard_reflectance=standard,
+        )  # fmt: skip
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise CaptureInputError(f"{path}: {place}: {first['msg']}; correct it.") from problem
+
+
+def _numbers(path: Path) -> list[tuple[int, list[float]]]:
+    """Lines that hold numbers, with their number in the file."""
+    rows = []
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for number, line in enumerate(text.removeprefix(RXT_MARK).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        try:
+            values = [float(word) for word in words]
+        except ValueError as problem:
+            raise CaptureInputError(f"{path}, line {number}: {' '.join(words)} is not a list of numbers; correct it.") from problem
+        if values:
+            rows.append((number, values))
+    return rows
+
+
+def _reading(path: Path, line: int, row: list[float], columns: int) -> TotalsReading:
+    if len(row) not in {columns, columns + 1}:
+        raise CaptureInputError(f"{path}, line {line}: {len(row)} numbers where {columns} readings were announced; correct one of them.")
+    values = row[-columns:]
+    unscattered, reflection_wall, transmission_wall = (*values[2:], None, None, None)[:3]
+    return TotalsReading(
+        wavelength_nm=row[0] if len(row) > columns else None,
+        R=values[0],
+        T=values[1],
+        T_unscattered=unscattered or None,  # IAD takes nothing measured where 0 stands
+        reflection_wall=reflection_wall,
+        transmission_wall=transmission_wall,
+    )
+
+
+def _sphere(numbers: list[float]) -> dict[str, float]:
+    names = ("diameter_mm", "sample_port_mm", "third_port_mm", "detector_port_mm", "wall_reflectance")
+    return dict(zip(names, numbers, strict=True))
