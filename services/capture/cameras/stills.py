@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.arrays import as_float32, map_radiance
 from services.core.errors import CaptureInputError
+from services.core.files.arrays import as_float32, map_radiance
 from services.core.records import FolderCapture
 
 
