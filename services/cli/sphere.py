@@ -24,7 +24,7 @@ def sphere_command(
     from services.fit.slab.sphere.translucency import translucency_of
     from services.fit.slab.sphere.write import write_sphere
 
-    if black >= white:
+    if not black < white:
         raise SettingsError(f"Option --black = {black:g} is not below --white = {white:g}; give the darker backing as --black.")
     readings = read_readings(file)
     fits = fit_readings(readings)

@@ -148,6 +148,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"colour": "red"}, "colour"),
     "no readings": ({"totals": []}, "totals"),
     "no index": ({"cell": {"width_mm": 1, "index": None}}, "give the sample's index"),
+    "a sample thinner than its surroundings": ({"cell": {"width_mm": 1, "index": 1.2, "index_outside": 1.33}}, "below index_outside"),
     "a wavelength twice": ({"totals": 2 * PLAIN["totals"]}, "550 nm is listed twice"),
     "a reading above all light": ({"totals": [{"R": 3, "T": 0.1}]}, "totals.0.R"),
     "a port larger than its sphere": ({"reflection_sphere": SPHERE | {"sample_port_mm": 120}}, "below diameter_mm"),
@@ -169,6 +170,8 @@ def test_a_wrong_file_gets_a_sentence(name: str, tmp_path: Path) -> None:
     ("rows", "header", "words"),
     [
         ("0.1 0.2 x", {}, "line 9: 0.1 0.2 x is not a list of numbers"),
+        ("0.1 nan 0.2", {}, "line 9: 0.1 nan 0.2 holds a number that is not finite"),
+        (ROWS, {"spheres": float("inf")}, "line 5: inf holds a number that is not finite"),
         ("0.1", {}, "line 9: 1 numbers where 3 readings"),
         (ROWS, {"spheres": 2}, "2 spheres at once"),
         (ROWS, {"columns": 1}, "1 readings a line"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -75,6 +76,8 @@ class SphereFile(Record):
     def _one_index(self) -> SphereFile:
         if self.cell.boundary == "smooth" and self.cell.index is None:
             raise ValueError("cell.index is null, and totals do not tell it; give the sample's index")
+        if self.cell.boundary == "smooth" and (self.cell.index or 0) < self.cell.index_outside:
+            raise ValueError(f"cell.index is below index_outside, {self.cell.index_outside:g}; only a sample that is denser is understood")
         names = [reading.wavelength_nm for reading in self.totals]
         if twice := {nm for nm in names if nm is not None and names.count(nm) > 1}:
             raise ValueError(f"wavelength {min(twice):g} nm is listed twice; keep one")
@@ -142,6 +145,8 @@ def _numbers(path: Path) -> list[tuple[int, list[float]]]:
             values = [float(word) for word in words]
         except ValueError as problem:
             raise CaptureInputError(f"{path}, line {number}: {' '.join(words)} is not a list of numbers; correct it.") from problem
+        if not all(map(math.isfinite, values)):
+            raise CaptureInputError(f"{path}, line {number}: {' '.join(words)} holds a number that is not finite; correct it.")
         if values:
             rows.append((number, values))
     return rows
