@@ -8,7 +8,11 @@ SLOW_TIMEOUT_S = 3600
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", choices=("llvm", "cuda"), help="trace paths there in this process's tests; a CUDA device must be present for cuda")
+    parser.addoption(
+        "--device",
+        choices=("llvm", "cuda"),
+        help="trace paths there in this process's tests; a CUDA device must be present for cuda",
+    )
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

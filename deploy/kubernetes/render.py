@@ -36,7 +36,9 @@ HEADER = "# Written by deploy/kubernetes/render.py from deploy/compose.yaml; cha
 def render(composed: Mapping[str, Any]) -> str:
     """The manifests of a compose file, as one text."""
     services = {name: one for name, one in composed["services"].items() if "profiles" not in one and name != "secrets"}
-    volumes = sorted({volume for one in composed["services"].values() if "profiles" not in one for volume in _named_volumes(one)})
+    volumes = sorted(
+        {volume for one in composed["services"].values() if "profiles" not in one for volume in _named_volumes(one)}
+    )
     networks = sorted({network for one in services.values() for network in one["networks"]})
     documents = [
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},
@@ -55,7 +57,12 @@ def _meta(name: str, **labels: str) -> dict[str, Any]:
 def _claim(volume: str) -> dict[str, Any]:
     size = {"requests": {"storage": SIZES.get(volume, "1Gi")}}
     modes = ["ReadWriteOnce"] if volume == "database" else [SHARED]
-    return {"apiVersion": "v1", "kind": "PersistentVolumeClaim", "metadata": _meta(volume), "spec": {"accessModes": modes, "resources": size}}
+    return {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": _meta(volume),
+        "spec": {"accessModes": modes, "resources": size},
+    }
 
 
 def _policy(network: str) -> dict[str, Any]:
@@ -67,7 +74,12 @@ def _policy(network: str) -> dict[str, Any]:
 
 def _service(name: str) -> dict[str, Any]:
     ports = [{"port": PORTS[name], "targetPort": PORTS[name]}]
-    return {"apiVersion": "v1", "kind": "Service", "metadata": _meta(name), "spec": {"selector": {"app": name}, "ports": ports}}
+    return {
+        "apiVersion": "v1",
+        "kind": "Service",
+        "metadata": _meta(name),
+        "spec": {"selector": {"app": name}, "ports": ports},
+    }
 
 
 def _deployment(name: str, service: Mapping[str, Any], secrets: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,12 +121,22 @@ def _container(name: str, service: Mapping[str, Any]) -> dict[str, Any]:
         container["ports"] = [{"containerPort": PORTS[name]}]
     if "healthcheck" in service:
         check = service["healthcheck"]
-        probe = {"exec": {"command": check["test"][1:]}, "periodSeconds": _seconds(check["interval"]), "timeoutSeconds": _seconds(check["timeout"])}
+        probe = {
+            "exec": {"command": check["test"][1:]},
+            "periodSeconds": _seconds(check["interval"]),
+            "timeoutSeconds": _seconds(check["timeout"]),
+        }
         container["startupProbe"] = probe | {"failureThreshold": 60}
         container["livenessProbe"] = probe | {"failureThreshold": check["retries"]}
     if "mem_limit" in service:
-        container["resources"] = {"limits": {"memory": _default(service["mem_limit"]).replace("m", "Mi").replace("g", "Gi")}}
-    container["securityContext"] = {"readOnlyRootFilesystem": True, "allowPrivilegeEscalation": False, "capabilities": rights}
+        container["resources"] = {
+            "limits": {"memory": _default(service["mem_limit"]).replace("m", "Mi").replace("g", "Gi")}
+        }
+    container["securityContext"] = {
+        "readOnlyRootFilesystem": True,
+        "allowPrivilegeEscalation": False,
+        "capabilities": rights,
+    }
     container["volumeMounts"] = list(_mounts(service))
     return container
 

@@ -50,7 +50,9 @@ SLICES = 20
 """Of the tooth's height, in which its width is taken."""
 
 
-def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, crown: ToothDimensions | None = None, faces: int = 4000) -> DentinShape:
+def dentin_blend_shape(
+    outer: Mesh, frame: ToothFrame | None = None, *, crown: ToothDimensions | None = None, faces: int = 4000
+) -> DentinShape:
     """Base 0.1 mm below the enamel's surface and three modes that thicken the enamel, in the coordinates of ``outer``.
 
     Args:
@@ -75,7 +77,10 @@ def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, crown: T
     share = np.ones(len(height))
     for attempt in range(40):
         along = (share * buccal * (inward @ axes[1]), -share * proximal, -share * drop)
-        moved = [_kept_inside(base.vertices_mm + np.outer(length, axes[axis]), grid) for length, axis in zip(along, MODE_AXES, strict=True)]
+        moved = [
+            _kept_inside(base.vertices_mm + np.outer(length, axes[axis]), grid)
+            for length, axis in zip(along, MODE_AXES, strict=True)
+        ]
         modes = np.stack(moved) - base.vertices_mm
         short = _shallowest_corner_mm(base.vertices_mm, modes, grid) < CORNER_DEPTH_MM
         if attempt < UNFOLDING_ROUNDS:
@@ -83,12 +88,16 @@ def dentin_blend_shape(outer: Mesh, frame: ToothFrame | None = None, *, crown: T
         if not short.any():
             return DentinShape(base, modes)
         share = _smooth_below(base, np.where(short, 0.8 * share, share))
-    raise MeshError("The enamel mesh leaves no room for dentin between its walls; check its scale and that it is one solid tooth.")
+    raise MeshError(
+        "The enamel mesh leaves no room for dentin between its walls; check its scale and that it is one solid tooth."
+    )
 
 
 def _kept_inside(points_mm: NDArray[np.float64], grid: SignedDistanceGrid) -> NDArray[np.float64]:
     for _ in range(4):
-        points_mm = points_mm + np.maximum(BASE_DEPTH_MM - grid.depth_mm(points_mm), 0)[:, None] * grid.inward(points_mm)
+        points_mm = points_mm + np.maximum(BASE_DEPTH_MM - grid.depth_mm(points_mm), 0)[:, None] * grid.inward(
+            points_mm
+        )
     return points_mm
 
 
@@ -118,7 +127,9 @@ def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces: int) -> Mesh:
     # A surface net at the base's depth: closed by construction and evenly spaced, unlike the scan's own triangles moved inward.
     corners = outer.vertices_mm[outer.faces]
-    area = float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2)
+    area = float(
+        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    )
     pitch = np.sqrt(3 * area / faces)
     for _ in range(4):
         base = surface_net(grid.depth_mm, *grid.bounds_mm, pitch, BASE_DEPTH_MM)
@@ -126,7 +137,9 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
             break
         pitch *= 0.8
     else:
-        raise MeshError("The enamel mesh has no closed surface 0.1 mm below it; check its scale and that it is one solid tooth.")
+        raise MeshError(
+            "The enamel mesh has no closed surface 0.1 mm below it; check its scale and that it is one solid tooth."
+        )
 
     # Exact projection to the depth; faces that cut through a concave crease of the enamel take their corners deeper.
     vertices = _smooth(base, base.vertices_mm, 2)
@@ -137,7 +150,9 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
         direction = (vertices - nearest) / np.where(np.abs(signed) > 1e-9, signed, 1e-9)[:, None]
         vertices = vertices + (depth - signed)[:, None] * direction
         shortfall = BASE_DEPTH_MM - CREASE_MM - grid.depth_mm(vertices[base.faces].mean(axis=1))
-        np.maximum.at(depth, base.faces, np.maximum(depth[base.faces], (BASE_DEPTH_MM + 2 * np.maximum(shortfall, 0))[:, None]))
+        np.maximum.at(
+            depth, base.faces, np.maximum(depth[base.faces], (BASE_DEPTH_MM + 2 * np.maximum(shortfall, 0))[:, None])
+        )
     return Mesh(vertices, base.faces)
 
 
@@ -152,7 +167,9 @@ def _room_mm(start: NDArray[np.float64], inward: NDArray[np.float64], grid: Sign
     return np.minimum(full, MIDDLE_FRACTION * travelled)
 
 
-def _shallowest_corner_mm(start: NDArray[np.float64], modes: NDArray[np.float64], grid: SignedDistanceGrid) -> NDArray[np.float64]:
+def _shallowest_corner_mm(
+    start: NDArray[np.float64], modes: NDArray[np.float64], grid: SignedDistanceGrid
+) -> NDArray[np.float64]:
     # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the lingual hollow.
     weights = np.stack(np.meshgrid(*[(0.0, 0.5, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
     return np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0)

@@ -27,7 +27,9 @@ class SurfaceDistance:
         samples, self._owner = _sample_triangles(self._corners, spacing_mm)
         self._tree = cKDTree(samples)
 
-    def closest(self, points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def closest(
+        self, points_mm: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Closest surface points (N, 3), unsigned distances (N,) in mm and their faces (N,)."""
         from trimesh.triangles import closest_point
 

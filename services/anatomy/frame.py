@@ -90,10 +90,15 @@ def _leads_to_the_crown(offsets_mm: NDArray[np.float64], areas: NDArray[np.float
     low, high, length = along.min(), along.max(), np.ptp(along)
     if length > WHOLE_ROOT * 2 * np.linalg.norm(across, axis=1).max():
         return bool(high < -low)  # from the centre of the surface, which lies in the crown's half
-    spreads = [np.sqrt(np.linalg.det(_plane_covariance(across[end], areas[end], axis))) for end in (along < low + END * length, along > high - END * length)]
+    spreads = [
+        np.sqrt(np.linalg.det(_plane_covariance(across[end], areas[end], axis)))
+        for end in (along < low + END * length, along > high - END * length)
+    ]
     return bool(spreads[1] < spreads[0])
 
 
-def _plane_covariance(across_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane_covariance(
+    across_mm: NDArray[np.float64], areas: NDArray[np.float64], axis: NDArray[np.float64]
+) -> NDArray[np.float64]:
     plane = np.linalg.svd(axis[None])[2][1:]
     return np.asarray(np.cov((across_mm @ plane.T).T, aweights=areas))

@@ -12,7 +12,9 @@ from services.core.geometry import Mesh
 Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def surface_net(field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64], pitch_mm: float, level: float) -> Mesh:
+def surface_net(
+    field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64], pitch_mm: float, level: float
+) -> Mesh:
     """Surface where ``field`` equals ``level``, oriented outward from the larger values; they must not touch the bounds."""
     shape = np.ceil((high_mm - low_mm) / pitch_mm).astype(int) + 1
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1)
@@ -29,7 +31,9 @@ def surface_net(field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.f
             start[others] = offset
             stop = start.copy()
             stop[axis] += 1
-            a, b = (value[tuple(slice(o, o + n) for o, n in zip(corner, cells, strict=True))] for corner in (start, stop))
+            a, b = (
+                value[tuple(slice(o, o + n) for o, n in zip(corner, cells, strict=True))] for corner in (start, stop)
+            )
             crossed = (a > 0) != (b > 0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 fraction = np.where(crossed, a / (a - b), 0.0)
@@ -48,13 +52,18 @@ def surface_net(field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.f
         u, v = (axis + 1) % 3, (axis + 2) % 3
         step_u, step_v = np.eye(3, dtype=int)[u], np.eye(3, dtype=int)[v]
         ahead = np.eye(3, dtype=int)[axis]
-        edges = np.argwhere(above[tuple(slice(0, n - k) for n, k in zip(shape, ahead, strict=True))] != above[tuple(slice(k, None) for k in ahead)])
+        edges = np.argwhere(
+            above[tuple(slice(0, n - k) for n, k in zip(shape, ahead, strict=True))]
+            != above[tuple(slice(k, None) for k in ahead)]
+        )
         around = [number[tuple((edges - a * step_u - b * step_v).T)] for a, b in ((1, 1), (0, 1), (0, 0), (1, 0))]
         quad = np.stack(around, axis=-1)
         falling = above[tuple(edges.T)]
         quads.append(np.where(falling[:, None], quad, quad[:, ::-1]))
     quad = np.concatenate(quads)
     corners = vertices[quad]
-    first = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1) <= np.linalg.norm(corners[:, 1] - corners[:, 3], axis=1)
+    first = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=1) <= np.linalg.norm(
+        corners[:, 1] - corners[:, 3], axis=1
+    )
     split = np.where(first[:, None], quad[:, [0, 1, 2, 0, 2, 3]], quad[:, [1, 2, 3, 1, 3, 0]])
     return Mesh(vertices, split.reshape(-1, 3).astype(np.int32))

@@ -108,12 +108,16 @@ def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
     numbers, matches = tuple(tooth.fdi for tooth in teeth), [CrownMatch(tooth.fdi, tooth.outer) for tooth in teeth]
     middles = np.array([_middle_mm(tooth) for tooth in teeth])
     nominal, nominal_axes = nominal_places(numbers)
-    turns, misfits = _arch_turns(arch_from_middles(numbers, middles), middles - middles.mean(axis=0), nominal - nominal.mean(axis=0))
+    turns, misfits = _arch_turns(
+        arch_from_middles(numbers, middles), middles - middles.mean(axis=0), nominal - nominal.mean(axis=0)
+    )
     misfits = ARCH_SHARE * misfits
     for match, axes in zip(matches, nominal_axes, strict=True):
         placed = match.settled(axes @ turns, *MEDIUM)
         drift = np.maximum(_angles_deg(placed.axes, axes @ turns) - FREE_DRIFT_DEG, 0.0)
-        misfits = misfits + (placed.misfits_mm + match.reverse_misfits_mm(placed) + DRIFT_MM_PER_DEG * drift) / len(teeth)
+        misfits = misfits + (placed.misfits_mm + match.reverse_misfits_mm(placed) + DRIFT_MM_PER_DEG * drift) / len(
+            teeth
+        )
     arch = turns[misfits.argmin()]
 
     # From there each tooth turns to where its own shape is nearest to the average's.
@@ -130,7 +134,9 @@ def _arch_turns(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Arra
     from scipy.spatial.transform import Rotation
 
     line = np.linalg.svd(middles_mm, full_matrices=False)[2][0]
-    turns = best @ Rotation.from_rotvec(np.linspace(0, 2 * np.pi, ARCH_TURNS, endpoint=False)[:, None] * line).as_matrix()
+    turns = (
+        best @ Rotation.from_rotvec(np.linspace(0, 2 * np.pi, ARCH_TURNS, endpoint=False)[:, None] * line).as_matrix()
+    )
     misfits = np.sqrt(((np.einsum("kij,nj->kni", turns, middles_mm) - nominal_mm) ** 2).sum(axis=2).mean(axis=1))
     near = misfits < misfits.min() + WORST_ARCH_MM
     return turns[near], misfits[near]
@@ -143,7 +149,9 @@ def _even_turns(count: int) -> Array:
     at = np.arange(count) + 0.5
     inner, outer = np.sqrt(at / count), np.sqrt(1 - at / count)
     one, two = 2 * np.pi * at / np.sqrt(2), 2 * np.pi * at / 1.533751168755204288118041
-    quaternions = np.stack([inner * np.sin(one), inner * np.cos(one), outer * np.sin(two), outer * np.cos(two)], axis=-1)
+    quaternions = np.stack(
+        [inner * np.sin(one), inner * np.cos(one), outer * np.sin(two), outer * np.cos(two)], axis=-1
+    )
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 

@@ -75,7 +75,16 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         kept = settings.data.resolve() / PHANTOMS
-        run_job(spec, folder, events=events, doors=doors, cluster=workers, is_logged=True, before=lambda: jobs.take_turn(events.job), phantoms=kept)
+        run_job(
+            spec,
+            folder,
+            events=events,
+            doors=doors,
+            cluster=workers,
+            is_logged=True,
+            before=lambda: jobs.take_turn(events.job),
+            phantoms=kept,
+        )
 
     def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         if first_stage(spec, folder) == "capture":
@@ -91,7 +100,12 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         finally:
             dome.close()
 
-    readers, openers, lookers, auditors = ThreadPool.reading(jobs.repository.engine), ThreadPool(1), ThreadPool(1), ThreadPool(1)
+    readers, openers, lookers, auditors = (
+        ThreadPool.reading(jobs.repository.engine),
+        ThreadPool(1),
+        ThreadPool(1),
+        ThreadPool(1),
+    )
     parsers = ThreadPool(1)
     # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
     darkeners, dark_auditors = ThreadPool(DARKENERS), ThreadPool(1)
@@ -117,7 +131,9 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             for close in (darken, *(clerks.close for clerks in everybody), jobs.close, workers.close):
                 await closing.ask(close)
 
-    app = FastAPI(title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+    app = FastAPI(
+        title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None
+    )
     app.state.darken, app.state.parsers = darken, parsers
     problems.install(app)
     app.include_router(build_router(jobs, feed, readers, openers, lookers, cancellers))
@@ -129,7 +145,14 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     observation.include_routes(app)
     install(app, settings, jobs.repository.engine, auditors, dark_auditors)
     app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
-    names = {"127.0.0.1", "localhost", "::1", settings.host, urlsplit(settings.public_url or "").hostname or "", *settings.names.split(",")} - {""}
+    names = {
+        "127.0.0.1",
+        "localhost",
+        "::1",
+        settings.host,
+        urlsplit(settings.public_url or "").hostname or "",
+        *settings.names.split(","),
+    } - {""}
     app.add_middleware(BrowserProtection, names=names, secure=not settings.is_loopback)
     observation.watch_requests(app)
     return app

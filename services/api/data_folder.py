@@ -38,7 +38,9 @@ def require_own_folder(engine: sql.Engine, data: Path) -> None:
     if owner not in {None, own}:
         engine.dispose()
         what = f"The database belongs to another data folder than {data}, which has none of its jobs' files"
-        raise SettingsError(f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder is lost for good.")
+        raise SettingsError(
+            f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder is lost for good."
+        )
 
 
 def keep_password_apart(url: str, data: Path) -> str:

@@ -35,7 +35,9 @@ class Observation:
         workers: Callable[[], str] | None = None,
     ) -> None:
         engine, policy = jobs.repository.engine, AddressPolicy(settings.private_webhooks)
-        readiness = Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler, certificates, workers)
+        readiness = Readiness(
+            engine, jobs.folder(""), jobs.is_running, jobs.free_bytes, settings.scheduler, certificates, workers
+        )
         deliveries = Deliveries(engine)
         self._registry = build_registry(engine, readiness, jobs.free_bytes)
         self._routers = (

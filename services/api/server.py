@@ -53,7 +53,10 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
 
     with _sole_server(settings.data), closing(_listen(settings)) as listener:
         if not is_dashboard_built():
-            print("The dashboard is not built; run make dashboard and start again. The API works without it.", file=sys.stderr)
+            print(
+                "The dashboard is not built; run make dashboard and start again. The API works without it.",
+                file=sys.stderr,
+            )
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(sys.stderr)
@@ -86,7 +89,9 @@ def _tell_setup_link(settings: ServerSettings, port: int) -> None:
         engine.dispose()
     if secret is not None:
         link = f"{setup_address(settings, port)}/#/setup/{secret.get_secret_value()}"
-        logging.getLogger(__name__).info("Nobody has a token yet. Open this link within an hour to make the administrator's: %s", link)
+        logging.getLogger(__name__).info(
+            "Nobody has a token yet. Open this link within an hour to make the administrator's: %s", link
+        )
 
 
 @contextmanager
@@ -98,7 +103,9 @@ def _telling_what_cannot_be_written(data: Path) -> Iterator[None]:
     except (OSError, DBAPIError) as problem:
         reason = problem.orig if isinstance(problem, DBAPIError) else problem.strerror or problem
         what = f"The server cannot use its data folder {data} or its database ({redacted(str(reason).splitlines()[0])})"
-        raise PlatformError(f"{what}; free some disk, correct path and permissions, and see that the database answers.") from problem
+        raise PlatformError(
+            f"{what}; free some disk, correct path and permissions, and see that the database answers."
+        ) from problem
 
 
 def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
@@ -116,14 +123,18 @@ def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
 
 def _listen(settings: ServerSettings) -> socket.socket:
     # asyncio sends small answers at once (TCP_NODELAY) only where the protocol is named; else each waits some 40 ms for an acknowledgement
-    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = socket.socket(
+        socket.AF_INET6 if ":" in settings.host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP
+    )
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((settings.host, settings.port))
         listener.listen()
     except OSError as problem:
         listener.close()
-        raise PlatformError(f"Cannot listen on {settings.host}:{settings.port} ({problem.strerror}); choose another --port.") from problem
+        raise PlatformError(
+            f"Cannot listen on {settings.host}:{settings.port} ({problem.strerror}); choose another --port."
+        ) from problem
     return listener
 
 
@@ -139,5 +150,7 @@ def _sole_server(data: Path) -> Iterator[None]:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise PlatformError(f"Another server uses the data folder {data}; stop it or choose another --data.") from None
+            raise PlatformError(
+                f"Another server uses the data folder {data}; stop it or choose another --data."
+            ) from None
         yield

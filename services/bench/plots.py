@@ -26,7 +26,9 @@ def error_against_time(rows: Rows) -> Figure:
     for row in rows:
         panels.setdefault((row["benchmark"].removesuffix(SUMMARY), row.get("parameter") or ""), []).append(row)
     # A summary over several panels has nothing to draw.
-    panels = {name: drawn for name, drawn in panels.items() if any(not row["benchmark"].endswith(SUMMARY) for row in drawn)}
+    panels = {
+        name: drawn for name, drawn in panels.items() if any(not row["benchmark"].endswith(SUMMARY) for row in drawn)
+    }
     figure, axes = grid(len(panels))
     for one, (name, drawn) in zip(axes, panels.items(), strict=True):
         draw_errors(one, drawn)

@@ -28,5 +28,12 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
                 begun = time.perf_counter()
                 result = simulate_slab((layer,), **options, rel_error=rel_error, gradient=gradient)
                 error = max(result.R_se / result.R, result.T_se / max(result.T, 1e-3))
-                rows.append(Row(benchmark=f"{name}{'-gradient' if gradient else ''}", peer="dentine", seconds=time.perf_counter() - begun, error=error))
+                rows.append(
+                    Row(
+                        benchmark=f"{name}{'-gradient' if gradient else ''}",
+                        peer="dentine",
+                        seconds=time.perf_counter() - begun,
+                        error=error,
+                    )
+                )
     return [row.model_dump() for row in rows]

@@ -45,7 +45,10 @@ class Console:
         self._driving, self._ending = threading.Lock(), threading.Event()
         self._held = ExitStack()
         self._dome: ModbusDome | None = None
-        self._budget, self._until_s = ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s), 0.0
+        self._budget, self._until_s = (
+            ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s),
+            0.0,
+        )
         self._newest_off, self._ordering = 0, threading.Lock()
         self._keeper = threading.Thread(target=self._keep, name="light keeper")
         self._keeper.start()
@@ -57,7 +60,11 @@ class Console:
         except DentineError as problem:
             return DomeAnswer(number=command.number, code=problem.code, message=problem.message)
         except Exception as problem:
-            return DomeAnswer(number=command.number, code=DentineError.code, message=f"The dome's console broke with {type(problem).__name__}: {problem}.")
+            return DomeAnswer(
+                number=command.number,
+                code=DentineError.code,
+                message=f"The dome's console broke with {type(problem).__name__}: {problem}.",
+            )
 
     def close(self) -> None:
         """End dark, also in mid-preflight."""
@@ -117,7 +124,9 @@ class Console:
         try:
             if self._dome is None:
                 self._forget_old_dose()
-                self._dome = self._held.enter_context(ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s))
+                self._dome = self._held.enter_context(
+                    ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s)
+                )
             self._require_wanted(command)
             _require_light(command.light, self._dome.light_count)
             self._dome.light(command.light, command.level, command.on_s)
@@ -138,7 +147,9 @@ class Console:
         self._forget_old_dose()
         try:
             with planned.in_use(self._budget.spent_s) as (self._dome, cameras):
-                return preflight(planned.plan, self._dome, cameras, planned.spec, partial(self._require_wanted, command))
+                return preflight(
+                    planned.plan, self._dome, cameras, planned.spec, partial(self._require_wanted, command)
+                )
         finally:
             self._dome, self._until_s = None, time.monotonic()
 

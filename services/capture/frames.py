@@ -104,12 +104,19 @@ class FrameStore:
     def _attempts(self) -> list[Path]:
         prefix = f".{self._writer.stage}."
         attempts = [p for p in self._writer.root.glob(f"{prefix}*") if p.name.removeprefix(prefix).isdigit()]
-        return sorted((p for p in attempts if int(p.name.removeprefix(prefix)) <= self._writer.attempt), key=lambda p: -int(p.name.removeprefix(prefix)))
+        return sorted(
+            (p for p in attempts if int(p.name.removeprefix(prefix)) <= self._writer.attempt),
+            key=lambda p: -int(p.name.removeprefix(prefix)),
+        )
 
     def _newest_leftover(self) -> Path | None:
         for folder in self._attempts():
             journal = folder / JOURNAL
-            if journal.is_file() and (folder / ARRAY / "zarr.json").is_file() and journal.read_text().partition("\n")[0] == self._header:
+            if (
+                journal.is_file()
+                and (folder / ARRAY / "zarr.json").is_file()
+                and journal.read_text().partition("\n")[0] == self._header
+            ):
                 return folder
         return None
 

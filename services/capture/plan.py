@@ -49,7 +49,9 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
             dose limit.
     """
     if rig.black_frames > MAX_BLACK_FRAMES:
-        raise SettingsError(f"rig.black_frames {rig.black_frames} are more than {MAX_BLACK_FRAMES}, which average all noise away; lower it.")
+        raise SettingsError(
+            f"rig.black_frames {rig.black_frames} are more than {MAX_BLACK_FRAMES}, which average all noise away; lower it."
+        )
     frames = tuple(_frame(rig, lights, index, light) for index, light in enumerate(_order(rig, lights)))
     require_exposure(frames, lights, rig)
     if (on_s := rig.settle_s + rig.exposure_s) > MAX_ON_TIME_S:
@@ -90,7 +92,9 @@ def _frame(rig: RigSpec, lights: int, index: int, what: int | Literal["black", "
     wanted = {"black": 0.0, "tracking": rig.level / lights, "light": rig.level}[kind]
     word = level_word(wanted)
     if kind != "black" and word == 0:
-        raise SettingsError(f"rig.level {rig.level:g} is below one step of the dome's 16-bit levels in a {kind} frame; raise it.")
+        raise SettingsError(
+            f"rig.level {rig.level:g} is below one step of the dome's 16-bit levels in a {kind} frame; raise it."
+        )
     return PlannedFrame(
         index=index,
         kind=kind,

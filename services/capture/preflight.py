@@ -14,7 +14,9 @@ from services.core.records import RigSpec
 BLACK_TOLERANCE = 0.005
 
 
-def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_unwanted: Callable[[], None]) -> tuple[str, ...]:
+def preflight(
+    plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_unwanted: Callable[[], None]
+) -> tuple[str, ...]:
     """Light every light for a moment, then expose one black and one lit frame.
 
     Args:
@@ -48,7 +50,9 @@ def preflight(plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: R
     for camera, image in enumerate(images):
         fraction = clipped_fraction(image, cameras.bits)
         if fraction > CLIPPED_FRACTION:
-            findings.append(f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or rig.exposure_s.")
+            findings.append(
+                f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or rig.exposure_s."
+            )
         if float(image.max()) - cameras.black_level < 2 * BLACK_TOLERANCE * full_scale:
             findings.append(f"Camera {camera} sees no light in a {lit.kind} frame; open its shutter or check its aim.")
     return tuple(findings)

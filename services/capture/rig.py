@@ -66,11 +66,15 @@ class PlannedRig:
         """
         spec = self.spec
         with dome_address(spec.dome, len(self.lights), spec.watchdog_s) as (host, port):
-            budget = ExposureBudget(spec.light_exposure_limit_s, spec.total_exposure_limit_s, {} if spent_s is None else spent_s)
+            budget = ExposureBudget(
+                spec.light_exposure_limit_s, spec.total_exposure_limit_s, {} if spent_s is None else spent_s
+            )
             with ModbusDome(host, port, budget, spec.watchdog_s) as dome:
                 if dome.light_count < len(self.lights):
                     listing = f"{spec.mouth / 'capture.json'} lists {len(self.lights)}"
-                    raise RigError(f"The dome at {dome.address} has {dome.light_count} lights and {listing}; correct rig.dome.")
+                    raise RigError(
+                        f"The dome at {dome.address} has {dome.light_count} lights and {listing}; correct rig.dome."
+                    )
                 with self._cameras(host, port, dome.pause) as cameras:
                     yield dome, cameras
 
@@ -82,10 +86,15 @@ class PlannedRig:
             return PlaybackCameras(self.stills, spec, level, plan, wait)
 
         def simulated() -> SimulatedCameras:
-            motion = SubjectMotion(spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed)
+            motion = SubjectMotion(
+                spec.simulation.motion_px, reference=spec.black_frames, last=len(plan) - 1, seed=spec.simulation.seed
+            )
             return SimulatedCameras(self.stills, spec, level, motion, host, port, wait)
 
-        kinds: dict[str, Callable[[], PlaybackCameras | SimulatedCameras]] = {"playback": playback, "simulated": simulated}
+        kinds: dict[str, Callable[[], PlaybackCameras | SimulatedCameras]] = {
+            "playback": playback,
+            "simulated": simulated,
+        }
         return chosen("rig.cameras", spec.cameras, kinds)()
 
 
@@ -102,12 +111,18 @@ def _require_sensor(sensor: SimulatedCameraSpec) -> None:
     if not 0 <= sensor.seed < 2**63:
         raise SettingsError(f"rig.simulation.seed {sensor.seed} is no seed; give a whole number from 0 to 2**63 - 1.")
     if sensor.motion_px > MAX_MOTION_PX:
-        raise SettingsError(f"rig.simulation.motion_px {sensor.motion_px:g} is more than {MAX_MOTION_PX:g} pixels, which no subject moves; lower it.")
+        raise SettingsError(
+            f"rig.simulation.motion_px {sensor.motion_px:g} is more than {MAX_MOTION_PX:g} pixels, which no subject moves; lower it."
+        )
 
 
 def _read_description(path: Path) -> FolderCapture:
     description = read_record(path, FolderCapture)
-    parts = {"camera": [c.name for c in description.cameras], "light": [light.name for light in description.lights], "channel": list(description.channels)}
+    parts = {
+        "camera": [c.name for c in description.cameras],
+        "light": [light.name for light in description.lights],
+        "channel": list(description.channels),
+    }
     for part, names in parts.items():
         if not names:
             raise CaptureInputError(f"{path} lists no {part}; describe the rig in it.")

@@ -19,7 +19,13 @@ CLIPPED_FRACTION = 0.01
 
 
 def capture_frames(
-    plan: Sequence[PlannedFrame], lights: Sequence[str], dome: Dome, cameras: Cameras, settle_s: float, store: FrameStore, context: StageContext
+    plan: Sequence[PlannedFrame],
+    lights: Sequence[str],
+    dome: Dome,
+    cameras: Cameras,
+    settle_s: float,
+    store: FrameStore,
+    context: StageContext,
 ) -> None:
     """Expose and store every planned frame that is not acknowledged yet.
 
@@ -31,7 +37,13 @@ def capture_frames(
     missing = [frame for frame in plan if frame.index not in store.acknowledged]
     if len(missing) < len(plan):
         done = len(plan) - len(missing)
-        context.report(StageEvent(stage="capture", kind="log", message=f"Resuming: {done} of {len(plan)} frames were already acknowledged."))
+        context.report(
+            StageEvent(
+                stage="capture",
+                kind="log",
+                message=f"Resuming: {done} of {len(plan)} frames were already acknowledged.",
+            )
+        )
     began_s = time.monotonic()
     resumed_at_s = max((frame.time_s for frame in store.acknowledged.values()), default=0.0)
     for count, frame in enumerate(missing, start=1):
@@ -39,7 +51,15 @@ def capture_frames(
         name = None if frame.light is None else lights[frame.light]
         time_s = resumed_at_s + time.monotonic() - began_s
         readback, images = expose(frame, dome, cameras, settle_s)
-        record = FrameRecord(index=frame.index, kind=frame.kind, light=name, exposure_s=frame.exposure_s, level=frame.level, time_s=time_s, readback=readback)
+        record = FrameRecord(
+            index=frame.index,
+            kind=frame.kind,
+            light=name,
+            exposure_s=frame.exposure_s,
+            level=frame.level,
+            time_s=time_s,
+            readback=readback,
+        )
         store.store(record, images)
         remaining_s = (time.monotonic() - began_s) / count * (len(missing) - count)
         context.report(
@@ -53,7 +73,9 @@ def capture_frames(
         )
 
 
-def expose(frame: PlannedFrame, dome: Dome, cameras: Cameras, settle_s: float) -> tuple[Rgb, tuple[NDArray[np.uint16], ...]]:
+def expose(
+    frame: PlannedFrame, dome: Dome, cameras: Cameras, settle_s: float
+) -> tuple[Rgb, tuple[NDArray[np.uint16], ...]]:
     """One exposure of all cameras; the dome is dark before and after. Returns the levels read back and the counts."""
     try:
         cameras.arm(frame.exposure_s, frame.index)
@@ -71,7 +93,11 @@ def expose(frame: PlannedFrame, dome: Dome, cameras: Cameras, settle_s: float) -
 
 def _clipping(images: Sequence[NDArray[np.uint16]], cameras: Cameras) -> str:
     fraction = max(clipped_fraction(image, cameras.bits) for image in images)
-    return f"; {fraction:.1%} of a camera's pixels are clipped, lower rig.level or rig.exposure_s" if fraction > CLIPPED_FRACTION else ""
+    return (
+        f"; {fraction:.1%} of a camera's pixels are clipped, lower rig.level or rig.exposure_s"
+        if fraction > CLIPPED_FRACTION
+        else ""
+    )
 
 
 def clipped_fraction(image: NDArray[np.uint16], bits: int) -> float:

@@ -43,18 +43,26 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     from services.core.files.meshes import read_teeth
 
     if spec.rig is None:
-        raise SettingsError("The capture stage needs option [rig]; add it, or give 'capture' and start from the prepare stage.")
+        raise SettingsError(
+            "The capture stage needs option [rig]; add it, or give 'capture' and start from the prepare stage."
+        )
     rig = PlannedRig.read(spec.rig)
     description, plan = rig.description, rig.plan
     teeth = read_teeth(spec.rig.mouth)
 
     writer = StageWriter(context.root, "capture", context.attempt)
-    context.report(StageEvent(stage="capture", kind="started", message=f"{len(plan)} frames of {len(description.cameras)} cameras."))
+    context.report(
+        StageEvent(
+            stage="capture", kind="started", message=f"{len(plan)} frames of {len(description.cameras)} cameras."
+        )
+    )
     widths, heights = zip(*(camera.size for camera in description.cameras), strict=True)
     shape = (len(description.cameras), len(plan), max(heights), max(widths), len(description.channels))
     # Where the dome is and how far it may go do not change a frame; everything else does.
     pixels = spec.rig.model_dump(mode="json", exclude=set(LIMITS_OF_A_RIG))
-    store = FrameStore(writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance))
+    store = FrameStore(
+        writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance)
+    )
 
     with rig.in_use() as (dome, cameras), interrupting(context.raise_if_cancelled, dome.interrupt):
         # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by the dome.
@@ -76,7 +84,9 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     _copy_meshes(spec.rig.mouth, writer.folder, manifest.fdi)
     writer.publish(manifest)
     store.remove_leftovers()
-    context.report(StageEvent(stage="capture", kind="finished", message=f"{len(manifest.frames)} frames captured.", done=1.0))
+    context.report(
+        StageEvent(stage="capture", kind="finished", message=f"{len(manifest.frames)} frames captured.", done=1.0)
+    )
     return manifest
 
 

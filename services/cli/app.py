@@ -63,7 +63,13 @@ def build_app() -> typer.Typer:
     from services.cli.token import build_token_app
     from services.core.settings import read_settings
 
-    app = typer.Typer(name="dentine", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app = typer.Typer(
+        name="dentine",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
     app.callback()(_root)
     local = serve, dome_sim, capture, run, export, phantom, bench
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo):
@@ -79,7 +85,9 @@ def build_app() -> typer.Typer:
     return app
 
 
-_EXTRAS = MappingProxyType({"serve": "api", "token": "api", "capture": "capture", "dome-sim": "capture", "bench": "worker,bench"})
+_EXTRAS = MappingProxyType(
+    {"serve": "api", "token": "api", "capture": "capture", "dome-sim": "capture", "bench": "worker,bench"}
+)
 """What a command needs beside the base installation; of those that are not named here all that a worker has."""
 
 
@@ -101,7 +109,11 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _root(version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")] = False) -> None:
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+) -> None:
     """From a capture of a person's teeth to a measured, renderable asset."""
 
 

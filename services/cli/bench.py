@@ -29,7 +29,9 @@ _BENCHMARKS = MappingProxyType(
 
 def bench(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run, or all; without it they are listed.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the result to this file, and a picture of it beside it.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Also write the result to this file, and a picture of it beside it.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A smaller case, for a check.")] = False,
     case: Annotated[str | None, typer.Option(help="Which case of a benchmark that has several.")] = None,
 ) -> None:
@@ -63,7 +65,11 @@ def bench(
         return
     json_file.write_text(text + "\n")
     for one in names:
-        _draw(modules[one], results[one], json_file.with_name(f"{json_file.stem}-{one}.png") if name == "all" else json_file.with_suffix(".png"))
+        _draw(
+            modules[one],
+            results[one],
+            json_file.with_name(f"{json_file.stem}-{one}.png") if name == "all" else json_file.with_suffix(".png"),
+        )
 
 
 def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
@@ -71,6 +77,9 @@ def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
     try:
         from services.bench.plots import error_against_time, write_png
     except ModuleNotFoundError as missing:
-        print(f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install 'dentine[bench]'.", file=sys.stderr)
+        print(
+            f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install 'dentine[bench]'.",
+            file=sys.stderr,
+        )
         return
     write_png(getattr(module, "picture", error_against_time)(rows), png)

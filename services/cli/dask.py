@@ -31,7 +31,9 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
     @app.command(context_settings=_ALL_TO_DASK)
     def worker(
         context: typer.Context,
-        captures_only: Annotated[bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")] = False,
+        captures_only: Annotated[
+            bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")
+        ] = False,
     ) -> None:
         """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address.
 
@@ -39,7 +41,9 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
         """
         require_scheduler_named(context.args, os.environ)
         claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
-        _become("worker", [*_claiming(context.args, claims), "--preload", "services.pipeline.worker_setup"], tls_folder())
+        _become(
+            "worker", [*_claiming(context.args, claims), "--preload", "services.pipeline.worker_setup"], tls_folder()
+        )
 
     @app.command("worker-health")
     def worker_health() -> None:
@@ -56,7 +60,9 @@ def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:
     for argument in rest:
         option, is_joined, value = argument.partition("=")
         if option == "--resources":
-            named |= dict(part.split("=", 1) for part in (value if is_joined else next(rest, "")).split() if "=" in part)
+            named |= dict(
+                part.split("=", 1) for part in (value if is_joined else next(rest, "")).split() if "=" in part
+            )
         else:
             others.append(argument)
     named = {name: str(amount) for name, amount in claims.items()} | named
@@ -81,6 +87,15 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
 
     certificates = Certificates.of(folder) if folder is not None else None
     secured = [scheduler_address(argument, certificates) for argument in arguments]
-    command = [sys.executable, "-m", "dask", part, *secured, "--preload", "services.pipeline.close_http", *(certificates.arguments() if certificates else ())]
+    command = [
+        sys.executable,
+        "-m",
+        "dask",
+        part,
+        *secured,
+        "--preload",
+        "services.pipeline.close_http",
+        *(certificates.arguments() if certificates else ()),
+    ]
     os.umask(PRIVATE)  # which what is started here inherits: a worker writes captures of people, too
     os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

@@ -27,22 +27,40 @@ class BoundaryName(StrEnum):
 
 def phantom(
     out: Annotated[Path, typer.Option(help="Folder to write the rig, meshes, images and known optics to.")],
-    jaw: Annotated[bool, typer.Option("--jaw", help="A whole upper jaw with gums and the mouth's wall instead of one tooth.")] = False,
-    subject: Annotated[int | None, typer.Option(min=0, help="Whose jaw: a number draws shapes and optics; default: the average.")] = None,
+    jaw: Annotated[
+        bool, typer.Option("--jaw", help="A whole upper jaw with gums and the mouth's wall instead of one tooth.")
+    ] = False,
+    subject: Annotated[
+        int | None, typer.Option(min=0, help="Whose jaw: a number draws shapes and optics; default: the average.")
+    ] = None,
     scan: Annotated[Path | None, typer.Option(help="Labelled scan (.vtp or .ply) to take the jaw from.")] = None,
-    pixel_mm: Annotated[float | None, typer.Option(min=0.01, help="Size of a pixel at the teeth, mm; default: 0.5 for a tooth, 1 for a jaw.")] = None,
+    pixel_mm: Annotated[
+        float | None,
+        typer.Option(min=0.01, help="Size of a pixel at the teeth, mm; default: 0.5 for a tooth, 1 for a jaw."),
+    ] = None,
     cameras: Annotated[int, typer.Option(min=1, help="Number of cameras.")] = 3,
     lights: Annotated[int, typer.Option(min=1, help="Number of lights, held-out ones included.")] = 8,
-    held_out: Annotated[int | None, typer.Option(min=0, help="How many of the lights are kept from the fit; default: every fourth.")] = None,
+    held_out: Annotated[
+        int | None, typer.Option(min=0, help="How many of the lights are kept from the fit; default: every fourth.")
+    ] = None,
     channels: Annotated[int, typer.Option(min=1, max=3, help="1 (green) or 3 (red, green, blue).")] = 1,
     boundary: Annotated[BoundaryName, typer.Option(help="Model of the enamel surface.")] = BoundaryName.MATCHED,
-    renderer: Annotated[RendererName, typer.Option(help="The project's engine, or stock Mitsuba for a matched boundary.")] = RendererName.ENGINE,
+    renderer: Annotated[
+        RendererName, typer.Option(help="The project's engine, or stock Mitsuba for a matched boundary.")
+    ] = RendererName.ENGINE,
     samples: Annotated[int, typer.Option(min=1, help="Paths per pixel.")] = 1024,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     outer: Annotated[Path | None, typer.Option(help="Enamel surface to use instead of the procedural one.")] = None,
     dentin: Annotated[Path | None, typer.Option(help="Dentin surface to use instead of the procedural one.")] = None,
-    fdi: Annotated[int | None, typer.Option(help="FDI number of the tooth that --outer gives; default: 11. A fit takes dentin's shape from it.")] = None,
-    highlights: Annotated[bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")] = False,
+    fdi: Annotated[
+        int | None,
+        typer.Option(
+            help="FDI number of the tooth that --outer gives; default: 11. A fit takes dentin's shape from it."
+        ),
+    ] = None,
+    highlights: Annotated[
+        bool, typer.Option("--highlights", help="Add the surface's reflection of each light.")
+    ] = False,
     gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
 ) -> None:
@@ -55,9 +73,22 @@ def phantom(
     of_tooth |= {"--highlights": highlights, "--gums": gums, "--stains": stains}
     for option, given in (of_tooth if jaw else of_jaw).items():
         if given:
-            raise InputError(f"Option {option} is for one tooth; leave out either it or --jaw." if jaw else f"Option {option} is for a jaw; add --jaw.")
-    rig: dict[str, Any] = {"cameras": cameras, "lights": lights, "held_out": held_out, "channels": channels, "seed": seed, "samples": samples}
-    rig |= {"boundary": boundary.value, "renderer": renderer.value} | ({} if pixel_mm is None else {"pixel_mm": pixel_mm})
+            raise InputError(
+                f"Option {option} is for one tooth; leave out either it or --jaw."
+                if jaw
+                else f"Option {option} is for a jaw; add --jaw."
+            )
+    rig: dict[str, Any] = {
+        "cameras": cameras,
+        "lights": lights,
+        "held_out": held_out,
+        "channels": channels,
+        "seed": seed,
+        "samples": samples,
+    }
+    rig |= {"boundary": boundary.value, "renderer": renderer.value} | (
+        {} if pixel_mm is None else {"pixel_mm": pixel_mm}
+    )
     if jaw:
         from services.phantom.jaw import write_jaw_phantom
 
@@ -65,5 +96,15 @@ def phantom(
     else:
         from services.phantom.tooth import write_phantom
 
-        write_phantom(out, outer=outer, dentin=dentin, fdi=fdi, highlights=highlights, gums=gums, stains=stains, subject=subject, **rig)
+        write_phantom(
+            out,
+            outer=outer,
+            dentin=dentin,
+            fdi=fdi,
+            highlights=highlights,
+            gums=gums,
+            stains=stains,
+            subject=subject,
+            **rig,
+        )
     print(f"phantom: {out}")

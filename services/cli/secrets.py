@@ -22,7 +22,9 @@ def build_secrets_app(settings: Callable[[], ServerSettings]) -> typer.Typer:
     @app.command()
     def make(
         folder: Folder,
-        renew: Annotated[bool, typer.Option("--renew", help="Make the certificate of the parts anew in any case.")] = False,
+        renew: Annotated[
+            bool, typer.Option("--renew", help="Make the certificate of the parts anew in any case.")
+        ] = False,
     ) -> None:
         """Make what is absent or ends within 60 days; what is there stays."""
         from services.api.deployment.secrets import make_missing

@@ -10,8 +10,13 @@ import typer
 
 
 def serve(
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port to listen on; 0 picks a free one; default: the settings'.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of the database and the jobs; default: the settings'.")] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port to listen on; 0 picks a free one; default: the settings'."),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of the database and the jobs; default: the settings'.")
+    ] = None,
 ) -> None:
     """Serve the API and the dashboard on loopback."""
     from services.api.server import serve as serve_api

@@ -41,18 +41,31 @@ def simulate_slab_command(
             "table: {angles_rad, values} instead of beta, g1, g2."
         ),
     ] = None,
-    ior: Annotated[float, typer.Option(min=1, max=3, help="Index of refraction, used by boundaries thin and smooth.")] = 1.0,
+    ior: Annotated[
+        float, typer.Option(min=1, max=3, help="Index of refraction, used by boundaries thin and smooth.")
+    ] = 1.0,
     boundary: Annotated[SlabBoundary, typer.Option(help="Optical boundary.")] = SlabBoundary.MATCHED,
     source: Annotated[SlabSource, typer.Option(help="Light along the normal, or diffuse.")] = SlabSource.NORMAL,
-    mu_incident: Annotated[float, typer.Option(min=0, max=1, help="Cosine to the normal of the beam of source normal.")] = 1.0,
-    exit_cosines: Annotated[str, typer.Option(help="Also the radiance of scattered light at these cosines to the normal, as 0.1,0.5,1.")] = "",
+    mu_incident: Annotated[
+        float, typer.Option(min=0, max=1, help="Cosine to the normal of the beam of source normal.")
+    ] = 1.0,
+    exit_cosines: Annotated[
+        str, typer.Option(help="Also the radiance of scattered light at these cosines to the normal, as 0.1,0.5,1.")
+    ] = "",
     ring_edges: Annotated[
-        str, typer.Option(help="Also the scattered light that leaves between these radii about the point of entry, and beyond the last, mm, as 0.1,0.5.")
+        str,
+        typer.Option(
+            help="Also the scattered light that leaves between these radii about the point of entry, and beyond the last, mm, as 0.1,0.5."
+        ),
     ] = "",
     rel_error: Annotated[float, typer.Option(min=1e-5, max=1, help="Relative standard error to reach.")] = 1e-3,
-    gradient: Annotated[bool, typer.Option("--gradient", help="Also the derivatives with their standard errors.")] = False,
+    gradient: Annotated[
+        bool, typer.Option("--gradient", help="Also the derivatives with their standard errors.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
-    max_seconds: Annotated[float, typer.Option(min=0, help="Give the result as it stands after this time, marked as not complete.")] = 600.0,
+    max_seconds: Annotated[
+        float, typer.Option(min=0, help="Give the result as it stands after this time, marked as not complete.")
+    ] = 600.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Reflectance and transmittance of a slab by the walk that the fit uses."""
@@ -65,7 +78,10 @@ def simulate_slab_command(
         rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds, numbered=layers is not None,
     )  # fmt: skip
     if not result.complete:
-        print("The time ran out before every standard error was reached; the ones printed are true, give --max-seconds for smaller ones.", file=sys.stderr)
+        print(
+            "The time ran out before every standard error was reached; the ones printed are true, give --max-seconds for smaller ones.",
+            file=sys.stderr,
+        )
     figures = result.as_json()
     print(json.dumps(figures) if as_json else _table(figures, cosines, edges_mm))
 
@@ -74,7 +90,9 @@ def _numbers(option: str, text: str) -> tuple[float, ...]:
     try:
         return tuple(float(number) for number in text.split(",")) if text else ()
     except ValueError as problem:
-        raise SettingsError(f"Option {option} = {text} is not a list of numbers; separate them by commas, as 0.1,0.5,1.") from problem
+        raise SettingsError(
+            f"Option {option} = {text} is not a list of numbers; separate them by commas, as 0.1,0.5,1."
+        ) from problem
 
 
 def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> tuple[Any, ...]:
@@ -105,14 +123,19 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
         return tuple(TypeAdapter(list[Layer]).validate_python(layers))
     except ValidationError as problem:
         first = problem.errors()[0]
-        raise SettingsError(f"Option --layers, {'.'.join(str(part) for part in first['loc']) or 'value'}: {first['msg']}; correct it.") from problem
+        raise SettingsError(
+            f"Option --layers, {'.'.join(str(part) for part in first['loc']) or 'value'}: {first['msg']}; correct it."
+        ) from problem
 
 
 def _table(figures: dict[str, Any], cosines: tuple[float, ...], edges_mm: tuple[float, ...]) -> str:
     """One line per total, derivative, radiance and ring, each with its standard error."""
     lines = [f"{name:<4} {figures[name]:.6f} +- {figures[f'{name}_se']:.1e}" for name in ("R", "T")]
     for name in ("dR", "dT"):
-        lines += [f"{name}/d{wrt:<8} {value:+.5e} +- {figures[f'{name}_se'][wrt]:.1e}" for wrt, value in (figures.get(name) or {}).items()]
+        lines += [
+            f"{name}/d{wrt:<8} {value:+.5e} +- {figures[f'{name}_se'][wrt]:.1e}"
+            for wrt, value in (figures.get(name) or {}).items()
+        ]
     rings = [f"{low:g} to {high:g} mm" for low, high in pairwise((0.0, *edges_mm, math.inf))]
     for name, places in (("radiance", [f"at {cosine:g}" for cosine in cosines]), ("rings", rings)):
         if faces := figures[name]:

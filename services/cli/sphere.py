@@ -12,9 +12,13 @@ if TYPE_CHECKING:
 
 
 def sphere_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings: JSON of kind sphere, or an .rxt file of IAD.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Readings: JSON of kind sphere, or an .rxt file of IAD.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of parameters.json, readings.json and translucency.json.")],
-    black: Annotated[float, typer.Option(min=0, max=1, help="Reflectance of the black backing, for the translucency.")] = 0.0,
+    black: Annotated[
+        float, typer.Option(min=0, max=1, help="Reflectance of the black backing, for the translucency.")
+    ] = 0.0,
     white: Annotated[float, typer.Option(min=0, max=1, help="Reflectance of the white backing.")] = 1.0,
 ) -> None:
     """Measure absorption and reduced scattering from a slab's reflectance and transmittance."""
@@ -25,7 +29,9 @@ def sphere_command(
     from services.fit.slab.sphere.write import write_sphere
 
     if not black < white:
-        raise SettingsError(f"Option --black = {black:g} is not below --white = {white:g}; give the darker backing as --black.")
+        raise SettingsError(
+            f"Option --black = {black:g} is not below --white = {white:g}; give the darker backing as --black."
+        )
     readings = read_readings(file)
     fits = fit_readings(readings)
     translucency = translucency_of(readings, fits, black, white)

@@ -15,7 +15,9 @@ import typer
 if TYPE_CHECKING:
     from services.api.auth.tokens import Tokens
 
-Data = Annotated[Path | None, typer.Option(help="Folder of the server's SQLite database; default: the settings' database.")]
+Data = Annotated[
+    Path | None, typer.Option(help="Folder of the server's SQLite database; default: the settings' database.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -26,9 +28,14 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
     @app.command()
     def create(
         name: Annotated[str, typer.Argument(help="Who or what uses it.")],
-        scope: Annotated[list[str], typer.Option(help="What it may do: read, submit, operate-dome or admin; may be given several times.")],
+        scope: Annotated[
+            list[str],
+            typer.Option(help="What it may do: read, submit, operate-dome or admin; may be given several times."),
+        ],
         expires_days: Annotated[float | None, typer.Option(min=0, help="Days until it ends; default: never.")] = None,
-        group: Annotated[str | None, typer.Option(help="Whose jobs and captures it sees and makes; default: its own alone.")] = None,
+        group: Annotated[
+            str | None, typer.Option(help="Whose jobs and captures it sees and makes; default: its own alone.")
+        ] = None,
         data: Data = None,
         as_json: Json = False,
     ) -> None:
@@ -43,7 +50,10 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
             audited = AuditedAction("dentine token create", "command line", "local")
             issued = tokens.create(name, [Scope(one) for one in scope], expires_days, audited, group)
         if group is None and set(scope) == {Scope.READ}:
-            print(f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it with --group.", file=sys.stderr)
+            print(
+                f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it with --group.",
+                file=sys.stderr,
+            )
         print(issued.model_dump_json() if as_json else issued.token.get_secret_value())
 
     @app.command("list")
@@ -60,7 +70,9 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
             print(f"{who}  {what}  made {_day(token.created_s)}  {ended}  last used {_day(token.last_used_s)}")
 
     @app.command()
-    def revoke(token: Annotated[str, typer.Argument(metavar="ID", help="Id or name that list prints.")], data: Data = None) -> None:
+    def revoke(
+        token: Annotated[str, typer.Argument(metavar="ID", help="Id or name that list prints.")], data: Data = None
+    ) -> None:
         """End a token now."""
         from services.api.auth.audit import AuditedAction
 

@@ -39,11 +39,15 @@ def require_paths(paths: Iterable[str]) -> None:
         folders.update(above)
         for own in (path, *above):
             if (other := spelled.setdefault(_folded(own), own)) != own:
-                raise UploadError(f"File {path!r}: {own!r} and {other!r} are the same to some file systems; rename one.")
+                raise UploadError(
+                    f"File {path!r}: {own!r} and {other!r} are the same to some file systems; rename one."
+                )
     if both := sorted(files & folders):
         raise UploadError(f"File {both[0]!r} is a folder of other files too; rename one.")
     if not files & DESCRIPTIONS:
-        raise UploadError(f"The capture holds neither {' nor '.join(sorted(DESCRIPTIONS))}; one of them must say what it is.")
+        raise UploadError(
+            f"The capture holds neither {' nor '.join(sorted(DESCRIPTIONS))}; one of them must say what it is."
+        )
 
 
 def path_fault(path: str) -> str | None:
@@ -53,7 +57,10 @@ def path_fault(path: str) -> str | None:
         return "is absolute; give it relative to the capture's folder"
     if any(part in {"", ".", ".."} for part in parts):
         return "is not normalised; leave out empty parts, '.' and '..'"
-    if any(unicodedata.category(letter)[0] == "C" or letter == "\\" or (letter.isspace() and letter != " ") for letter in path):
+    if any(
+        unicodedata.category(letter)[0] == "C" or letter == "\\" or (letter.isspace() and letter != " ")
+        for letter in path
+    ):
         return "has a control character, a backslash or a special space; rename it"
     if unicodedata.normalize("NFC", path) != path:
         return "is not in Unicode's normal form C; rename it"

@@ -36,7 +36,9 @@ class UploadManifest(Record):
     """What a client wants to upload."""
 
     files: tuple[ManifestFile, ...] = Field(min_length=1, fail_fast=True, description="every file of the capture")
-    subject: str | None = Field(default=None, pattern=f"^{SUBJECT}$", description="pseudonymous label of the person; never a name")
+    subject: str | None = Field(
+        default=None, pattern=f"^{SUBJECT}$", description="pseudonymous label of the person; never a name"
+    )
 
     def digest(self, owner: str = DEFAULT_GROUP) -> str:
         """The same for the same files in any order, the same subject and the same owner."""
@@ -50,7 +52,9 @@ class CaptureFile(ManifestFile):
 
     received_bytes: int = Field(description="bytes that need not be sent again")
     is_known: bool = Field(description="whether the whole content is here and verified; nothing is missing then")
-    upload: str = Field(description="where to send what is missing, by tus; create the upload there first with POST /v1/uploads")
+    upload: str = Field(
+        description="where to send what is missing, by tus; create the upload there first with POST /v1/uploads"
+    )
 
 
 class Capture(Record):
@@ -61,7 +65,9 @@ class Capture(Record):
     state: CaptureState
     subject: str | None = Field(description="pseudonymous label of the person")
     created_s: float = Field(description="Unix time")
-    expires_s: float = Field(description="Unix time at which it expires if it is still open; later with every byte received")
+    expires_s: float = Field(
+        description="Unix time at which it expires if it is still open; later with every byte received"
+    )
     file_count: int
     bytes: int = Field(description="size of all files together")
     owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
@@ -86,5 +92,7 @@ class FileFault(Record):
     """Why a file keeps its capture from being committed."""
 
     path: str
-    kind: Literal["missing", "corrupt", "refused"] = Field(description="not all received; not what the manifest says; or content that is not accepted")
+    kind: Literal["missing", "corrupt", "refused"] = Field(
+        description="not all received; not what the manifest says; or content that is not accepted"
+    )
     detail: str = Field(description="one sentence that names the file and the remedy")

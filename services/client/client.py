@@ -37,7 +37,9 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._http.close()
 
     def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
@@ -68,7 +70,9 @@ class Client:
         """A stored calibration; its 'option' is what a job takes."""
         return self.run(self._exchange.calibration(name))
 
-    def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> UploadResult:
+    def upload(
+        self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
+    ) -> UploadResult:
         """Upload a folder capture and commit it. Files that the server knows are not sent; a broken upload resumes, also in a new process.
 
         Args:
@@ -153,7 +157,9 @@ class AsyncClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    async def __aexit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         await self._http.aclose()
 
     async def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
@@ -185,7 +191,9 @@ class AsyncClient:
         """See ``Client``."""
         return await self.run(self._exchange.calibration(name))
 
-    async def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> UploadResult:
+    async def upload(
+        self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
+    ) -> UploadResult:
         """See ``Client``. ``progress`` may be called in another thread."""
         return await self.run(self._exchange.upload(folder, progress, subject))
 

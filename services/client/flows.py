@@ -62,7 +62,9 @@ def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
                 raise
             response = yield ask
     except httpx.HTTPError as problem:
-        raise PlatformError(f"Server {server} does not answer ({problem}); start it with dentine serve or give --server.") from problem
+        raise PlatformError(
+            f"Server {server} does not answer ({problem}); start it with dentine serve or give --server."
+        ) from problem
     if response.is_error:
         raise error_in(response)
     told: dict[str, Any] = response.json()
@@ -103,7 +105,9 @@ class EventCursor:
         """
         self._tries += 1
         if self._tries > RECONNECT_TRIES:
-            raise PlatformError(f"Server {self._server} no longer answers; start it again, the job is kept.") from problem
+            raise PlatformError(
+                f"Server {self._server} no longer answers; start it again, the job is kept."
+            ) from problem
 
 
 def error_in(response: Any) -> DentineError:
@@ -117,5 +121,12 @@ def error_in(response: Any) -> DentineError:
         detail += " The command line reads it from the variable DENTINE__CLIENT__TOKEN."
     if (known := error_of(code, detail)) is not None:
         return known
-    kinds = {401: UnauthenticatedError, 403: ScopeError, 404: UnknownJobError, 409: JobStateError, 422: InputError, 429: RateError}
+    kinds = {
+        401: UnauthenticatedError,
+        403: ScopeError,
+        404: UnknownJobError,
+        409: JobStateError,
+        422: InputError,
+        429: RateError,
+    }
     return kinds.get(response.status_code, DentineError)(detail)

@@ -25,13 +25,20 @@ class Requests:
         import httpx
 
         headers = {} if self._token is None else {"Authorization": f"Bearer {self._token.get_secret_value()}"}
-        return {"base_url": f"{self.server.rstrip('/')}/v1", "headers": headers, "timeout": httpx.Timeout(10.0, read=60.0), "trust_env": False}
+        return {
+            "base_url": f"{self.server.rstrip('/')}/v1",
+            "headers": headers,
+            "timeout": httpx.Timeout(10.0, read=60.0),
+            "trust_env": False,
+        }
 
     def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> Flow[dict[str, Any]]:
         """Submit a job."""
         headers = {"Idempotency-Key": key} if key is not None else {}
         label = {} if name is None else {"name": name}
-        return self._answer("POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True) | label, headers=headers)
+        return self._answer(
+            "POST", "/jobs", json=spec.model_dump(mode="json", exclude_none=True) | label, headers=headers
+        )
 
     def jobs(self, limit: int, before: int | None = None, **only: Any) -> Flow[dict[str, Any]]:
         """Some jobs, newest first; ``only`` are the list's filters."""
@@ -51,7 +58,9 @@ class Requests:
         """A stored calibration; its 'option' is what a job takes."""
         return self._answer("GET", f"/calibrations/{quote(name, safe='')}")
 
-    def upload(self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None) -> Flow[UploadResult]:
+    def upload(
+        self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
+    ) -> Flow[UploadResult]:
         """Upload a folder capture and commit it."""
         return Uploader(self.server, progress).upload(folder, subject)
 

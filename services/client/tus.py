@@ -37,11 +37,15 @@ def parse_metadata(header: str) -> dict[str, str]:
     for pair in header.split(","):
         key, _, value = pair.strip().partition(" ")
         if not _KEY.fullmatch(key) or key in found:
-            raise UploadError(f"Upload-Metadata has the key {key!r} twice or malformed; send each key once, with its value in Base64.")
+            raise UploadError(
+                f"Upload-Metadata has the key {key!r} twice or malformed; send each key once, with its value in Base64."
+            )
         try:
             found[key] = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, ValueError) as problem:
-            raise UploadError(f"Upload-Metadata: the value of {key!r} is not UTF-8 in Base64; encode it so.") from problem
+            raise UploadError(
+                f"Upload-Metadata: the value of {key!r} is not UTF-8 in Base64; encode it so."
+            ) from problem
         if not found[key].isprintable():
             raise UploadError(f"Upload-Metadata: the value of {key!r} has a control character; leave it out.")
     return found
@@ -66,7 +70,9 @@ def parse_checksum(header: str) -> Checksum:
     except (binascii.Error, ValueError) as problem:
         raise UploadError("Upload-Checksum is not Base64; encode the digest so.") from problem
     if len(digest) != DIGEST_BYTES[algorithm]:
-        raise UploadError(f"Upload-Checksum has {len(digest)} bytes and a {algorithm} has {DIGEST_BYTES[algorithm]}; send the whole digest.")
+        raise UploadError(
+            f"Upload-Checksum has {len(digest)} bytes and a {algorithm} has {DIGEST_BYTES[algorithm]}; send the whole digest."
+        )
     return Checksum(algorithm, digest)
 
 

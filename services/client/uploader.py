@@ -67,7 +67,9 @@ class PassingError(Exception):
 class Uploader:
     """One upload, as a flow of requests."""
 
-    def __init__(self, server: str, progress: Callable[[UploadProgress], None] | None = None, patience_s: float = PATIENCE_S) -> None:
+    def __init__(
+        self, server: str, progress: Callable[[UploadProgress], None] | None = None, patience_s: float = PATIENCE_S
+    ) -> None:
         self._server, self._progress, self._patience_s = server, progress, patience_s
         self._sent_bytes = self._done_bytes = self._total_bytes = 0
         self._chunk_bytes = CHUNK_BYTES
@@ -79,7 +81,9 @@ class Uploader:
             CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: what the server refuses. PlatformError: no server answers.
         """
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
-            raise UploadError(f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no name.")
+            raise UploadError(
+                f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no name."
+            )
         files, left_out = yield Work(lambda: _scan(folder))
         yield Work(lambda: _require_no_metadata(folder, files))
         self._total_bytes = sum((folder / path).stat().st_size for path in files)
@@ -92,7 +96,9 @@ class Uploader:
             if not file.is_known:
                 yield from self._send(folder / file.path, capture.id, file)
         yield from self._patiently(lambda: self._answer("POST", f"/captures/{capture.id}/commit"))
-        return UploadResult(id=capture.id, path=capture.path, bytes=capture.bytes, sent_bytes=self._sent_bytes, left_out=left_out)
+        return UploadResult(
+            id=capture.id, path=capture.path, bytes=capture.bytes, sent_bytes=self._sent_bytes, left_out=left_out
+        )
 
     def _hashed(self, folder: Path, path: str) -> ManifestFile:
         content, size = hashlib.sha256(), 0
@@ -110,8 +116,13 @@ class Uploader:
         from services.client.tus import VERSION, format_metadata
 
         url = file.upload.removeprefix("/v1")
-        metadata = {"Upload-Length": str(file.bytes), "Upload-Metadata": format_metadata({"capture": capture, "path": file.path})}
-        created = yield from self._patiently(lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata))
+        metadata = {
+            "Upload-Length": str(file.bytes),
+            "Upload-Metadata": format_metadata({"capture": capture, "path": file.path}),
+        }
+        created = yield from self._patiently(
+            lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata)
+        )
         base, offset = self._done_bytes - file.received_bytes, int(created.headers["Upload-Offset"])
         with source.open("rb") as stream:
 
@@ -122,9 +133,13 @@ class Uploader:
                 if start < 0:
                     asked = yield from self._answer("HEAD", url, headers={"Tus-Resumable": VERSION})
                     start = int(asked.headers["Upload-Offset"])
-                chunk, checksum = yield Work(lambda: _read_chunk(stream, start, min(self._chunk_bytes, file.bytes - start)))
+                chunk, checksum = yield Work(
+                    lambda: _read_chunk(stream, start, min(self._chunk_bytes, file.bytes - start))
+                )
                 if start < file.bytes and not chunk:
-                    raise CaptureInputError(f"File {source} became shorter while it was uploaded; upload the folder again.")
+                    raise CaptureInputError(
+                        f"File {source} became shorter while it was uploaded; upload the folder again."
+                    )
                 offset = yield from self._append(url, start, chunk, checksum)
                 return offset
 
@@ -137,7 +152,12 @@ class Uploader:
     def _append(self, url: str, offset: int, chunk: bytes, checksum: str) -> Flow[int]:
         from services.client.tus import CHUNK_TYPE, VERSION
 
-        headers = {"Tus-Resumable": VERSION, "Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE, "Upload-Checksum": checksum}
+        headers = {
+            "Tus-Resumable": VERSION,
+            "Upload-Offset": str(offset),
+            "Content-Type": CHUNK_TYPE,
+            "Upload-Checksum": checksum,
+        }
         self._sent_bytes += len(chunk)
         try:
             appended = yield from self._answer("PATCH", url, content=chunk, headers=headers)
@@ -156,7 +176,9 @@ class Uploader:
         import httpx
 
         try:
-            response: httpx.Response = yield Ask(method, path, options | {"timeout": httpx.Timeout(10.0, read=VERIFYING_S, write=60.0)})
+            response: httpx.Response = yield Ask(
+                method, path, options | {"timeout": httpx.Timeout(10.0, read=VERIFYING_S, write=60.0)}
+            )
         except httpx.TransportError as problem:
             raise PassingError(f"Server {self._server} does not answer ({problem})") from problem
         if not response.is_error:
@@ -164,7 +186,9 @@ class Uploader:
         problem_code = "" if method == "HEAD" else response.text
         if response.status_code in _PASSING or '"code":"upload-offset"' in problem_code:
             wait = response.headers.get("Retry-After", "")
-            raise PassingError(f"Server {self._server} answers {response.status_code}", float(wait) if wait.isdigit() else None)
+            raise PassingError(
+                f"Server {self._server} answers {response.status_code}", float(wait) if wait.isdigit() else None
+            )
         raise error_in(response)
 
     def _patiently(self, step: Callable[[], Flow[R]]) -> Flow[R]:
@@ -176,13 +200,17 @@ class Uploader:
             except PassingError as problem:
                 pause_s = problem.wait_s or wait_s * random.uniform(0.8, 1.2)
                 if time.monotonic() + pause_s > give_up_s:
-                    raise PlatformError(f"{problem}; start it again and repeat this command, what was sent is kept.") from problem
+                    raise PlatformError(
+                        f"{problem}; start it again and repeat this command, what was sent is kept."
+                    ) from problem
             yield Pause(pause_s)
             wait_s = min(2 * wait_s, MAX_WAIT_S)
 
     def _tell(self, phase: Literal["hashing", "sending"], path: str) -> None:
         if self._progress is not None:
-            self._progress(UploadProgress(phase=phase, path=path, done_bytes=self._done_bytes, total_bytes=self._total_bytes))
+            self._progress(
+                UploadProgress(phase=phase, path=path, done_bytes=self._done_bytes, total_bytes=self._total_bytes)
+            )
 
 
 def _read_chunk(stream: BinaryIO, start: int, size: int) -> tuple[bytes, str]:

@@ -46,7 +46,10 @@ def load_asset(job: str | Path) -> Asset:
     path = Path(job) / PARAMETERS
     try:
         tables = json.loads(path.read_text(encoding="utf-8"))
-        parameters = {channel: {name: Estimate.model_validate(value) for name, value in table.items()} for channel, table in tables.items()}
+        parameters = {
+            channel: {name: Estimate.model_validate(value) for name, value in table.items()}
+            for channel, table in tables.items()
+        }
     except (OSError, ValueError, AttributeError) as problem:
         raise CorruptStoreError(f"{path} cannot be read ({problem}); write it again with dentine export.") from problem
     return Asset(folder, manifest, parameters)

@@ -78,7 +78,9 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
         if repeated := {name for name, count in Counter(names).items() if count > 1}:
             raise CaptureInputError(f"{origin} lists {what} {min(repeated)} twice; give each its own name.")
     if len(description.lights) > MAX_LIGHTS:
-        raise CaptureInputError(f"{origin} lists {len(description.lights)} lights, more than any rig has ({MAX_LIGHTS}); remove those without images.")
+        raise CaptureInputError(
+            f"{origin} lists {len(description.lights)} lights, more than any rig has ({MAX_LIGHTS}); remove those without images."
+        )
     for camera in description.cameras:
         _require_possible(camera, origin)
     for light in description.lights:
@@ -86,13 +88,19 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
             raise CaptureInputError(
                 f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)} channels; give one per channel."
             )
-        dark = [channel for channel, value in zip(description.channels, light.intensity, strict=True) if not MIN_INTENSITY <= value <= MAX_INTENSITY]
+        dark = [
+            channel
+            for channel, value in zip(description.channels, light.intensity, strict=True)
+            if not MIN_INTENSITY <= value <= MAX_INTENSITY
+        ]
         if dark:
             value = light.intensity[description.channels.index(dark[0])]
             what = f"{origin}: light {light.name} has intensity {value:g} in channel {dark[0]}, outside {MIN_INTENSITY:g} to {MAX_INTENSITY:g}"
             raise CaptureInputError(f"{what}; give what was measured, or remove the light.")
         if max(map(abs, light.position_mm)) > MAX_DISTANCE_MM:
-            raise CaptureInputError(f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm.")
+            raise CaptureInputError(
+                f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm."
+            )
 
 
 def _require_possible(camera: Camera, origin: str) -> None:
@@ -100,17 +108,23 @@ def _require_possible(camera: Camera, origin: str) -> None:
     where = f"{origin}: camera {camera.name}"
     width, height = camera.size
     if width * height > MAX_PIXELS:
-        raise CaptureInputError(f"{where} has {width} x {height} pixels, more than any camera here ({MAX_PIXELS / 2**20:.0f} million); correct its size.")
+        raise CaptureInputError(
+            f"{where} has {width} x {height} pixels, more than any camera here ({MAX_PIXELS / 2**20:.0f} million); correct its size."
+        )
     (fx, skew, cx), (zero, fy, cy), last = camera.K
     if not (0 < fx <= MAX_FOCAL_PX and 0 < fy <= MAX_FOCAL_PX):
         what = f"{where} has focal lengths K[0][0] = {fx:g} and K[1][1] = {fy:g} pixels, which must lie between 0 and {MAX_FOCAL_PX:g}"
         raise CaptureInputError(f"{what}; correct K.")
     if zero != 0 or last != (0, 0, 1) or abs(skew) > fx or max(abs(cx), abs(cy)) > MAX_FOCAL_PX:
-        raise CaptureInputError(f"{where} has a K that is not [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels; correct K.")
+        raise CaptureInputError(
+            f"{where} has a K that is not [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels; correct K."
+        )
     if max(abs(row[3]) for row in camera.camera_from_world) > MAX_DISTANCE_MM:
         raise CaptureInputError(f"{where} is more than {MAX_DISTANCE_MM:g} mm away; its pose must be in millimetres.")
     if camera.camera_from_world[3] != (0, 0, 0, 1):
-        raise CaptureInputError(f"{where}: the last row of camera_from_world must be [0, 0, 0, 1]; export the pose again.")
+        raise CaptureInputError(
+            f"{where}: the last row of camera_from_world must be [0, 0, 0, 1]; export the pose again."
+        )
 
 
 def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:
@@ -123,16 +137,26 @@ def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:
     require_consistent(calibration, f"Calibration {path}")
     if calibration.channels != description.channels:
         theirs, ours = ", ".join(calibration.channels), ", ".join(description.channels)
-        raise CaptureInputError(f"Calibration {path} is for channels {theirs}, but the capture has {ours}; choose the calibration of this rig.")
-    cameras, lights = {camera.name: camera for camera in calibration.cameras}, {light.name: light for light in calibration.lights}
+        raise CaptureInputError(
+            f"Calibration {path} is for channels {theirs}, but the capture has {ours}; choose the calibration of this rig."
+        )
+    cameras, lights = (
+        {camera.name: camera for camera in calibration.cameras},
+        {light.name: light for light in calibration.lights},
+    )
     for what, wanted, known in (("camera", description.cameras, cameras), ("light", description.lights, lights)):
         if absent := next((one.name for one in wanted if one.name not in known), None):
-            raise CaptureInputError(f"Calibration {path} lacks {what} {absent} of the capture; choose the calibration of this rig.")
+            raise CaptureInputError(
+                f"Calibration {path} lacks {what} {absent} of the capture; choose the calibration of this rig."
+            )
     for camera in description.cameras:
         if cameras[camera.name].size != camera.size:
             theirs, ours = (" x ".join(map(str, size)) for size in (cameras[camera.name].size, camera.size))
             raise CaptureInputError(
                 f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but the capture's are {ours}; calibrate anew."
             )
-    changed = {"cameras": tuple(cameras[one.name] for one in description.cameras), "lights": tuple(lights[one.name] for one in description.lights)}
+    changed = {
+        "cameras": tuple(cameras[one.name] for one in description.cameras),
+        "lights": tuple(lights[one.name] for one in description.lights),
+    }
     return description.model_copy(update=changed)

@@ -27,4 +27,6 @@ DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
 
 def as_environment() -> dict[str, str]:
     """The same as environment variables, for processes that are Dask's own commands."""
-    return {f"DASK_{name.replace('.', '__').replace('-', '_').upper()}": str(value) for name, value in DASK_CONFIG.items()}
+    return {
+        f"DASK_{name.replace('.', '__').replace('-', '_').upper()}": str(value) for name, value in DASK_CONFIG.items()
+    }

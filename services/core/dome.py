@@ -17,8 +17,12 @@ class DomeStatus(Record):
     light_count: int
     interlock_closed: bool
     emergency_stop: bool = Field(description="whether the emergency stop is pressed")
-    supply_on: bool = Field(description="whether the relay of the LED supply is closed; it is while a driver feeds the watchdog")
-    stopped: bool = Field(description="whether ALL OFF holds: no light goes on until somebody starts a capture, a preflight or a light anew")
+    supply_on: bool = Field(
+        description="whether the relay of the LED supply is closed; it is while a driver feeds the watchdog"
+    )
+    stopped: bool = Field(
+        description="whether ALL OFF holds: no light goes on until somebody starts a capture, a preflight or a light anew"
+    )
     faults: tuple[str, ...]
     lit: tuple[int, ...] = Field(description="indices of the lights that emit now")
     temperature_degc: tuple[float, ...] = Field(description="of each bank")

@@ -27,7 +27,9 @@ def _part_of_a_file_name(name: str) -> str:
     plain = not any(letter in "/\\" or unicodedata.category(letter) in UNWRITABLE for letter in name)
     if plain and name not in {"", ".", ".."} and len(name.encode()) <= MAX_NAME_BYTES:
         return name
-    rule = f"a name has 1 to {MAX_NAME_BYTES} bytes, no slash, backslash or control character, and is neither '.' nor '..'"
+    rule = (
+        f"a name has 1 to {MAX_NAME_BYTES} bytes, no slash, backslash or control character, and is neither '.' nor '..'"
+    )
     raise PydanticCustomError("name", "{rule}", {"rule": rule})
 
 
@@ -68,7 +70,9 @@ class Camera(Record):
         """Edge of a pixel at a world point (3,), mm."""
         return float(self.project(point_mm[None])[1][0] / self.K[0][0])
 
-    def rays(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(
+        self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World-space origin (3,) and unit directions (N, 3) through pixel coordinates."""
         pose = np.asarray(self.camera_from_world)
         local = np.stack([x_px, y_px, np.ones_like(x_px)], axis=-1) @ np.linalg.inv(np.asarray(self.K)).T
@@ -108,7 +112,9 @@ class Mesh:
             MeshError: not finite, without faces, or of an extent that nothing in a mouth has.
         """
         if not np.isfinite(self.vertices_mm).all():
-            raise MeshError(f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again.")
+            raise MeshError(
+                f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again."
+            )
         if len(self.faces) == 0:
             raise MeshError(f"Mesh {name} has no faces; export it again with its triangles.")
         extent = float(np.ptp(self.vertices_mm, axis=0).max())
@@ -135,7 +141,9 @@ class Mesh:
             MeshError: says how many there are.
         """
         if (shells := self.shell_count()) > 1:
-            raise MeshError(f"Mesh {name} holds {shells} separate shells; join them into one surface, or remove all but the tooth's.")
+            raise MeshError(
+                f"Mesh {name} holds {shells} separate shells; join them into one surface, or remove all but the tooth's."
+            )
 
     def require_solid(self, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:
         """Refuse a mesh that cannot bound a medium.
@@ -146,7 +154,9 @@ class Mesh:
         self.require_surface(name, extent_mm)
         open_edges = int(np.count_nonzero(self.edge_counts() != 2))
         if open_edges:
-            raise MeshError(f"Mesh {name} is not watertight: {open_edges} edges do not join exactly two faces; close its holes.")
+            raise MeshError(
+                f"Mesh {name} is not watertight: {open_edges} edges do not join exactly two faces; close its holes."
+            )
         if self.signed_volume_mm3() <= 0:
             raise MeshError(f"Mesh {name} is inside out (negative volume); flip its face orientation.")
 

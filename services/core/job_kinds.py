@@ -57,7 +57,9 @@ ENTRY_POINTS = "dentine.job_kinds"
 JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
     {
         "tooth": JobKind("one tooth alone", ("prepare", "fit", "export"), _TEETH, None),
-        "jaw": JobKind("all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW),
+        "jaw": JobKind(
+            "all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW
+        ),
         "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, frozenset({"effort"})),
     }
 )

@@ -24,7 +24,9 @@ Number = Annotated[float, Strict()]
 """Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level": true."""
 Whole = Annotated[int, BeforeValidator(_no_stand_in)]
 """The same, but 2.0 is whole too."""
-JobName = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")]
+JobName = Annotated[
+    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")
+]
 """A label that a person gives a job: one line, as long as a list of jobs can show."""
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -86,7 +88,9 @@ class SimulatedCameraSpec(Record):
     black_level: Whole = Field(default=64, description="counts without light")
     noise_relative: Unit = Field(default=0.01, description="noise, fraction of the value")
     noise_floor: Unit = Field(default=0.002, description="noise, fraction of full scale")
-    motion_px: Number = Field(default=0.0, ge=0, description="largest displacement of the subject between frames, pixels")
+    motion_px: Number = Field(
+        default=0.0, ge=0, description="largest displacement of the subject between frames, pixels"
+    )
     seed: Whole = 0
 
 
@@ -101,7 +105,10 @@ DEMO_MOUTH = Path("demo")
 class RigSpec(Record):
     """Which dome and cameras to capture with."""
 
-    dome: str = Field(default=SIMULATED_DOME, description="host:port of the Modbus controller, or 'simulated' to start one on loopback")
+    dome: str = Field(
+        default=SIMULATED_DOME,
+        description="host:port of the Modbus controller, or 'simulated' to start one on loopback",
+    )
     cameras: Literal["simulated", "playback"] = "simulated"
     mouth: Path = Field(
         description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see. "
@@ -110,10 +117,16 @@ class RigSpec(Record):
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
     exposure_s: Positive = Field(default=0.05, description="exposure time")
     settle_s: Number = Field(default=0.002, ge=0, description="wait between light on and exposure")
-    tracking_every: Whole = Field(default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none")
+    tracking_every: Whole = Field(
+        default=6, ge=0, description="an all-on tracking frame every so many lights; 0 for none"
+    )
     black_frames: Whole = Field(default=2, ge=1, description="frames without light")
-    watchdog_s: Number = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
-    light_exposure_limit_s: Positive = Field(default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment")
+    watchdog_s: Number = Field(
+        default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
+    )
+    light_exposure_limit_s: Positive = Field(
+        default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment"
+    )
     total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
@@ -125,7 +138,9 @@ class RigSpec(Record):
 
 LIMITS_OF_A_RIG = frozenset({"dome", "watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
 """Options of a rig that change no frame: where its dome is, and how far it may go."""
-HELD_RANGES = MappingProxyType({"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)})
+HELD_RANGES = MappingProxyType(
+    {"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)}
+)
 """Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
 
 
@@ -142,36 +157,65 @@ class JobSpec(Record):
     )
     capture: Path | None = Field(default=None, description="folder capture or capture store to fit; give this or [rig]")
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
-    calibration: Path | None = Field(default=None, description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>")
+    calibration: Path | None = Field(
+        default=None,
+        description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>",
+    )
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(
-        default="fit", description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent"
+        default="fit",
+        description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent",
     )
-    held: dict[str, float] = Field(default={}, max_length=MAX_HELD, description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}")
-    loss: Loss = Field(default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders")
-    solver: Literal["gauss-newton", "adam"] = Field(default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples")
+    held: dict[str, float] = Field(
+        default={},
+        max_length=MAX_HELD,
+        description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}",
+    )
+    loss: Loss = Field(
+        default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders"
+    )
+    solver: Literal["gauss-newton", "adam"] = Field(
+        default="gauss-newton", description="adam: as in teeth 2018, hundreds of gradients at constant samples"
+    )
     adam_steps: Whole = Field(default=300, ge=1, le=100_000, description="most steps of solver = adam in each stage")
-    adam_rate: Positive = Field(default=0.05, description="learning rate of solver = adam, in lengths over which images are about linear")
-    prior: Literal["weak", "literature"] = Field(default="weak", description="literature: media are drawn towards measured teeth where the images say little")
+    adam_rate: Positive = Field(
+        default=0.05, description="learning rate of solver = adam, in lengths over which images are about linear"
+    )
+    prior: Literal["weak", "literature"] = Field(
+        default="weak", description="literature: media are drawn towards measured teeth where the images say little"
+    )
     stains: bool = Field(default=False, description="fit a texture of stains on the enamel after the media")
     lobes: Literal[1, 2] = Field(default=1, description="Henyey-Greenstein lobes per medium")
     held_out_lights: tuple[str, ...] | None = Field(
-        default=None, fail_fast=True, description="lights kept from the fit; default: the capture's own, else every fourth"
+        default=None,
+        fail_fast=True,
+        description="lights kept from the fit; default: the capture's own, else every fourth",
     )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
-    samples_per_pixel: Whole = Field(default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs")
+    samples_per_pixel: Whole = Field(
+        default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs"
+    )
     max_samples_per_pixel: Whole = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
     max_steps: Whole = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
     search_candidates: Whole = Field(default=50_000, ge=100, description="table-search points per channel")
     advise: bool = Field(default=True, description="say at the end which further light or view would help most")
-    sensor_noise_relative: Unit = Field(default=0.01, description="assumed noise where the capture gives no variance, fraction of the value")
+    sensor_noise_relative: Unit = Field(
+        default=0.01, description="assumed noise where the capture gives no variance, fraction of the value"
+    )
     sensor_noise_floor: Unit = Field(default=0.002, description="assumed noise, fraction of the image maximum")
-    effort: Number = Field(default=1.0, ge=0.01, le=100, description="of kind slab: paths, in units of the default budget; ± shrink as its root")
+    effort: Number = Field(
+        default=1.0,
+        ge=0.01,
+        le=100,
+        description="of kind slab: paths, in units of the default budget; ± shrink as its root",
+    )
     workers: Whole = Field(default=2, ge=1, le=1024, description="processes of a local run")
-    device: Device = Field(default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker")
+    device: Device = Field(
+        default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker"
+    )
     priority: Priority = Field(
         default="normal",
         description="which waiting jobs start first; of running fits each takes four times the share of a lower one",
@@ -200,7 +244,9 @@ class JobSpec(Record):
         for name, value in self.held.items():
             part, _, leaf = name.partition(".")
             if part not in {"enamel", "dentin"} or leaf not in HELD_RANGES:
-                raise ValueError(f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as enamel.sigma")
+                raise ValueError(
+                    f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as enamel.sigma"
+                )
             low, high = HELD_RANGES[leaf]
             if not low < value < high:
                 raise ValueError(f"held {name} = {value:g} must lie between {low:g} and {high:g}")
@@ -216,7 +262,9 @@ class FrameRecord(Record):
     exposure_s: Positive
     level: Unit
     time_s: float = Field(description="since the capture began")
-    readback: tuple[int, int, int] = Field(description="R, G, B register levels read back from the controller; all-on frames give the first light's")
+    readback: tuple[int, int, int] = Field(
+        description="R, G, B register levels read back from the controller; all-on frames give the first light's"
+    )
 
 
 class CaptureManifest(Record):
@@ -241,12 +289,21 @@ class PreparedManifest(Record):
     held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
     fdi: tuple[int, ...]
     dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
-    gums: bool = Field(default=False, description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there")
+    gums: bool = Field(
+        default=False,
+        description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there",
+    )
     cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
-    tooth_pixels: tuple[int, ...] = Field(default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth")
+    tooth_pixels: tuple[int, ...] = Field(
+        default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth"
+    )
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
-    masks: str = Field(default="", description="digest of the masks by hand that it was prepared with; empty without any")
-    notes: tuple[str, ...] = Field(default=(), description="what to know of the capture before trusting a fit of it, one sentence each")
+    masks: str = Field(
+        default="", description="digest of the masks by hand that it was prepared with; empty without any"
+    )
+    notes: tuple[str, ...] = Field(
+        default=(), description="what to know of the capture before trusting a fit of it, one sentence each"
+    )
     valid_fraction: float
 
 
@@ -262,21 +319,30 @@ class Estimate(Record):
 class ToothReport(Record):
     """One tooth of a jaw."""
 
-    state: Literal["fitted", "tied", "failed"] = Field(description="from its own pixels; held near other teeth for lack of them; or its own fit raised")
+    state: Literal["fitted", "tied", "failed"] = Field(
+        description="from its own pixels; held near other teeth for lack of them; or its own fit raised"
+    )
     sentence: str = Field(description="why it is tied or failed, or what is wrong with it; may be empty")
     told: str = Field(default="", description="in plain words, what the capture tells of it and what it cannot")
     pixels: int = Field(description="pixels that show it and enter the fit, over all views")
     parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
     fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
     held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
-    shape: tuple[float, ...] = Field(default=(), description="dentin's blend weights, all channels alike; empty where the dentin is known or absent")
-    enamel_thickness: Estimate | None = Field(default=None, description="mean over what the first camera sees of the tooth; null if nothing, or without dentin")
+    shape: tuple[float, ...] = Field(
+        default=(), description="dentin's blend weights, all channels alike; empty where the dentin is known or absent"
+    )
+    enamel_thickness: Estimate | None = Field(
+        default=None,
+        description="mean over what the first camera sees of the tooth; null if nothing, or without dentin",
+    )
 
 
 class Correlation(Record):
     """How errors go together, between -1 and 1."""
 
-    names: tuple[str, ...] = Field(description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)")
+    names: tuple[str, ...] = Field(
+        description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)"
+    )
     matrix: tuple[tuple[float, ...], ...]
 
 
@@ -285,20 +351,36 @@ class FitReport(Record):
 
     converged: bool
     advice: str = Field(description="what to do when it did not converge, or for a better answer; may be empty")
-    parameters: dict[str, dict[str, Estimate]] = Field(description="per channel: name -> estimate, derived quantities included")
+    parameters: dict[str, dict[str, Estimate]] = Field(
+        description="per channel: name -> estimate, derived quantities included"
+    )
     fit_error: dict[str, float] = Field(description="per channel: relative image error on fitted images")
     held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
-    fit_error_se: dict[str, float] = Field(default={}, description="per channel: standard error of fit_error by the renders' noise")
+    fit_error_se: dict[str, float] = Field(
+        default={}, description="per channel: standard error of fit_error by the renders' noise"
+    )
     held_out_error_se: dict[str, float] = Field(default={}, description="per channel: the same of held_out_error")
     steps: int
     shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
-    shape_covariance: tuple[tuple[float, ...], ...] = Field(default=(), description="of the blend weights; empty where they were not fitted")
-    enamel_thickness: Estimate | None = Field(default=None, description="mean over what the first camera sees of the tooth; null if nothing, or without dentin")
-    teeth: dict[str, ToothReport] = Field(default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone")
-    correlations: dict[str, Correlation] = Field(default={}, description="per channel: correlation of the fitted coordinates")
+    shape_covariance: tuple[tuple[float, ...], ...] = Field(
+        default=(), description="of the blend weights; empty where they were not fitted"
+    )
+    enamel_thickness: Estimate | None = Field(
+        default=None,
+        description="mean over what the first camera sees of the tooth; null if nothing, or without dentin",
+    )
+    teeth: dict[str, ToothReport] = Field(
+        default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone"
+    )
+    correlations: dict[str, Correlation] = Field(
+        default={}, description="per channel: correlation of the fitted coordinates"
+    )
     told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
     notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
-    next_capture: str = Field(default="", description="in plain words, which further light or view would help most; empty where none was looked for")
+    next_capture: str = Field(
+        default="",
+        description="in plain words, which further light or view would help most; empty where none was looked for",
+    )
     seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
 
 
@@ -314,12 +396,18 @@ class Verdict(Record):
 
     headline: str = Field(description="one sentence, the worst first")
     converged: bool = Field(description="whether the numbers are those of a fit that ended where it should")
-    is_above_limit: bool = Field(description="whether an image error, fitted or held out, of some channel is above the limit")
+    is_above_limit: bool = Field(
+        description="whether an image error, fitted or held out, of some channel is above the limit"
+    )
     limit: float = Field(description="relative image error above which no fit is called converged")
-    error_of: Literal["held-out", "fitted"] = Field(description="which images the errors are of; fitted ones where none was held out")
+    error_of: Literal["held-out", "fitted"] = Field(
+        description="which images the errors are of; fitted ones where none was held out"
+    )
     error: Figure = Field(description="mean over the channels")
     channels: dict[str, Figure] = Field(description="by channel")
-    enamel_thickness: Estimate | None = Field(description="of a single tooth, mean over what the first camera sees; null without dentin and of a jaw")
+    enamel_thickness: Estimate | None = Field(
+        description="of a single tooth, mean over what the first camera sees; null without dentin and of a jaw"
+    )
     steps: int
     advice: str = Field(description="what to do where it did not converge, or for a better answer; may be empty")
 
@@ -331,5 +419,7 @@ class AssetManifest(Record):
     held_out_error: float = Field(description="mean over channels")
     converged: bool = Field(default=True, description="whether the fit behind it did")
     advice: str = Field(default="", description="what to do where it did not")
-    verdict: Verdict | None = Field(default=None, description="how well the fit went; null where an earlier version exported it")
+    verdict: Verdict | None = Field(
+        default=None, description="how well the fit went; null where an earlier version exported it"
+    )
     centre_mm: Vector3 = (0.0, 0.0, 0.0)

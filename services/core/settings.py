@@ -22,45 +22,79 @@ DATABASE_FILE = "dentine.sqlite"
 class RateSettings(Record):
     """How often one token, or one address without a token, may ask."""
 
-    reads_per_10_s: int = Field(default=10_000, gt=0, description="requests that change nothing; an event stream counts once")
+    reads_per_10_s: int = Field(
+        default=10_000, gt=0, description="requests that change nothing; an event stream counts once"
+    )
     writes_per_10_s: int = Field(default=2_000, gt=0, description="requests that change something")
-    refusals_per_minute: int = Field(default=60, gt=0, description="requests of one address without a valid token that are answered and audited one by one")
+    refusals_per_minute: int = Field(
+        default=60,
+        gt=0,
+        description="requests of one address without a valid token that are answered and audited one by one",
+    )
 
 
 class UploadLimits(Record):
     """What captures may be uploaded. Sizes are checked when a capture is created, images when it is committed."""
 
     largest_file_bytes: int = Field(default=16 * 2**30, ge=1, description="largest file of a capture")
-    largest_text_bytes: int = Field(default=64 * 2**20, ge=1, description="largest .json, .jsonl or .toml file, which is read whole")
+    largest_text_bytes: int = Field(
+        default=64 * 2**20, ge=1, description="largest .json, .jsonl or .toml file, which is read whole"
+    )
     largest_capture_bytes: int = Field(default=256 * 2**30, ge=1, description="largest capture")
     most_files: int = Field(default=5000, ge=1, le=100_000, description="most files in a capture")
-    largest_image_bytes: int = Field(default=4 * 2**30, ge=1, description="largest image, as its header declares it decoded")
-    open_for_s: float = Field(default=7 * 86400.0, gt=0, description="an open capture expires this long after the last byte received")
-    silence_s: float = Field(default=30.0, gt=0, description="a request that sends nothing for this long is ended; what it sent is kept")
-    keep_free_bytes: int = Field(default=2**30, ge=0, description="free disk that open captures, fully received, must leave")
+    largest_image_bytes: int = Field(
+        default=4 * 2**30, ge=1, description="largest image, as its header declares it decoded"
+    )
+    open_for_s: float = Field(
+        default=7 * 86400.0, gt=0, description="an open capture expires this long after the last byte received"
+    )
+    silence_s: float = Field(
+        default=30.0, gt=0, description="a request that sends nothing for this long is ended; what it sent is kept"
+    )
+    keep_free_bytes: int = Field(
+        default=2**30, ge=0, description="free disk that open captures, fully received, must leave"
+    )
 
 
 class ConnectionLimits(Record):
     """How many connections a server keeps, and how long each may wait for a request."""
 
-    most: int = Field(default=2000, ge=8, description="connections at once; beyond them those without a request make room, longest waiting first")
-    header_s: float = Field(default=10.0, gt=0, description="a connection is closed if the head of a request is not whole by then")
+    most: int = Field(
+        default=2000,
+        ge=8,
+        description="connections at once; beyond them those without a request make room, longest waiting first",
+    )
+    header_s: float = Field(
+        default=10.0, gt=0, description="a connection is closed if the head of a request is not whole by then"
+    )
 
 
 class DomeSettings(Record):
     """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less, never for more."""
 
-    address: str | None = Field(default=None, description="host:port of the Modbus controller, or 'simulated' for one of the server's own; default is none")
+    address: str | None = Field(
+        default=None,
+        description="host:port of the Modbus controller, or 'simulated' for one of the server's own; default is none",
+    )
     job_addresses: str = Field(
         default="",
         description="host:port of further domes that jobs may capture with, separated by commas; the server's own and 'simulated' always may",
     )
-    watchdog_s: float = Field(default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long")
-    light_exposure_limit_s: float = Field(default=10.0, gt=0, description="most level x on-time of one light, from the rig's photobiological assessment")
-    total_exposure_limit_s: float = Field(default=100.0, gt=0, description="most level x on-time of all lights together")
+    watchdog_s: float = Field(
+        default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
+    )
+    light_exposure_limit_s: float = Field(
+        default=10.0, gt=0, description="most level x on-time of one light, from the rig's photobiological assessment"
+    )
+    total_exposure_limit_s: float = Field(
+        default=100.0, gt=0, description="most level x on-time of all lights together"
+    )
     max_level: float = Field(default=1.0, gt=0, le=1, description="highest LED level, fraction of full scale")
     max_exposure_s: float = Field(
-        default=10.0, gt=0, le=MAX_ON_TIME_S, description="longest exposure, settling included: one light at full level then takes the whole default limit"
+        default=10.0,
+        gt=0,
+        le=MAX_ON_TIME_S,
+        description="longest exposure, settling included: one light at full level then takes the whole default limit",
     )
 
     @property
@@ -76,24 +110,50 @@ class ServerSettings(Record):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8000, ge=0, le=65535, description="0 picks a free port")
     data: Path = Field(default=Path("dentine-data"), description="folder of the jobs and, by default, the database")
-    database: SecretStr | None = Field(default=None, description="postgresql://USER@HOST/NAME; default is SQLite in the data folder")
-    database_password_file: Path | None = Field(default=None, description="file with the password of the database; read for every connection")
-    scheduler: str | None = Field(default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers")
-    tls: Path | None = Field(default=None, description="folder with ca.crt, tls.crt and tls.key: API, scheduler and workers speak TLS; default: without")
-    jobs_at_once: int = Field(default=4, ge=1, le=64, description="most jobs that run side by side; captures of further ones begin nevertheless")
-    keep_days: float | None = Field(default=None, gt=0, description="days after which a job that has ended is deleted; default is never")
-    private_webhooks: bool = Field(default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS")
-    access: Literal["tokens", "open"] = Field(default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only")
+    database: SecretStr | None = Field(
+        default=None, description="postgresql://USER@HOST/NAME; default is SQLite in the data folder"
+    )
+    database_password_file: Path | None = Field(
+        default=None, description="file with the password of the database; read for every connection"
+    )
+    scheduler: str | None = Field(
+        default=None, description="address of a Dask scheduler whose workers see the data folder; default: own workers"
+    )
+    tls: Path | None = Field(
+        default=None,
+        description="folder with ca.crt, tls.crt and tls.key: API, scheduler and workers speak TLS; default: without",
+    )
+    jobs_at_once: int = Field(
+        default=4,
+        ge=1,
+        le=64,
+        description="most jobs that run side by side; captures of further ones begin nevertheless",
+    )
+    keep_days: float | None = Field(
+        default=None, gt=0, description="days after which a job that has ended is deleted; default is never"
+    )
+    private_webhooks: bool = Field(
+        default=False, description="whether webhooks may go to private and loopback addresses, and there without TLS"
+    )
+    access: Literal["tokens", "open"] = Field(
+        default="open", description="tokens: every caller needs one; open: none is asked for, on loopback only"
+    )
     public_url: str | None = Field(
-        default=None, pattern=r"^https?://[^\s#?]+$", description="address of the page as people reach it, such as https://teeth.example.org"
+        default=None,
+        pattern=r"^https?://[^\s#?]+$",
+        description="address of the page as people reach it, such as https://teeth.example.org",
     )
     job_roots: str = Field(
         default="",
         description="absolute folders on the server below which jobs may name captures, mouths and calibrations, separated by commas;"
         " default: none where callers need tokens, any on an open server",
     )
-    names: str = Field(default="", description="further host names that clients use for this server, separated by commas")
-    trusted_proxies: str = Field(default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas")
+    names: str = Field(
+        default="", description="further host names that clients use for this server, separated by commas"
+    )
+    trusted_proxies: str = Field(
+        default="", description="addresses of proxies whose X-Forwarded-For is believed, separated by commas"
+    )
     session_s: float = Field(default=8 * 3600.0, gt=0, description="how long a browser stays signed in, s")
     body_limit_bytes: int = Field(default=2**20, gt=0, description="longest body that is read, uploads excepted")
     rates: RateSettings = RateSettings()
@@ -147,9 +207,13 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
             for part in path:
                 node = node.setdefault(part, {})
                 if not isinstance(node, dict):
-                    raise SettingsError(f"Setting {variable} needs a group of which another variable sets the whole; remove one of the two.")
+                    raise SettingsError(
+                        f"Setting {variable} needs a group of which another variable sets the whole; remove one of the two."
+                    )
             if isinstance(node.get(leaf), dict):
-                raise SettingsError(f"Setting {variable} is a group, of which other variables set single values; remove it.")
+                raise SettingsError(
+                    f"Setting {variable} is a group, of which other variables set single values; remove it."
+                )
             node[leaf] = value
     try:
         return Settings.model_validate(tree)
@@ -170,7 +234,9 @@ def read_job(path: Path) -> JobSpec:
     try:
         tree = tomllib.loads(path.read_text())
     except RecursionError as problem:
-        raise SettingsError(f"Job file {path} nests brackets too deeply; a job's options need three levels at most.") from problem
+        raise SettingsError(
+            f"Job file {path} nests brackets too deeply; a job's options need three levels at most."
+        ) from problem
     except (ValueError, OSError) as problem:  # numbers beyond all limits, too, and what is no UTF-8
         raise SettingsError(f"Job file {path} is not valid TOML: {problem}; correct that line.") from problem
     return job_from_tree(tree, path.parent, str(path))
@@ -190,8 +256,14 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
         if first["type"] == "extra_forbidden":
             known = ", ".join(sorted(JobSpec.model_fields))
             raise SettingsError(f"{origin}: unknown option '{option}'; known options are {known}.") from problem
-        raise SettingsError(f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it.") from problem
-    for option, path in {"capture": spec.capture, "calibration": spec.calibration, "rig.mouth": spec.rig and spec.rig.mouth}.items():
+        raise SettingsError(
+            f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it."
+        ) from problem
+    for option, path in {
+        "capture": spec.capture,
+        "calibration": spec.calibration,
+        "rig.mouth": spec.rig and spec.rig.mouth,
+    }.items():
         if path is not None and "\0" in str(path):
             raise SettingsError(f"{origin}: option '{option}' holds the character NUL, which no path has; correct it.")
     if spec.channels == ():

@@ -36,7 +36,9 @@ class Cell(Record):
     @model_validator(mode="after")
     def _matched_has_no_glass(self) -> Cell:
         if self.boundary == "matched" and self.glass is not None:
-            raise ValueError("a matched boundary neither bends nor reflects, so it has no glass; leave glass out or choose smooth")
+            raise ValueError(
+                "a matched boundary neither bends nor reflects, so it has no glass; leave glass out or choose smooth"
+            )
         return self
 
 
@@ -140,7 +142,9 @@ class SlabFolder(Record):
             self._require_known(image)
             key = image.camera, image.light, self.wavelength_of(image)
             if key in seen:
-                raise ValueError(f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice; keep one")
+                raise ValueError(
+                    f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice; keep one"
+                )
             seen.add(key)
         return self
 
@@ -148,7 +152,9 @@ class SlabFolder(Record):
         angles = {light.name: light.angle_deg for light in self.lights}
         for beam in self.through_beam:
             if beam.light not in angles:
-                raise ValueError(f"a through_beam names light {beam.light}, which is not among the lights; correct the name")
+                raise ValueError(
+                    f"a through_beam names light {beam.light}, which is not among the lights; correct the name"
+                )
             if angles[beam.light] == 0:
                 what = f"the through_beam of light {beam.light} meets the cell at 0 degrees and is not bent"
                 raise ValueError(f"{what}; measure one at an angle, or leave it out")
@@ -162,11 +168,17 @@ class SlabFolder(Record):
     def _require_known(self, image: SlabImage) -> None:
         for what, name, things in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):
             if name not in {thing.name for thing in things}:
-                raise ValueError(f"image {image.file} names {what} {name}, which is not among the {what}s; correct the name")
+                raise ValueError(
+                    f"image {image.file} names {what} {name}, which is not among the {what}s; correct the name"
+                )
         if image.wavelength_nm is None and len(self.wavelengths_nm) > 1:
-            raise ValueError(f"image {image.file} has no wavelength_nm, and there are {len(self.wavelengths_nm)}; name one")
+            raise ValueError(
+                f"image {image.file} has no wavelength_nm, and there are {len(self.wavelengths_nm)}; name one"
+            )
         if image.wavelength_nm is not None and image.wavelength_nm not in self.wavelengths_nm:
-            raise ValueError(f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or correct it")
+            raise ValueError(
+                f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or correct it"
+            )
 
     def wavelength_of(self, image: SlabImage) -> float:
         """The image's wavelength, nm."""

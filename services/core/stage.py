@@ -22,7 +22,9 @@ class StageEvent(Record):
     kind: Literal["started", "progress", "log", "step", "preview", "finished"]
     message: str = Field(default="", description="one sentence for people")
     done: float | None = Field(default=None, description="fraction of the stage done, 0 to 1")
-    data: dict[str, Any] = Field(default_factory=dict, description="JSON values; a step carries step, loss, held_out_error, parameters")
+    data: dict[str, Any] = Field(
+        default_factory=dict, description="JSON values; a step carries step, loss, held_out_error, parameters"
+    )
 
 
 class StageContext(Protocol):

@@ -37,7 +37,14 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from services.core.errors import CaptureInputError, CorruptStoreError, DiskFullError, FencedError, MissingStageError, ReadOnlyStoreError
+from services.core.errors import (
+    CaptureInputError,
+    CorruptStoreError,
+    DiskFullError,
+    FencedError,
+    MissingStageError,
+    ReadOnlyStoreError,
+)
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -115,14 +122,24 @@ class StageWriter:
         """Raise FencedError if a newer attempt has started the stage. Call before every durable write."""
         newest = int(self._lease.read_text()) if self._lease.exists() else 0
         if newest > self.attempt or (not starting and newest != self.attempt):
-            raise FencedError(f"Attempt {self.attempt} of stage {self.stage} was overtaken by attempt {newest}; its writes are refused.")
+            raise FencedError(
+                f"Attempt {self.attempt} of stage {self.stage} was overtaken by attempt {newest}; its writes are refused."
+            )
 
     def publish(self, record: Record) -> Path:
         """Make everything in ``folder`` visible at once as ``root/stage``; returns that path."""
         files = {}
-        for path in sorted(p for p in self.folder.rglob("*") if p.is_file() and not p.name.endswith(".partial") and p.name != MANIFEST):
+        for path in sorted(
+            p for p in self.folder.rglob("*") if p.is_file() and not p.name.endswith(".partial") and p.name != MANIFEST
+        ):
             files[path.relative_to(self.folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": _sha256(path)}
-        manifest = {"format": FORMAT_VERSION, "stage": self.stage, "attempt": self.attempt, "files": files, "record": json.loads(record.model_dump_json())}
+        manifest = {
+            "format": FORMAT_VERSION,
+            "stage": self.stage,
+            "attempt": self.attempt,
+            "files": files,
+            "record": json.loads(record.model_dump_json()),
+        }
         write_atomic(self.folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         final, retired = self.root / self.stage, self.root / f".{self.stage}.retired"
         with self._alone():
@@ -196,7 +213,9 @@ def _manifest(root: Path, stage: str) -> dict[str, Any]:
         manifest = json.loads(path.read_bytes())
         return {"files": dict(manifest["files"]), "record": manifest["record"]}
     except (ValueError, KeyError, TypeError, RecursionError) as problem:
-        raise CorruptStoreError(f"{path}, the list of what stage {stage} published, cannot be read; {_remedy(stage)}.") from problem
+        raise CorruptStoreError(
+            f"{path}, the list of what stage {stage} published, cannot be read; {_remedy(stage)}."
+        ) from problem
 
 
 def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
@@ -208,16 +227,28 @@ def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
             what = f"{path} of published stage {stage} has {path.stat().st_size} bytes instead of {expected['bytes']} (truncated?)"
             raise CorruptStoreError(f"{what}; {_remedy(stage)}.")
         if _sha256(path) != expected["sha256"]:
-            raise CorruptStoreError(f"{path} of published stage {stage} differs from its published checksum; {_remedy(stage)}.")
+            raise CorruptStoreError(
+                f"{path} of published stage {stage} differs from its published checksum; {_remedy(stage)}."
+            )
 
 
 def _remedy(stage: str) -> str:
     # What cameras saw cannot be computed again.
-    return "restore it or capture again" if stage == "capture" else f"restore it, or retry the job, which then makes {stage} anew"
+    return (
+        "restore it or capture again"
+        if stage == "capture"
+        else f"restore it, or retry the job, which then makes {stage} anew"
+    )
 
 
 def create_array(
-    folder: Path, name: str, shape: tuple[int, ...], shard: tuple[int, ...], dtype: str, dimensions: tuple[str, ...], chunk: tuple[int, ...] | None = None
+    folder: Path,
+    name: str,
+    shape: tuple[int, ...],
+    shard: tuple[int, ...],
+    dtype: str,
+    dimensions: tuple[str, ...],
+    chunk: tuple[int, ...] | None = None,
 ) -> zarr.Array[Any]:
     """Create a zarr v3 array. One writer per shard; ``shard`` is also the chunk unless ``chunk`` divides it."""
     return zarr.create_array(
@@ -256,7 +287,9 @@ class StoredArray:
             for selection in asked:
                 # What no array of this shape could be asked for is the caller's mistake, and raised as such.
                 np.broadcast_to(np.empty((), dtype=bool), self._array.shape)[selection]
-            raise CorruptStoreError(f"{self._path} cannot be read ({problem}); restore it or run its stage again.") from problem
+            raise CorruptStoreError(
+                f"{self._path} cannot be read ({problem}); restore it or run its stage again."
+            ) from problem
 
 
 @contextmanager
@@ -272,9 +305,14 @@ def telling_disk_faults(root: Path) -> Iterator[None]:
         place = problem.filename or root
         if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
             what = f"The disk was full at {place}; free some space, the job goes on from what it had published."
-            raise DiskFullError(what, {"free_disk_bytes": shutil.disk_usage(next(one for one in (root, *root.parents) if one.exists())).free}) from problem
+            raise DiskFullError(
+                what,
+                {"free_disk_bytes": shutil.disk_usage(next(one for one in (root, *root.parents) if one.exists())).free},
+            ) from problem
         if problem.errno == errno.EROFS:
-            raise ReadOnlyStoreError(f"The store is read-only at {place}; make it writable, the job goes on from what it had published.") from problem
+            raise ReadOnlyStoreError(
+                f"The store is read-only at {place}; make it writable, the job goes on from what it had published."
+            ) from problem
         raise
 
 

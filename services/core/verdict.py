@@ -27,7 +27,9 @@ NOT_CONVERGED_STATUS = 9
 def verdict_of(report: FitReport) -> Verdict:
     """The judgement of a fit."""
     is_tested = bool(report.held_out_error)
-    errors, ses = (report.held_out_error, report.held_out_error_se) if is_tested else (report.fit_error, report.fit_error_se)
+    errors, ses = (
+        (report.held_out_error, report.held_out_error_se) if is_tested else (report.fit_error, report.fit_error_se)
+    )
     worst = max([*report.fit_error.values(), *report.held_out_error.values()], default=0.0)
     error, error_of = mean_figure(errors, ses), _HELD_OUT if is_tested else _FITTED
     converged, is_above_limit = report.converged and worst <= MAX_ERROR, worst > MAX_ERROR

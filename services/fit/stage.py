@@ -72,7 +72,15 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     report = driver.run(time.time()).model_copy(update={"notes": notes})
     writer.publish(report)
     verdict = verdict_of(report)
-    context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=verdict.headline, data={VERDICT: verdict.model_dump(mode="json")}))
+    context.report(
+        StageEvent(
+            stage="fit",
+            kind="finished",
+            done=1.0,
+            message=verdict.headline,
+            data={VERDICT: verdict.model_dump(mode="json")},
+        )
+    )
     return report
 
 
@@ -102,7 +110,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     gums, cavity = (read_mesh(path) if spec.kind == "jaw" and path.is_file() else None for path in surroundings)
     index = [prepared.channels.index(channel) for channel in channels]
     lights = tuple(
-        light.model_copy(update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}) for light in prepared.lights
+        light.model_copy(
+            update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}
+        )
+        for light in prepared.lights
     )
     stains = kept_stains(fit_folder)
     files = write_asset(
@@ -121,27 +132,51 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 
     history = json.loads((fit_folder / "history.json").read_text())
     title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"
-    facts = {"title": title, "boundary": spec.boundary, "ior": spec.ior, "provenance": {"source": _source(spec), "seed": str(spec.seed)}}
-    thickness = None if spec.kind == "jaw" else fitted_thickness(teeth[0], prepared.cameras, spec, report.shape, report.shape_covariance)
-    pictures = read_pictures(fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, thickness, stains)
+    facts = {
+        "title": title,
+        "boundary": spec.boundary,
+        "ior": spec.ior,
+        "provenance": {"source": _source(spec), "seed": str(spec.seed)},
+    }
+    thickness = (
+        None
+        if spec.kind == "jaw"
+        else fitted_thickness(teeth[0], prepared.cameras, spec, report.shape, report.shape_covariance)
+    )
+    pictures = read_pictures(
+        fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, thickness, stains
+    )
     write_report(context.root / "report.html", report, pictures, history, facts)
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
     write_atomic(context.root / "errors.json", _json(errors_json(report)))
 
-    corners = [corner for tooth in teeth for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))]
+    corners = [
+        corner
+        for tooth in teeth
+        for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))
+    ]
     centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
     place = float(centre[0]), float(centre[1]), float(centre[2])
     verdict = verdict_of(report)
     manifest = AssetManifest(
-        files=files, held_out_error=verdict.error.value, converged=verdict.converged, advice=report.advice, verdict=verdict, centre_mm=place
+        files=files,
+        held_out_error=verdict.error.value,
+        converged=verdict.converged,
+        advice=report.advice,
+        verdict=verdict,
+        centre_mm=place,
     )
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)
-    context.report(StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written."))
+    context.report(
+        StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written.")
+    )
     return manifest
 
 
-def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport) -> tuple[Tooth, ...]:
+def fitted_teeth(
+    prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
+) -> tuple[Tooth, ...]:
     """The teeth with the dentin surfaces the fit ended with."""
     from services.core.files.meshes import read_teeth
     from services.fit.jaw.driver import jaw_dentins
@@ -150,8 +185,13 @@ def fitted_teeth(prepared_folder: Path, prepared: PreparedManifest, spec: JobSpe
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":
         shapes = [(report.teeth[str(tooth.fdi)].shape, _is_layered(report.teeth[str(tooth.fdi)])) for tooth in teeth]
-        dentins = [dentin if layered else None for dentin, (_, layered) in zip(jaw_dentins(teeth, prepared.cameras, spec), shapes, strict=True)]
-        return tuple(_with_dentin(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True))
+        dentins = [
+            dentin if layered else None
+            for dentin, (_, layered) in zip(jaw_dentins(teeth, prepared.cameras, spec), shapes, strict=True)
+        ]
+        return tuple(
+            _with_dentin(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True)
+        )
     (tooth,) = teeth
     return (_with_dentin(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape),)
 

@@ -59,7 +59,9 @@ def _render(folder: Path, look: Callable[[float], None]) -> None:
                 process.kill()
         if process.returncode:
             last = (words.read_text(errors="replace").strip().splitlines() or ["nothing"])[-1].removeprefix("dentine: ")
-            raise CrashError(f"The demonstration's mouth could not be rendered: {last}", {"exit_status": process.returncode})
+            raise CrashError(
+                f"The demonstration's mouth could not be rendered: {last}", {"exit_status": process.returncode}
+            )
     finally:
         words.unlink(missing_ok=True)
 

@@ -40,7 +40,11 @@ def dome_lights(count: int, channels: tuple[str, ...], seed: int) -> tuple[Light
     brightness = 1 + LED_SPREAD * random.uniform(-1, 1, size=count)
     colours = INTENSITY * brightness[:, None] * np.array([LED_WHITE[channel] for channel in channels])
     return tuple(
-        Light(name=f"l{n}", position_mm=(float(x), float(y), float(z)), intensity=tuple(float(value) for value in colours[n]))
+        Light(
+            name=f"l{n}",
+            position_mm=(float(x), float(y), float(z)),
+            intensity=tuple(float(value) for value in colours[n]),
+        )
         for n, (x, y, z) in enumerate(position)
     )
 
@@ -65,4 +69,6 @@ def _framed(name: str, pose: NDArray[np.float64], pixel_mm: float, meshes: tuple
     low, high = np.floor(image.min(axis=0)) - MARGIN_PX, np.ceil(image.max(axis=0)) + MARGIN_PX
     width, height = (int(extent) for extent in high - low)
     K = ((focal, 0.0, float(-low[0])), (0.0, focal, float(-low[1])), (0.0, 0.0, 1.0))
-    return Camera(name=name, size=(width, height), K=K, camera_from_world=tuple(tuple(float(v) for v in row) for row in pose))  # type: ignore[arg-type]
+    return Camera(
+        name=name, size=(width, height), K=K, camera_from_world=tuple(tuple(float(v) for v in row) for row in pose)
+    )  # type: ignore[arg-type]

@@ -21,14 +21,25 @@ HELD_OUT_EVERY = 4
 Renderer = Literal["engine", "mitsuba"]
 
 
-def require_rig(pixel_mm: float, cameras: int, lights: int, channels: int, samples: int, held_out: int | None, boundary: Boundary, renderer: Renderer) -> None:
+def require_rig(
+    pixel_mm: float,
+    cameras: int,
+    lights: int,
+    channels: int,
+    samples: int,
+    held_out: int | None,
+    boundary: Boundary,
+    renderer: Renderer,
+) -> None:
     """Refuse what no phantom can be rendered with.
 
     Raises:
         InputError: names the option.
     """
     if min(cameras, lights) < 1 or samples < 16 or not pixel_mm > 0:
-        raise InputError("A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that is too small.")
+        raise InputError(
+            "A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that is too small."
+        )
     if channels not in CHANNELS:
         raise InputError(f"A phantom has 1 or 3 channels, not {channels}; choose one of these.")
     if held_out is not None and not 0 <= held_out < lights:
@@ -45,7 +56,12 @@ def held_out_lights(lights: int, held_out: int | None) -> frozenset[int]:
 
 
 def write_images(
-    out: Path, camera: Camera, lights: tuple[Light, ...], mean: NDArray[np.float64], variance: NDArray[np.float64], held_out: frozenset[int]
+    out: Path,
+    camera: Camera,
+    lights: tuple[Light, ...],
+    mean: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    held_out: frozenset[int],
 ) -> list[ImageEntry]:
     """Write ``<camera>_<light>.npy`` and its variance for images (L, H, W, C) of one camera."""
     entries = []
@@ -53,7 +69,15 @@ def write_images(
         stem = f"{camera.name}_{light.name}"
         write_image(out / f"{stem}.npy", mean[n])
         write_image(out / f"{stem}_var.npy", variance[n])
-        entries.append(ImageEntry(camera=camera.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy", held_out=n in held_out))
+        entries.append(
+            ImageEntry(
+                camera=camera.name,
+                light=light.name,
+                file=f"{stem}.npy",
+                variance_file=f"{stem}_var.npy",
+                held_out=n in held_out,
+            )
+        )
     return entries
 
 
@@ -64,11 +88,19 @@ def write_image(path: Path, image: NDArray[np.float64]) -> None:
 
 
 def write_description(
-    out: Path, channels: tuple[str, ...], cameras: tuple[Camera, ...], lights: tuple[Light, ...], images: list[ImageEntry], truth: dict[str, Any]
+    out: Path,
+    channels: tuple[str, ...],
+    cameras: tuple[Camera, ...],
+    lights: tuple[Light, ...],
+    images: list[ImageEntry],
+    truth: dict[str, Any],
 ) -> None:
     """Write ``truth.json``, then ``capture.json``, which makes the folder a capture."""
     write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
-    write_record(out / "capture.json", FolderCapture(units="mm", channels=channels, cameras=cameras, lights=lights, images=tuple(images)))
+    write_record(
+        out / "capture.json",
+        FolderCapture(units="mm", channels=channels, cameras=cameras, lights=lights, images=tuple(images)),
+    )
 
 
 def medium_truth(medium: Medium) -> dict[str, float]:

@@ -24,7 +24,15 @@ from services.fit.optics.parameters import Mouth
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from services.phantom.dome_rig import dome_cameras, dome_lights
-from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_images
+from services.phantom.files import (
+    CHANNELS,
+    Renderer,
+    held_out_lights,
+    medium_truth,
+    require_rig,
+    write_description,
+    write_images,
+)
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.tooth import IOR
@@ -49,9 +57,24 @@ class JawSurfaces:
 
     def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
         """The scene for the project's engine; dentin stays as it is."""
-        surfaces = [ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin)) for tooth in self.teeth]
-        positions, intensities = np.array([light.position_mm for light in lights]), np.array([light.intensity[channel] for light in lights])
-        return SceneRecipe(tuple(surfaces), positions, intensities, boundary, IOR, gums=self.gums, gums_ior=GUMS_IOR, cavity=self.cavity)
+        surfaces = [
+            ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
+            for tooth in self.teeth
+        ]
+        positions, intensities = (
+            np.array([light.position_mm for light in lights]),
+            np.array([light.intensity[channel] for light in lights]),
+        )
+        return SceneRecipe(
+            tuple(surfaces),
+            positions,
+            intensities,
+            boundary,
+            IOR,
+            gums=self.gums,
+            gums_ior=GUMS_IOR,
+            cavity=self.cavity,
+        )
 
 
 def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSurfaces:
@@ -65,13 +88,19 @@ def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSur
     """
     if scan is None:
         jaw = build_jaw(subject)
-        teeth = sorted((Tooth(tooth.fdi, tooth.outer, tooth.dentin) for tooth in jaw.teeth), key=lambda tooth: tooth.fdi)
+        teeth = sorted(
+            (Tooth(tooth.fdi, tooth.outer, tooth.dentin) for tooth in jaw.teeth), key=lambda tooth: tooth.fdi
+        )
         return JawSurfaces(tuple(teeth), jaw.gums, jaw.cavity)
     scanned = jaw_from_scan(read_scan(scan))
     teeth, weights = [], {}
     for tooth, frame in zip(scanned.teeth, scanned.frames, strict=True):
         middle = sum(SCAN_DENTIN) / 2
-        c = (middle,) * 3 if subject is None else tuple(np.random.default_rng((subject, _DENTIN, tooth.fdi)).uniform(*SCAN_DENTIN, 3).tolist())
+        c = (
+            (middle,) * 3
+            if subject is None
+            else tuple(np.random.default_rng((subject, _DENTIN, tooth.fdi)).uniform(*SCAN_DENTIN, 3).tolist())
+        )
         try:
             shape = dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
         except MeshError:
@@ -122,12 +151,22 @@ def write_jaw_phantom(
 
     entries, kept = [], held_out_lights(lights, held_out)
     with TemporaryDirectory() as folder:
-        painters = _by_mitsuba(jaw, mouths, rig_lights, Path(folder)) if renderer == "mitsuba" else _by_engine(jaw, mouths, rig_lights, boundary)
+        painters = (
+            _by_mitsuba(jaw, mouths, rig_lights, Path(folder))
+            if renderer == "mitsuba"
+            else _by_engine(jaw, mouths, rig_lights, boundary)
+        )
         for number, camera in enumerate(rig_cameras):
             stacks = [paint(camera, samples, seed + 7919 * number) for paint in painters]
             mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
             entries += write_images(out, camera, rig_lights, mean, variance, kept)
-    made = {"subject": subject, "scan": None if scan is None else scan.name, "renderer": renderer, "samples_per_pixel": samples, "seed": seed}
+    made = {
+        "subject": subject,
+        "scan": None if scan is None else scan.name,
+        "renderer": renderer,
+        "samples_per_pixel": samples,
+        "seed": seed,
+    }
     write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | made)
 
 
@@ -158,7 +197,9 @@ def _channel_truth(jaw: JawSurfaces, mouth: Mouth) -> dict[str, Any]:
     assert mouth.gums is not None
     teeth = {}
     for tooth, tissue in zip(jaw.teeth, mouth.teeth, strict=True):
-        teeth[str(tooth.fdi)] = {"enamel": medium_truth(tissue.enamel)} | ({} if tooth.dentin is None else {"dentin": medium_truth(tissue.dentin)})
+        teeth[str(tooth.fdi)] = {"enamel": medium_truth(tissue.enamel)} | (
+            {} if tooth.dentin is None else {"dentin": medium_truth(tissue.dentin)}
+        )
     return {"teeth": teeth, "gums": medium_truth(mouth.gums), "cavity_reflectance": mouth.reflectance}
 
 
@@ -168,12 +209,16 @@ def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
     return mouth if jaw.cavity is not None else replace(mouth, reflectance=None)
 
 
-def _by_engine(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], boundary: Boundary) -> list[Painter]:
+def _by_engine(
+    jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], boundary: Boundary
+) -> list[Painter]:
     from services.fit.transport.engine import Engine
 
     def painter(channel: int, mouth: Mouth) -> Painter:
         engine = Engine(jaw.recipe(lights, channel, boundary))
-        return lambda camera, samples, seed: render_engine(engine, mouth, camera, np.ones(camera.size[::-1], dtype=bool), samples, seed)
+        return lambda camera, samples, seed: render_engine(
+            engine, mouth, camera, np.ones(camera.size[::-1], dtype=bool), samples, seed
+        )
 
     return [painter(channel, mouth) for channel, mouth in enumerate(mouths.values())]
 
@@ -186,7 +231,9 @@ def _by_mitsuba(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light,
 
     def painter(channel: int, mouth: Mouth) -> Painter:
         def paint(camera: Camera, samples: int, seed: int) -> Stack:
-            return render_mitsuba(mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, channel, samples, seed)
+            return render_mitsuba(
+                mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, channel, samples, seed
+            )
 
         return paint
 

@@ -36,7 +36,9 @@ def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
         enamel, dentin = _draws(subject, number, 2)
         teeth.append(Tissue(_varied(average.enamel, enamel), _varied(average.dentin, dentin)))
     gums = _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0])
-    return Mouth(tuple(teeth), gums, GUM_REFLECTANCE[channel] * (1 + REFLECTANCE_SPREAD * _draws(subject, _CAVITY, 1)[0][0]))
+    return Mouth(
+        tuple(teeth), gums, GUM_REFLECTANCE[channel] * (1 + REFLECTANCE_SPREAD * _draws(subject, _CAVITY, 1)[0][0])
+    )
 
 
 def gums_medium(channel: str) -> Medium:

@@ -29,7 +29,9 @@ class Reflection:
     """(H, W) whether any ray of the pixel meets the tooth."""
 
 
-def reflect(outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float) -> Reflection:
+def reflect(
+    outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float
+) -> Reflection:
     """Shade each pixel on a 4 × 4 grid of rays, with shadows by tooth and gums."""
     width, height = camera.size
     normals_at = [_SmoothNormals(mesh) for mesh in (outer, gums) if mesh is not None]
@@ -67,11 +69,20 @@ def reflect(outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light,
 
     count, image = SUBPIXELS**2, (len(lights), height, width, len(channels))
     share = np.where(met > 0, visible / np.maximum(met, 1), 1.0)
-    return Reflection((highlight / count).reshape(image), (diffuse / count).reshape(image), share.reshape(height, width), (met > 0).reshape(height, width))
+    return Reflection(
+        (highlight / count).reshape(image),
+        (diffuse / count).reshape(image),
+        share.reshape(height, width),
+        (met > 0).reshape(height, width),
+    )
 
 
 def ggx_reflection(
-    normal: NDArray[np.float64], towards_light: NDArray[np.float64], towards_eye: NDArray[np.float64], roughness: float, ior: float
+    normal: NDArray[np.float64],
+    towards_light: NDArray[np.float64],
+    towards_eye: NDArray[np.float64],
+    roughness: float,
+    ior: float,
 ) -> NDArray[np.float64]:
     """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr; all directions unit and away from the surface."""
     half = towards_light + towards_eye
@@ -80,7 +91,9 @@ def ggx_reflection(
     a2 = roughness**2
     distribution = a2 / (np.pi * (n_h**2 * (a2 - 1) + 1) ** 2)
     shadowing = np.prod([2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2)) for c in (n_l, n_v)], axis=0)
-    return np.asarray(distribution * shadowing * fresnel(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior) / (4 * n_l * n_v))
+    return np.asarray(
+        distribution * shadowing * fresnel(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior) / (4 * n_l * n_v)
+    )
 
 
 def fresnel(cosine: NDArray[np.float64], ior: float) -> NDArray[np.float64]:

@@ -19,7 +19,9 @@ Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Radiance (L, H, W) and the variance of its mean."""
 
 
-def render_engine(engine: Engine, tissue: Tissue | Mouth, camera: Camera, seen: NDArray[np.bool_], samples: int, seed: int) -> Stack:
+def render_engine(
+    engine: Engine, tissue: Tissue | Mouth, camera: Camera, seen: NDArray[np.bool_], samples: int, seed: int
+) -> Stack:
     """All lights in one walk; pixels that are not ``seen`` (H, W) stay dark."""
     pixels = np.argwhere(seen)[:, ::-1].astype(np.int32)
     estimate = engine.images(tissue, View(camera, pixels), samples=samples, seed=seed)

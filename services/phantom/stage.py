@@ -21,7 +21,9 @@ def run(spec: JobSpec, context: StageContext) -> FolderCapture:
         context.raise_if_cancelled()
         if fraction > done:
             done = fraction
-            context.report(StageEvent(stage="phantom", kind="progress", done=done, message="A virtual incisor is being rendered."))
+            context.report(
+                StageEvent(stage="phantom", kind="progress", done=done, message="A virtual incisor is being rendered.")
+            )
 
     context.report(StageEvent(stage="phantom", kind="started"))
     context.raise_if_cancelled()

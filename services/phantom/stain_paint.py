@@ -23,7 +23,10 @@ SPOTS, SPOT_DEPTH, SPOT_MM = 6, 0.5, 0.9
 def painted_stains(outer: Mesh, channels: tuple[str, ...], seed: int) -> ToothStains:
     """A texture for each channel, alike but in strength."""
     layout = stain_layout(outer, TEXEL_MM)
-    return ToothStains(layout.corners_uv, {name: layout.texture(painted_depth(layout, seed, STRENGTH.get(name, 1.0))) for name in channels})
+    return ToothStains(
+        layout.corners_uv,
+        {name: layout.texture(painted_depth(layout, seed, STRENGTH.get(name, 1.0))) for name in channels},
+    )
 
 
 def painted_depth(layout: StainLayout, seed: int, strength: float = 1.0) -> NDArray[np.float64]:
@@ -40,7 +43,10 @@ def painted_depth(layout: StainLayout, seed: int, strength: float = 1.0) -> NDAr
 
     # Streaks are a function of x alone, so that they run along the tooth.
     phases = random.uniform(0, 2 * np.pi, 3)
-    waves = sum(np.cos(2 * np.pi * place[:, 0] / (STREAK_MM * factor) + phase) for factor, phase in zip((1.0, 1.7, 2.9), phases, strict=True))
+    waves = sum(
+        np.cos(2 * np.pi * place[:, 0] / (STREAK_MM * factor) + phase)
+        for factor, phase in zip((1.0, 1.7, 2.9), phases, strict=True)
+    )
     depth = depth + STREAK_DEPTH * np.clip(waves / 3, 0, None)
 
     # Spots sit on the side that faces the cameras.

@@ -46,7 +46,9 @@ def subject_tissues(seed: int, channels: tuple[str, ...]) -> dict[str, Tissue]:
 
 
 def _draw(spread: MediumSpread, random: np.random.Generator) -> dict[str, float]:
-    logarithmic = {name: float(np.exp(random.uniform(*np.log(getattr(spread, name))))) for name in ("sigma_s_reduced", "sigma_a")}
+    logarithmic = {
+        name: float(np.exp(random.uniform(*np.log(getattr(spread, name))))) for name in ("sigma_s_reduced", "sigma_a")
+    }
     return logarithmic | {name: float(random.uniform(*getattr(spread, name))) for name in ("beta", "g1", "g2")}
 
 

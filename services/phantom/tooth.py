@@ -21,7 +21,16 @@ from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.recipe import single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
-from services.phantom.files import CHANNELS, Renderer, held_out_lights, medium_truth, require_rig, write_description, write_image, write_images
+from services.phantom.files import (
+    CHANNELS,
+    Renderer,
+    held_out_lights,
+    medium_truth,
+    require_rig,
+    write_description,
+    write_image,
+    write_images,
+)
 from services.phantom.reflection import ROUGHNESS, Reflection, reflect
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.stain_paint import painted_stains
@@ -90,7 +99,10 @@ def write_phantom(
     painted = painted_stains(tooth.outer, names, seed) if stains else None
     if painted is not None:
         keep_stains(out, painted)
-    stained = {name: tissues[name] if painted is None else replace(tissues[name], stain=painted.textures[name]) for name in names}
+    stained = {
+        name: tissues[name] if painted is None else replace(tissues[name], stain=painted.textures[name])
+        for name in names
+    }
 
     entries, kept = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
@@ -108,21 +120,29 @@ def write_phantom(
         if highlights:
             for n, light in enumerate(rig_lights):
                 write_image(out / "highlights" / f"{camera.name}_{light.name}.npy", surface.highlight[n])
-    truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums) | {"stains": stains}
+    truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums) | {
+        "stains": stains
+    }
     write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
-def _require_possible(boundary: Boundary, outer: Path | None, dentin: Path | None, fdi: int | None, highlights: bool, gums: bool) -> None:
+def _require_possible(
+    boundary: Boundary, outer: Path | None, dentin: Path | None, fdi: int | None, highlights: bool, gums: bool
+) -> None:
     if dentin is not None and outer is None:
         raise InputError("A dentin mesh was given without its enamel's outer mesh; give both.")
     if fdi is not None and outer is None:
-        raise InputError(f"The procedural incisor is tooth {FDI}; leave out the FDI number, or give the outer mesh that it names.")
+        raise InputError(
+            f"The procedural incisor is tooth {FDI}; leave out the FDI number, or give the outer mesh that it names."
+        )
     if fdi is not None and fdi not in FDI_NUMBERS:
         raise InputError(f"{fdi} is no tooth's FDI number; give one of 11 to 18, 21 to 28, 31 to 38 or 41 to 48.")
     if outer is not None and gums:
         raise InputError("Gums are made for the procedural incisor only; leave out either the gums or the outer mesh.")
     if highlights and boundary == "matched":
-        raise InputError("An index-matched surface has no highlights; choose boundary thin or leave the highlights out.")
+        raise InputError(
+            "An index-matched surface has no highlights; choose boundary thin or leave the highlights out."
+        )
 
 
 def _tooth(outer: Path | None, dentin: Path | None, fdi: int) -> tuple[Tooth, Mesh]:
@@ -193,8 +213,19 @@ def _render(
     return render_engine(Engine(recipe), tissue, camera, surface.enamel_pixels, samples, seed)
 
 
-def _truth(tissues: Mapping[str, Tissue], boundary: Boundary, renderer: Renderer, samples: int, seed: int, highlights: bool, gums: bool) -> dict[str, Any]:
-    optics = {name: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)} for name, tissue in tissues.items()}
+def _truth(
+    tissues: Mapping[str, Tissue],
+    boundary: Boundary,
+    renderer: Renderer,
+    samples: int,
+    seed: int,
+    highlights: bool,
+    gums: bool,
+) -> dict[str, Any]:
+    optics = {
+        name: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)}
+        for name, tissue in tissues.items()
+    }
     surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
     return {
         "boundary": boundary,

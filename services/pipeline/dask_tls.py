@@ -31,12 +31,16 @@ class Certificates:
         found = cls(folder / "ca.crt", folder / "tls.crt", folder / "tls.key")
         for path in (found.authority, found.certificate, found.key):
             if not path.is_file():
-                raise SettingsError(f"Setting DENTINE__SERVER__TLS: {path} does not exist; the folder needs ca.crt, tls.crt and tls.key.")
+                raise SettingsError(
+                    f"Setting DENTINE__SERVER__TLS: {path} does not exist; the folder needs ca.crt, tls.crt and tls.key."
+                )
         try:
             found.context()
         except OSError as problem:
             what = f"Setting DENTINE__SERVER__TLS: the certificates in {folder} cannot be used ({problem})"
-            raise SettingsError(f"{what}; tls.key must be the key of tls.crt and readable, and all must be PEM.") from problem
+            raise SettingsError(
+                f"{what}; tls.key must be the key of tls.crt and readable, and all must be PEM."
+            ) from problem
         return found
 
     def context(self) -> ssl.SSLContext:
@@ -51,7 +55,9 @@ class Certificates:
         from distributed import Security
 
         files = {
-            f"tls_{role}_{part}": str(path) for role in ("client", "scheduler", "worker") for part, path in (("cert", self.certificate), ("key", self.key))
+            f"tls_{role}_{part}": str(path)
+            for role in ("client", "scheduler", "worker")
+            for part, path in (("cert", self.certificate), ("key", self.key))
         }
         return Security(tls_ca_file=str(self.authority), require_encryption=True, **files)
 

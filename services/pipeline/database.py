@@ -68,7 +68,12 @@ def open_database(url: str) -> sql.Engine:
     password_file = parsed.query.get(PASSWORD_FILE)
     parsed = parsed.difference_update_query([PASSWORD_FILE])
     try:
-        engine = sql.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, hide_parameters=True, connect_args=_watchful(parsed))
+        engine = sql.create_engine(
+            parsed.set(drivername="postgresql+psycopg"),
+            pool_pre_ping=True,
+            hide_parameters=True,
+            connect_args=_watchful(parsed),
+        )
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
     if isinstance(password_file, str):
@@ -87,7 +92,9 @@ def parse_database_url(url: str) -> sql.URL:
     except (sql.exc.ArgumentError, ValueError):
         what = "The database's URL is malformed; give sqlite:///FILE or postgresql://USER@HOST/NAME"
         advice = "with the password in the file that DENTINE__SERVER__DATABASE_PASSWORD_FILE names"
-        raise SettingsError(f"{what}, {advice}: in a URL, characters such as / @ # must be written as %2F %40 %23.") from None
+        raise SettingsError(
+            f"{what}, {advice}: in a URL, characters such as / @ # must be written as %2F %40 %23."
+        ) from None
 
 
 def with_password_file(url: str, path: Path) -> str:
@@ -109,7 +116,9 @@ def read_password(path: Path) -> str:
         password = path.read_text().rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as problem:
         reason = getattr(problem, "strerror", None) or "it is no text"
-        raise SettingsError(f"The file of the database's password, {path}, cannot be read ({reason}); correct it or the setting.") from problem
+        raise SettingsError(
+            f"The file of the database's password, {path}, cannot be read ({reason}); correct it or the setting."
+        ) from problem
     if not password:
         raise SettingsError(f"The file of the database's password, {path}, is empty; write the password into it.")
     return password
@@ -160,7 +169,9 @@ class Query:
             with closing(engine.raw_connection()) as borrowed:
                 rows: list[tuple[Any, ...]] = borrowed.cursor().execute(text, constants | values).fetchall()
         except sqlite3.Error as problem:  # also of connecting, which SQLAlchemy does not translate here
-            raise sql.exc.DBAPIError.instance(text, values, problem, sqlite3.Error, hide_parameters=True, dialect=engine.dialect) from problem
+            raise sql.exc.DBAPIError.instance(
+                text, values, problem, sqlite3.Error, hide_parameters=True, dialect=engine.dialect
+            ) from problem
         return rows
 
     @cached_property
@@ -190,7 +201,9 @@ def _turn(engine: sql.Engine) -> Iterator[None]:
         yield
         return
     if not turn.acquire(timeout=TURN_S):
-        raise sql.exc.OperationalError("BEGIN IMMEDIATE", None, TimeoutError("other writers of this process have not ended"))
+        raise sql.exc.OperationalError(
+            "BEGIN IMMEDIATE", None, TimeoutError("other writers of this process have not ended")
+        )
     try:
         yield
     finally:
@@ -211,7 +224,9 @@ def _watchful(url: sql.URL) -> dict[str, Any]:
 def _sqlite(url: sql.URL) -> sql.Engine:
     # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take turns before they ask it. Connections
     # stay open, as opening one costs more than most questions. Errors end in logs, so they hide what was asked.
-    engine = sql.create_engine(url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()})
+    engine = sql.create_engine(
+        url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()}
+    )
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:
@@ -226,6 +241,8 @@ def _sqlite(url: sql.URL) -> sql.Engine:
         if connection.get_execution_options().get("writes"):
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         else:
-            connection.connection.cursor().execute("BEGIN")  # takes no lock yet and cannot fail, so it needs none of SQLAlchemy's care
+            connection.connection.cursor().execute(
+                "BEGIN"
+            )  # takes no lock yet and cannot fail, so it needs none of SQLAlchemy's care
 
     return engine

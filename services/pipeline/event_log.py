@@ -70,7 +70,9 @@ def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
     """
     those, columns = jobs.subquery(), event_table.c
     last_ids = (
-        sql.select(sql.func.max(columns.id)).where(columns.job == those.c.id, columns.stage == stage, is_meant).scalar_subquery()
+        sql.select(sql.func.max(columns.id))
+        .where(columns.job == those.c.id, columns.stage == stage, is_meant)
+        .scalar_subquery()
         for stage in get_args(StageName)
         for is_meant in (sql.true(), columns.kind == "started")
     )
@@ -78,13 +80,21 @@ def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
     earlier = event_table.alias()
     last_done = (
         sql.select(earlier.c.done)
-        .where(earlier.c.job == event_table.c.job, earlier.c.stage == event_table.c.stage, earlier.c.attempt == event_table.c.attempt)
+        .where(
+            earlier.c.job == event_table.c.job,
+            earlier.c.stage == event_table.c.stage,
+            earlier.c.attempt == event_table.c.attempt,
+        )
         .where(earlier.c.done.is_not(None))
         .order_by(earlier.c.id.desc())
         .limit(1)
         .scalar_subquery()
     )
-    return sql.select(event_table, last_done.label("last_done")).where(event_table.c.id.in_(of_stage)).order_by(event_table.c.id)
+    return (
+        sql.select(event_table, last_done.label("last_done"))
+        .where(event_table.c.id.in_(of_stage))
+        .order_by(event_table.c.id)
+    )
 
 
 # Queries are built once: building one takes longer than asking it.
@@ -92,7 +102,11 @@ _LATEST = Query(latest_of_stages(sql.select(sql.bindparam("of").label("id"))))
 _NEWEST_ID = Query(sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == sql.bindparam("of")))
 _TOLD = Query(
     sql.select(event_table.c.id, event_table.c.time_s, event_table.c.data)
-    .where(event_table.c.job == sql.bindparam("of"), event_table.c.kind == sql.bindparam("of_kind"), event_table.c.id > sql.bindparam("after"))
+    .where(
+        event_table.c.job == sql.bindparam("of"),
+        event_table.c.kind == sql.bindparam("of_kind"),
+        event_table.c.id > sql.bindparam("after"),
+    )
     .order_by(event_table.c.id)
     .limit(PAGE)
 )
@@ -109,7 +123,9 @@ _INSERT = event_table.insert()
 @cache
 def _page_of(columns: tuple[str, ...]) -> Query:
     """Events of job ``of`` after ``after``, at most ``most``; each of the columns must be what the parameter of its name says."""
-    query = sql.select(event_table).where(event_table.c.job == sql.bindparam("of"), event_table.c.id > sql.bindparam("after"))
+    query = sql.select(event_table).where(
+        event_table.c.job == sql.bindparam("of"), event_table.c.id > sql.bindparam("after")
+    )
     query = query.where(*(event_table.c[name] == sql.bindparam(f"of_{name}") for name in columns))
     return Query(query.order_by(event_table.c.id).limit(sql.bindparam("most", type_=sql.Integer)))
 
@@ -160,10 +176,18 @@ def folder_events(folder: Path, job: str = "local") -> EventAddress:
     return address
 
 
-def insert_event(connection: sql.Connection, job: str, attempt: int, event: StageEvent | None = None, **columns: Any) -> None:
+def insert_event(
+    connection: sql.Connection, job: str, attempt: int, event: StageEvent | None = None, **columns: Any
+) -> None:
     """Append one row inside the caller's transaction."""
     if event is not None:
-        columns = {"stage": event.stage, "kind": event.kind, "message": event.message, "done": event.done, "data": event.data} | columns
+        columns = {
+            "stage": event.stage,
+            "kind": event.kind,
+            "message": event.message,
+            "done": event.done,
+            "data": event.data,
+        } | columns
     row = {"job": job, "attempt": attempt, "time_s": time.time(), "stage": None, "message": "", "done": None} | columns
     connection.execute(_INSERT, row | {"data": json.dumps(columns.get("data", {}), allow_nan=False)})
 
@@ -183,7 +207,9 @@ class EventLog:
         with writing(self._engine) as connection:
             newest = connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == self.job)) or 0
             if newest > self._lease:
-                raise FencedError(f"The job was taken over under lease {newest}; lease {self._lease} may not start stage {stage}.")
+                raise FencedError(
+                    f"The job was taken over under lease {newest}; lease {self._lease} may not start stage {stage}."
+                )
             attempt = 1 + max(known, self._newest_attempt(connection, stage))
             origin = {} if self._request_id is None else {"job": self.job, "request_id": self._request_id}
             origin |= {} if machine is None else {"machine": machine}
@@ -199,14 +225,19 @@ class EventLog:
         with writing(self._engine) as connection:
             newest = self._newest_attempt(connection, event.stage)
             if newest > attempt:
-                raise FencedError(f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are refused.")
+                raise FencedError(
+                    f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are refused."
+                )
             insert_event(connection, self.job, attempt, event)
 
     def read(self, after: int = 0, limit: int = PAGE, **only: str | int | None) -> list[JobEvent]:
         """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None for anything."""
         asked = {name: value for name, value in only.items() if value is not None}
         values = {f"of_{name}": value for name, value in asked.items()}
-        return [_event(row) for row in _page_of(tuple(asked)).rows(self._engine, of=self.job, after=after, most=limit, **values)]
+        return [
+            _event(row)
+            for row in _page_of(tuple(asked)).rows(self._engine, of=self.job, after=after, most=limit, **values)
+        ]
 
     def told(self, kind: str) -> Iterator[Told]:
         """All events of one kind, oldest first, as little of them as a curve of hundreds needs."""

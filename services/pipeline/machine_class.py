@@ -19,5 +19,9 @@ def machine_class(proc: Path = Path("/proc")) -> str:
 def _field(path: Path, name: str) -> str:
     if not path.is_file():
         return ""
-    found = (line.partition(":")[2].strip() for line in path.read_text().splitlines() if line.partition(":")[0].strip() == name)
+    found = (
+        line.partition(":")[2].strip()
+        for line in path.read_text().splitlines()
+        if line.partition(":")[0].strip() == name
+    )
     return next(found, "")

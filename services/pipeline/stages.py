@@ -26,14 +26,30 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from services.core.errors import CorruptStoreError, InputError, JobCancelledError, MissingStageError, PlatformError, SchedulerLostError, WorkerLostError
+from services.core.errors import (
+    CorruptStoreError,
+    InputError,
+    JobCancelledError,
+    MissingStageError,
+    PlatformError,
+    SchedulerLostError,
+    WorkerLostError,
+)
 from services.core.events import JobEvent
 from services.core.job_kinds import job_kinds
 from services.core.masks import is_stale
 from services.core.placement import DOME, STAGES, rank
 from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
-from services.core.store import is_published, open_stage, read_record, require_intact, telling_disk_faults, withdraw, write_record
+from services.core.store import (
+    is_published,
+    open_stage,
+    read_record,
+    require_intact,
+    telling_disk_faults,
+    withdraw,
+    write_record,
+)
 from services.pipeline.database import patiently
 from services.pipeline.event_log import EventAddress, EventLog, folder_events
 from services.pipeline.machine_class import machine_class
@@ -100,7 +116,19 @@ def run_job(
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
     """
-    run_stages(spec, root, stages_of(spec), listener, workers, events, doors, cluster, is_logged=is_logged, before=before, phantoms=phantoms)
+    run_stages(
+        spec,
+        root,
+        stages_of(spec),
+        listener,
+        workers,
+        events,
+        doors,
+        cluster,
+        is_logged=is_logged,
+        before=before,
+        phantoms=phantoms,
+    )
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
 
@@ -133,7 +161,12 @@ def run_stages(
             watch = _Watch(log, listener, log.newest_id())
             if todo:
                 entered = {**job_kinds()[spec.kind].doors, **doors}
-                tasks = [StageTask(stage, entered[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged) for stage in todo]
+                tasks = [
+                    StageTask(
+                        stage, entered[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged
+                    )
+                    for stage in todo
+                ]
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
             watch.tell()
@@ -235,7 +268,9 @@ def _go_on() -> None:
     """Nothing keeps the next stage."""
 
 
-def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _Watch, before: Callable[[], None]) -> None:
+def _run_tasks(
+    processes: Workers, count: int, tasks: list[StageTask], watch: _Watch, before: Callable[[], None]
+) -> None:
     """Submit each stage once the one before has ended, follow its events, and raise what it raises."""
     from distributed.comm import CommClosedError
 
@@ -246,7 +281,9 @@ def _run_tasks(processes: Workers, count: int, tasks: list[StageTask], watch: _W
                     before()
                 _follow_stage(client, processes.keep, task, watch)
     except (CancelledError, CommClosedError) as problem:
-        raise SchedulerLostError("The workers' scheduler went away; the job goes on from what it had published once it answers again.") from problem
+        raise SchedulerLostError(
+            "The workers' scheduler went away; the job goes on from what it had published once it answers again."
+        ) from problem
 
 
 def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: _Watch) -> None:
@@ -268,7 +305,9 @@ def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageT
         # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
         if not has_ended and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
             _stop_workers_of(client, key)
-            raise JobCancelledError("The job was cancelled on request; its workers were stopped, and what it had published is kept.")
+            raise JobCancelledError(
+                "The job was cancelled on request; its workers were stopped, and what it had published is kept."
+            )
     try:
         if stage.status != "finished":
             stage.result()
@@ -311,7 +350,9 @@ def _sole_owner(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(f"Folder {root} is in use by another running job; wait for it or choose another folder.") from None
+            raise InputError(
+                f"Folder {root} is in use by another running job; wait for it or choose another folder."
+            ) from None
         yield
 
 
@@ -353,7 +394,9 @@ def _claim_folder(root: Path, spec: JobSpec) -> None:
         theirs, ours = (_options(one) for one in (earlier, spec))
         changed = sorted(name for name in ours if name not in indifferent and ours[name] != theirs[name])
         if changed:
-            raise InputError(f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or remove it.")
+            raise InputError(
+                f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or remove it."
+            )
     write_record(path, spec)
 
 

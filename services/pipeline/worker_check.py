@@ -33,13 +33,19 @@ def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
     except subprocess.TimeoutExpired:
-        return f"The check of what is installed did not end within {timeout_s:g} s; look for what keeps this machine busy."
+        return (
+            f"The check of what is installed did not end within {timeout_s:g} s; look for what keeps this machine busy."
+        )
     if ended.returncode == 0:
         return ""
     last = next((line for line in reversed(ended.stderr.splitlines()) if line.strip()), "")
     if ended.returncode == PlatformError.exit_status:
         return last
-    how = f"was ended by {signal.Signals(-ended.returncode).name}" if ended.returncode < 0 else f"ended with status {ended.returncode}"
+    how = (
+        f"was ended by {signal.Signals(-ended.returncode).name}"
+        if ended.returncode < 0
+        else f"ended with status {ended.returncode}"
+    )
     return f"The process that imports what stages need and renders a pixel {how}: {last or 'it said nothing'}."
 
 

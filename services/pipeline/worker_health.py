@@ -63,7 +63,9 @@ def require_healthy_workers(folder: Path | None = None) -> int:
     folder, since_s = folder or default_folder(), time.time() - SILENT_S
     signs = sorted(path for path in folder.glob("*.json") if path.stat().st_mtime > since_s)
     if not signs:
-        raise PlatformError(f"No worker of this machine has been connected to its scheduler in the last {SILENT_S:g} s; read the worker's log.")
+        raise PlatformError(
+            f"No worker of this machine has been connected to its scheduler in the last {SILENT_S:g} s; read the worker's log."
+        )
     if faults := [fault for sign in signs if (fault := json.loads(sign.read_bytes())["fault"])]:
         raise PlatformError(faults[0])
     return len(signs)

@@ -91,7 +91,9 @@ class Workers:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     @contextmanager
@@ -146,7 +148,9 @@ class Workers:
         try:
             census: Census = client.sync(_census, client, callback_timeout=LOOK_S)
         except (OSError, TimeoutError) as problem:
-            raise SchedulerLostError(f"The scheduler {self._scheduler or 'of this server'} does not answer; jobs wait for it.") from problem
+            raise SchedulerLostError(
+                f"The scheduler {self._scheduler or 'of this server'} does not answer; jobs wait for it."
+            ) from problem
         return census
 
     def lacking(self, captures: bool) -> str | None:
@@ -157,7 +161,9 @@ class Workers:
             census = self.look()
         except SchedulerLostError as problem:
             return problem.message
-        return None if census is None or census.able(DOME if captures else STAGES) else census.sentence(captures=captures)
+        return (
+            None if census is None or census.able(DOME if captures else STAGES) else census.sentence(captures=captures)
+        )
 
     def condition(self) -> str:
         """How many workers can run stages.
@@ -205,14 +211,19 @@ class Workers:
 
         _leave_dask_alone()
         # For good, and in this process too, as connections that are made later read it.
-        preloads = {"distributed.worker.preload": [SIGINT_IS_THE_PARENTS, CLOSE_HTTP], "distributed.scheduler.preload": [CLOSE_HTTP]}
+        preloads = {
+            "distributed.worker.preload": [SIGINT_IS_THE_PARENTS, CLOSE_HTTP],
+            "distributed.scheduler.preload": [CLOSE_HTTP],
+        }
         dask.config.set({**DASK_CONFIG, **preloads})
         if self._scheduler is not None:
             try:
                 security = self._certificates.security() if self._certificates else None
                 return Client(self._scheduler, timeout=CONNECT_S, security=security)
             except OSError as problem:
-                raise SchedulerLostError(f"The scheduler {self._scheduler} does not answer; start it, the job waits.") from problem
+                raise SchedulerLostError(
+                    f"The scheduler {self._scheduler} does not answer; start it, the job waits."
+                ) from problem
         # Loopback is open to every user of the machine, so workers there show certificates too: made now, kept in memory.
         self._cluster = LocalCluster(
             n_workers=0,

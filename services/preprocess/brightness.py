@@ -43,11 +43,15 @@ class Brightness:
     """(camera, light) of images in which no tooth is above the noise."""
     _lights: dict[str, _Sums] = field(default_factory=lambda: defaultdict(_Sums))
 
-    def add(self, image: LightImage, footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]) -> bool:
+    def add(
+        self, image: LightImage, footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]
+    ) -> bool:
         """Count the chosen pixels (H, W) of an image; returns False where there are some and no light is seen in them."""
         if not chosen.any():
             return True
-        measured, variance = (float(values[chosen].sum(dtype=np.float64)) for values in (image.radiance, image.variance))
+        measured, variance = (
+            float(values[chosen].sum(dtype=np.float64)) for values in (image.radiance, image.variance)
+        )
         if measured <= CERTAIN * np.sqrt(variance):
             self.dark.append((camera.name, light.name))
             return False
@@ -64,7 +68,10 @@ class Brightness:
         Raises:
             CaptureInputError: says by how much.
         """
-        measured, white = sum(sums.measured for sums in self._lights.values()), sum(sums.white for sums in self._lights.values())
+        measured, white = (
+            sum(sums.measured for sums in self._lights.values()),
+            sum(sums.white for sums in self._lights.values()),
+        )
         if white > 0 and not PLAUSIBLE[0] <= measured / white <= PLAUSIBLE[1]:
             raise CaptureInputError(
                 f"Teeth are {measured / white:.2g} times as bright as a white surface in their place would be, where real ones are 0.1 to 1 times; give "
@@ -84,11 +91,15 @@ class Brightness:
         typical = float(np.median(list(ratios.values()))) if ratios else 1.0
         for light, ratio in ratios.items():
             if not 1 / ODD_LIGHT <= ratio / typical <= ODD_LIGHT:
-                notes.append(f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity let expect; check both.")
+                notes.append(
+                    f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity let expect; check both."
+                )
         return tuple(notes)
 
 
-def _incidence(footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _incidence(
+    footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows are not looked for.
     rows = np.flatnonzero(chosen.any(axis=1))
     band = slice(int(rows[0]), int(rows[-1]) + 1)

@@ -52,11 +52,17 @@ class FolderSource:
         self._entries: dict[tuple[str, str], ImageEntry] = {}
         for entry in self.description.images:
             if entry.camera not in cameras:
-                raise CaptureInputError(f"{origin}: image {entry.file} names camera {entry.camera}, which is not among the cameras; correct the name.")
+                raise CaptureInputError(
+                    f"{origin}: image {entry.file} names camera {entry.camera}, which is not among the cameras; correct the name."
+                )
             if entry.light not in lights:
-                raise CaptureInputError(f"{origin}: image {entry.file} names light {entry.light}, which is not among the lights; correct the name.")
+                raise CaptureInputError(
+                    f"{origin}: image {entry.file} names light {entry.light}, which is not among the lights; correct the name."
+                )
             if (entry.camera, entry.light) in self._entries:
-                raise CaptureInputError(f"{origin} lists camera {entry.camera} under light {entry.light} twice; keep one of the images.")
+                raise CaptureInputError(
+                    f"{origin} lists camera {entry.camera} under light {entry.light} twice; keep one of the images."
+                )
             self._entries[entry.camera, entry.light] = entry
             for file in (entry.file, entry.variance_file):
                 if file is not None and not self._path(file).is_file():
@@ -67,7 +73,9 @@ class FolderSource:
                     self._map(entry, file, numbers[entry.camera])
         used = {light for _, light in self._entries}
         if unused := [light.name for light in self.description.lights if light.name not in used]:
-            shown = ", ".join(unused[:NAMES_SHOWN]) + (f" and {len(unused) - NAMES_SHOWN} more" if len(unused) > NAMES_SHOWN else "")
+            shown = ", ".join(unused[:NAMES_SHOWN]) + (
+                f" and {len(unused) - NAMES_SHOWN} more" if len(unused) > NAMES_SHOWN else ""
+            )
             self.notes = (f"No image names light {shown}; remove what the rig does not have, or add its images.",)
         self.held_out = tuple(pair for pair, entry in self._entries.items() if entry.held_out)
 
@@ -111,6 +119,8 @@ class FolderSource:
     def _map(self, entry: ImageEntry, file: str, camera: int) -> tuple[NDArray[np.floating[Any]], str]:
         place = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"
         if Path(file).suffix.lower() != ".npy":
-            raise CaptureInputError(f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float32.")
+            raise CaptureInputError(
+                f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float32."
+            )
         width, height = self.description.cameras[camera].size
         return map_radiance(self._path(file), (height, width, len(self.description.channels)), place), place

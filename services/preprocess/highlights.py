@@ -46,7 +46,9 @@ def half_angles(camera: Camera, light: Light, footprint: Footprint, band_rows: i
         rows = slice(top, top + band_rows)
         points = footprint.points_mm(camera, rows)
         to_light, to_eye = np.asarray(light.position_mm) - points, eye - points
-        half = to_light / np.linalg.norm(to_light, axis=-1, keepdims=True) + to_eye / np.linalg.norm(to_eye, axis=-1, keepdims=True)
+        half = to_light / np.linalg.norm(to_light, axis=-1, keepdims=True) + to_eye / np.linalg.norm(
+            to_eye, axis=-1, keepdims=True
+        )
         cosine = (half * footprint.normal[rows]).sum(axis=-1) / np.maximum(np.linalg.norm(half, axis=-1), 1e-12)
         angles[rows] = np.where(footprint.mesh[rows] >= 0, np.arccos(np.clip(cosine, -1, 1)), np.pi)
     return angles
@@ -105,7 +107,9 @@ def highlight_mask(
     return (usable | saturated) & (bloom | lobe) if core.any() else np.zeros(usable.shape, dtype=bool)
 
 
-def _by_shading(brightness: Image, variance: Image, usable: BoolArray, far: BoolArray, normal: Image, o: HighlightOptions) -> tuple[Image, Image]:
+def _by_shading(
+    brightness: Image, variance: Image, usable: BoolArray, far: BoolArray, normal: Image, o: HighlightOptions
+) -> tuple[Image, Image]:
     """Reflected part and inverse variance, taking diffuse shading as a quadratic in the normal (nine coefficients)."""
     lit = far & (brightness > 0.1 * np.quantile(brightness[far], 0.95)) if far.any() else far
     chosen = np.flatnonzero(lit)
@@ -145,13 +149,26 @@ def _wide_blur(image: Image, sigma_px: float) -> Image:
 
     factor = max(1, int(sigma_px / 6))
     height, width = image.shape
-    small = image if factor == 1 else cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    small = (
+        image
+        if factor == 1
+        else cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    )
     blurred = cv2.GaussianBlur(small, (0, 0), sigma_px / factor)
-    return np.asarray(blurred if factor == 1 else cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    return np.asarray(
+        blurred if factor == 1 else cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR),
+        dtype=np.float32,
+    )
 
 
 def _by_colour(
-    radiance: Image, variance: Image, brightness: Image, usable: BoolArray, far: BoolArray, axis: NDArray[np.float64], o: HighlightOptions
+    radiance: Image,
+    variance: Image,
+    brightness: Image,
+    usable: BoolArray,
+    far: BoolArray,
+    axis: NDArray[np.float64],
+    o: HighlightOptions,
 ) -> tuple[Image, Image]:
     """Reflected part and inverse variance from S against UV.
 
@@ -181,7 +198,9 @@ def _by_colour(
     return estimate.astype(np.float32), weight.astype(np.float32)
 
 
-def _lobe_angle(estimate: Image, weight: Image, brightness: Image, usable: BoolArray, angles: Image, o: HighlightOptions) -> float:
+def _lobe_angle(
+    estimate: Image, weight: Image, brightness: Image, usable: BoolArray, angles: Image, o: HighlightOptions
+) -> float:
     """Half-angle in rad within which the mean reflected fraction exceeds ``tolerated``: averaging sees tails that single pixels hide."""
     degrees = np.degrees(angles[usable])
     bins = np.minimum(degrees.astype(np.int64), 179)

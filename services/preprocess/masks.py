@@ -23,10 +23,15 @@ class HandMasks:
         """
         self._root, self._masks = root, read_masks(root)
         self.digest = digest_of(self._masks)
-        cameras, lights = {camera.name for camera in description.cameras}, {light.name for light in description.lights} | {ALL_LIGHTS}
+        cameras, lights = (
+            {camera.name for camera in description.cameras},
+            {light.name for light in description.lights} | {ALL_LIGHTS},
+        )
         for camera, light in self._masks:
             if camera not in cameras or light not in lights:
-                raise CaptureInputError(f"Mask {mask_path(root, camera, light)} is of no camera and light of the capture; remove it or correct its name.")
+                raise CaptureInputError(
+                    f"Mask {mask_path(root, camera, light)} is of no camera and light of the capture; remove it or correct its name."
+                )
 
     def bits(self, camera: str, light: str, size: tuple[int, int]) -> NDArray[np.uint16]:
         """MANUAL where the mask of this light, or the one of all lights, is set; ``size`` is (width, height).
@@ -43,7 +48,11 @@ class HandMasks:
     def _decode(self, path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
         import cv2
 
-        mask: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        mask: NDArray[np.uint8] | None = (
+            cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
+        )
         if mask is None or mask.shape != size[::-1]:
-            raise CaptureInputError(f"Mask {path} is no image of {size[0]} x {size[1]} pixels; draw it again, or remove it.")
+            raise CaptureInputError(
+                f"Mask {path} is no image of {size[0]} x {size[1]} pixels; draw it again, or remove it."
+            )
         return mask

@@ -54,7 +54,12 @@ class ViewMotion:
     """
 
     def __init__(
-        self, footprint: Footprint, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord], brightness: Callable[[FrameRecord], Image], view: str
+        self,
+        footprint: Footprint,
+        bodies: Sequence[Sequence[int]],
+        frames: Sequence[FrameRecord],
+        brightness: Callable[[FrameRecord], Image],
+        view: str,
     ) -> None:
         """Measure.
 
@@ -98,7 +103,9 @@ class ViewMotion:
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # The shift's error stands for the field's: the other terms are small beside it
-        return Displacement(coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0)))
+        return Displacement(
+            coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
+        )
 
     def field(self, displacement: Displacement, step: int = 1) -> Image:
         """Displacement (H, W, 2) in pixels at every ``step``-th pixel; pixels beside all teeth move with the first jaw."""

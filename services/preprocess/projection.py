@@ -30,7 +30,9 @@ class Footprint:
         height, width = self.mesh.shape
         y, x = np.mgrid[0:height, 0:width][:, rows]
         pose = np.asarray(camera.camera_from_world)
-        local = np.stack([x + 0.5, y + 0.5, np.ones_like(x, dtype=float)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
+        local = (
+            np.stack([x + 0.5, y + 0.5, np.ones_like(x, dtype=float)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
+        )
         local *= np.where(self.mesh[rows] >= 0, self.depth_mm[rows], np.nan)[..., None]
         return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float32)
 

@@ -42,10 +42,16 @@ class QualityReport(Record):
     images: tuple[ImageQuality, ...]
 
 
-def assess(camera: str, light: str, bits: NDArray[np.uint16], covered: NDArray[np.bool_], motion_px: float | None) -> ImageQuality:
+def assess(
+    camera: str, light: str, bits: NDArray[np.uint16], covered: NDArray[np.bool_], motion_px: float | None
+) -> ImageQuality:
     """Count what was masked among the tooth's pixels."""
     pixels = int(np.count_nonzero(covered))
-    masked = {bit.name.lower(): float(np.count_nonzero(bits[covered] & np.uint16(bit)) / max(pixels, 1)) for bit in MaskBit if bit.name is not None}
+    masked = {
+        bit.name.lower(): float(np.count_nonzero(bits[covered] & np.uint16(bit)) / max(pixels, 1))
+        for bit in MaskBit
+        if bit.name is not None
+    }
     return ImageQuality(
         camera=camera,
         light=light,

@@ -37,7 +37,9 @@ class Radiometry:
         full_scale = 2**m.bits - 1
         signal = counts.astype(np.float32) - self.black
         floor = (m.sensor_noise_floor * full_scale) ** 2 + 1 / 12
-        variance = (m.sensor_noise_relative * np.maximum(signal, 0)) ** 2 + np.float32(floor * (1 + 1 / self.black_frames))
+        variance = (m.sensor_noise_relative * np.maximum(signal, 0)) ** 2 + np.float32(
+            floor * (1 + 1 / self.black_frames)
+        )
         gain = np.float32(m.radiance_per_count / (frame.level * frame.exposure_s))
         saturated: BoolArray = (counts >= full_scale).any(axis=-1)
         return (signal * gain).astype(np.float32), (variance * gain**2).astype(np.float32), saturated
@@ -63,4 +65,8 @@ class Merge:
         """Radiance and variance (H, W, C), and where no exposure was usable (H, W)."""
         weight = np.maximum(self._weight, 1e-30)
         lost: BoolArray = (self._weight == 0).any(axis=-1)
-        return (self._weighted / weight).astype(np.float32), np.where(lost[..., None], 0, 1 / weight).astype(np.float32), lost
+        return (
+            (self._weighted / weight).astype(np.float32),
+            np.where(lost[..., None], 0, 1 / weight).astype(np.float32),
+            lost,
+        )

@@ -47,12 +47,20 @@ class RigSource:
         require_consistent(self.description, f"Capture {root}")
         self._black = [frame for frame in manifest.frames if frame.kind == "black"][:BLACK_FRAMES]
         if not self._black:
-            raise CaptureInputError(f"Capture {root} has no black frame, so its zero is unknown; capture it again with at least one.")
+            raise CaptureInputError(
+                f"Capture {root} has no black frame, so its zero is unknown; capture it again with at least one."
+            )
         self._frames: list[list[FrameRecord]] = []
         for light in self.description.lights:
-            own = [frame for frame in manifest.frames if frame.kind == "light" and frame.light == light.name and frame.level > 0]
+            own = [
+                frame
+                for frame in manifest.frames
+                if frame.kind == "light" and frame.light == light.name and frame.level > 0
+            ]
             if not own:
-                raise CaptureInputError(f"Capture {root} has no lit frame of light {light.name}; capture that light again.")
+                raise CaptureInputError(
+                    f"Capture {root} has no lit frame of light {light.name}; capture that light again."
+                )
             self._frames.append(own)
         tracking = sum(frame.kind == "tracking" for frame in manifest.frames)
         self.notes: tuple[str, ...] = ()
@@ -97,7 +105,9 @@ def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion
         if move.median_px > STILL_PX:
             # Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right
             field = motion.field(move)
-            of_saturated, of_image = np.moveaxis(warp(np.stack([saturated, np.ones_like(saturated)], axis=-1), field), -1, 0)
+            of_saturated, of_image = np.moveaxis(
+                warp(np.stack([saturated, np.ones_like(saturated)], axis=-1), field), -1, 0
+            )
             radiance, variance, saturated = warp(radiance, field), warp(variance, field), of_saturated > 0
             beyond |= of_image < WHOLLY_SEEN
             warped = True

@@ -73,7 +73,9 @@ class SurfaceFlow:
         """Displacement (rows, width, 2) in pixels from the reference to the frame, every ``step`` pixels."""
         height, width = self._relief.shape
         y, x = np.mgrid[0:height, 0:width][:, rows][:, ::step, ::step].astype(np.float32)
-        return np.asarray(self.terms(self._relief[rows][::step, ::step], x, y) @ coefficients.astype(np.float32), dtype=np.float32)
+        return np.asarray(
+            self.terms(self._relief[rows][::step, ::step], x, y) @ coefficients.astype(np.float32), dtype=np.float32
+        )
 
     def reduced(self, factor: int) -> tuple[BoolArray, Image]:
         """Region used for matching and basis (h, w, TERMS), both reduced by ``factor``."""
@@ -113,7 +115,10 @@ class Aligner:
         self._levels = []
         for number, image in enumerate(_pyramid(reference, self._factor, feature)):
             if number:
-                region, terms = _halve(region.astype(np.float32)) > 0.5, np.stack([_halve(terms[..., k]) for k in range(TERMS)], axis=-1)
+                region, terms = (
+                    _halve(region.astype(np.float32)) > 0.5,
+                    np.stack([_halve(terms[..., k]) for k in range(TERMS)], axis=-1),
+                )
             inside = np.flatnonzero(region)
             matched = inside[:: -(-len(inside) // MATCHED_PIXELS) or 1]
             self._levels.append(_Level(image, matched, terms, float(self._factor * 2**number)))
@@ -124,7 +129,9 @@ class Aligner:
 
         coefficients = np.zeros((TERMS, 2))
         ridge = np.tile(RIDGE[self._feature], 2)
-        for level, moving in reversed(list(zip(self._levels, _pyramid(frame, self._factor, self._feature), strict=True))):
+        for level, moving in reversed(
+            list(zip(self._levels, _pyramid(frame, self._factor, self._feature), strict=True))
+        ):
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
             basis = level.terms.reshape(-1, TERMS)[level.matched] / level.pixel_px
             fixed_x, fixed_y = _gradient(level.feature)
@@ -132,7 +139,9 @@ class Aligner:
             for _ in range(iterations if level is not self._levels[0] else iterations // 3):
                 # Sample the frame where the reference pixel has gone; the gradient is the mean of both images'
                 shift = level.terms @ coefficients.astype(np.float32) / level.pixel_px
-                warped = cv2.remap(moving, x + shift[..., 0], y + shift[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                warped = cv2.remap(
+                    moving, x + shift[..., 0], y + shift[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
                 moved_x, moved_y = _gradient(warped)
                 slope = 0.5 * np.stack([fixed_x + moved_x, fixed_y + moved_y], axis=-1).reshape(-1, 2)[level.matched]
                 residual = (warped - level.feature).ravel()[level.matched]
@@ -182,7 +191,9 @@ def warp(image: NDArray[np.generic], displacement: Image) -> Image:
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     x += displacement[..., 0]
     y += displacement[..., 1]
-    return np.asarray(cv2.remap(np.asarray(image, dtype=np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)).reshape(image.shape)
+    return np.asarray(
+        cv2.remap(np.asarray(image, dtype=np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    ).reshape(image.shape)
 
 
 def _features(image: Image, feature: Feature) -> Image:
@@ -207,7 +218,9 @@ def _pyramid(image: Image, factor: int, feature: Feature) -> list[Image]:
     import cv2
 
     if factor > 1:
-        image = cv2.resize(image, (max(1, image.shape[1] // factor), max(1, image.shape[0] // factor)), interpolation=cv2.INTER_AREA)
+        image = cv2.resize(
+            image, (max(1, image.shape[1] // factor), max(1, image.shape[0] // factor)), interpolation=cv2.INTER_AREA
+        )
     levels = [_features(np.asarray(image, dtype=np.float32), feature)]
     while min(levels[-1].shape) >= 40:
         levels.append(_halve(levels[-1]))

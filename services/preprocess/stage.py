@@ -60,7 +60,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     if spec.channels == ():
         raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
     if unknown := set(spec.channels or ()) - set(channels):
-        raise SettingsError(f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it.")
+        raise SettingsError(
+            f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it."
+        )
     masks = HandMasks(context.root, source.description)
     subject = read_subject(source.root, whole=spec.kind == "jaw")
     teeth = subject.teeth
@@ -70,11 +72,15 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     shutil.rmtree(writer.folder)
     writer.folder.mkdir()
     images_in_all = sum(len(source.lights_of(k)) for k in range(len(cameras)))
-    context.report(StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras."))
+    context.report(
+        StageEvent(stage="prepare", kind="started", message=f"{images_in_all} images of {len(cameras)} cameras.")
+    )
 
     height, width = max(c.size[1] for c in cameras), max(c.size[0] for c in cameras)
     planes = (len(cameras), len(lights), height, width)
-    radiance, variance, valid, surface, motion = _create_arrays(writer.folder / "prepared.zarr", planes, len(channels), with_motion=source.measures_motion)
+    radiance, variance, valid, surface, motion = _create_arrays(
+        writer.folder / "prepared.zarr", planes, len(channels), with_motion=source.measures_motion
+    )
 
     brightness, reports, done, seen = Brightness(), [], 0, np.zeros(len(teeth), dtype=np.int64)
     for k, camera in enumerate(cameras):
@@ -102,7 +108,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
                 motion[k, j, : image.displacement.shape[0], : image.displacement.shape[1]] = image.displacement
             quality = assess(camera.name, lights[j].name, bits[:h, :w], footprint.covered, image.motion_px)
             reports.append(quality)
-            write_picture(writer.folder / "quality" / f"{camera.name}_{lights[j].name}.png", image.radiance, bits[:h, :w])
+            write_picture(
+                writer.folder / "quality" / f"{camera.name}_{lights[j].name}.png", image.radiance, bits[:h, :w]
+            )
             done += 1
             context.report(
                 StageEvent(
@@ -114,15 +122,23 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
                 )
             )
             if quality.valid_pixels == 0:
-                reasons = ", ".join(f"{name} {share:.0%}" for name, share in sorted(quality.masked.items(), key=lambda item: -item[1]))
+                reasons = ", ".join(
+                    f"{name} {share:.0%}" for name, share in sorted(quality.masked.items(), key=lambda item: -item[1])
+                )
                 context.report(
-                    StageEvent(stage="prepare", kind="log", message=f"Camera {camera.name}, light {lights[j].name} has no valid pixel left ({reasons}).")
+                    StageEvent(
+                        stage="prepare",
+                        kind="log",
+                        message=f"Camera {camera.name}, light {lights[j].name} has no valid pixel left ({reasons}).",
+                    )
                 )
 
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:
         what = "is dark: no tooth is above the noise" if brightness.dark else "lacks a valid tooth pixel"
-        raise CaptureInputError(f"Every image of {source.root} {what}; check exposure, lights, noise and masks, then capture again.")
+        raise CaptureInputError(
+            f"Every image of {source.root} {what}; check exposure, lights, noise and masks, then capture again."
+        )
     brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in teeth)
     notes = [*source.notes, *brightness.notes(), *unusable_note(reports)]
@@ -149,7 +165,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
     )
     writer.publish(manifest)
-    context.report(StageEvent(stage="prepare", kind="finished", message=f"{valid_pixels} valid pixels in {done} images.", done=1.0))
+    context.report(
+        StageEvent(stage="prepare", kind="finished", message=f"{valid_pixels} valid pixels in {done} images.", done=1.0)
+    )
     return manifest
 
 
@@ -162,10 +180,13 @@ def _create_arrays(
     cameras, _, height, width = planes
     stack = ("camera", "light", "y", "x")
     radiance, variance = (
-        create_array(store, name, (*planes, channels), (1, 1, height, width, channels), "float32", (*stack, "channel")) for name in ("radiance", "variance")
+        create_array(store, name, (*planes, channels), (1, 1, height, width, channels), "float32", (*stack, "channel"))
+        for name in ("radiance", "variance")
     )
     valid = create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
-    surface = create_array(store, "surface", (cameras, height, width), (1, height, width), "int16", ("camera", "y", "x"))
+    surface = create_array(
+        store, "surface", (cameras, height, width), (1, height, width), "int16", ("camera", "y", "x")
+    )
     if not with_motion:
         return radiance, variance, valid, surface, None
     step = stored_step((height, width))
@@ -188,7 +209,9 @@ def _open_source(spec: JobSpec, root: Path) -> Source:
         source = FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)
     if spec.calibration is not None:
         source.description = recalibrated(source.description, spec.calibration)
-        source.notes += (f"Cameras and lights are those of calibration {spec.calibration.stem}, not the capture's own.",)
+        source.notes += (
+            f"Cameras and lights are those of calibration {spec.calibration.stem}, not the capture's own.",
+        )
     return source
 
 
@@ -199,10 +222,17 @@ def _held_out(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...]:
         return source.held_out
     chosen = spec.held_out_lights if spec.held_out_lights is not None else tuple(names[3::4])
     if unknown := [name for name in chosen if name not in names]:
-        raise SettingsError(f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it.")
+        raise SettingsError(
+            f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it."
+        )
     if set(chosen) == set(names):
         raise SettingsError("Option 'held_out_lights' keeps every light from the fit; leave at least one to it.")
-    return tuple((camera.name, names[j]) for k, camera in enumerate(source.description.cameras) for j in source.lights_of(k) if names[j] in chosen)
+    return tuple(
+        (camera.name, names[j])
+        for k, camera in enumerate(source.description.cameras)
+        for j in source.lights_of(k)
+        if names[j] in chosen
+    )
 
 
 def _copy_meshes(source: Path, target: Path, fdi: tuple[int, ...]) -> None:

@@ -14,7 +14,11 @@ from services.preprocess.source import LightImage
 
 
 def valid_bits(
-    image: LightImage, footprint: Footprint, camera: Camera, light: Light, glossy: tuple[NDArray[np.bool_], ...] | None = None
+    image: LightImage,
+    footprint: Footprint,
+    camera: Camera,
+    light: Light,
+    glossy: tuple[NDArray[np.bool_], ...] | None = None,
 ) -> NDArray[np.uint16]:
     """Mask bits (H, W); 0 is a pixel to fit.
 
@@ -28,14 +32,19 @@ def valid_bits(
 
     inside = footprint.covered
     if image.warped:
-        inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+        inside = (
+            cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+            > 0
+        )
     bits = image.bits | np.where(inside, 0, MaskBit.OUTSIDE).astype(np.uint16)
     saturated = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED) > 0)
     usable = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE) == 0)
     angles = half_angles(camera, light, footprint)
     highlight = np.zeros(bits.shape, dtype=bool)
     for part in (footprint.covered,) if glossy is None else glossy:
-        highlight |= highlight_mask(image.radiance, image.variance, usable & part, saturated & part, angles, footprint.normal, light.intensity)
+        highlight |= highlight_mask(
+            image.radiance, image.variance, usable & part, saturated & part, angles, footprint.normal, light.intensity
+        )
     return np.asarray(bits | np.where(highlight, MaskBit.HIGHLIGHT, 0).astype(np.uint16), dtype=np.uint16)
 
 
@@ -77,4 +86,6 @@ def require_seen(footprint: Footprint, teeth: int, camera: Camera) -> None:
         CaptureInputError: names the camera.
     """
     if not (footprint.covered & (footprint.mesh < teeth)).any():
-        raise CaptureInputError(f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are in millimetres.")
+        raise CaptureInputError(
+            f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are in millimetres."
+        )

@@ -24,7 +24,9 @@ def modules_after(code: str) -> set[str]:
 
 def modules_below(room: str) -> list[str]:
     folder = ROOT / "services" / room
-    paths = (path.relative_to(folder).with_suffix("") for path in sorted(folder.rglob("*.py")) if path.stem != "__init__")
+    paths = (
+        path.relative_to(folder).with_suffix("") for path in sorted(folder.rglob("*.py")) if path.stem != "__init__"
+    )
     # Steps of migration are files that Alembic reads, not modules.
     return [".".join(("services", room, *path.parts)) for path in paths if path.parts[0] != "migrations"]
 
@@ -51,7 +53,11 @@ def test_an_application_starts_without_the_stages(tmp_path: Path) -> None:
 
 def test_the_command_line_starts_light() -> None:
     loaded = modules_after("from services.cli.app import build_app\nbuild_app()")
-    assert not [name for name in loaded if name.startswith(SERVICES) or name.split(".")[0] in (*HEAVY, "fastapi", "distributed", "zarr", "sqlalchemy")]
+    assert not [
+        name
+        for name in loaded
+        if name.startswith(SERVICES) or name.split(".")[0] in (*HEAVY, "fastapi", "distributed", "zarr", "sqlalchemy")
+    ]
 
 
 def test_only_the_composition_root_reads_the_environment() -> None:

@@ -28,7 +28,9 @@ def licence(of: Distribution) -> str:
     """As the package's metadata state it."""
     told = of.metadata
     classified = [one.rpartition(" :: ")[2] for one in told.get_all("Classifier", []) if one.startswith("License ::")]
-    return str(told.get("License-Expression") or "; ".join(classified) or (told.get("License") or "").partition("\n")[0])
+    return str(
+        told.get("License-Expression") or "; ".join(classified) or (told.get("License") or "").partition("\n")[0]
+    )
 
 
 def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator[Distribution]:
@@ -66,6 +68,15 @@ def test_every_package_of_the_page_may_be_given_on() -> None:
             assert PERMISSIVE.search(package["license"]), (path, package["license"])
 
 
-@pytest.mark.parametrize("text", ["GPL-3.0-only", "GNU General Public License v3 (GPLv3)", "AGPL-3.0", "GNU Affero General Public License v3", "Commercial"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "GPL-3.0-only",
+        "GNU General Public License v3 (GPLv3)",
+        "AGPL-3.0",
+        "GNU Affero General Public License v3",
+        "Commercial",
+    ],
+)
 def test_a_licence_that_binds_the_whole_is_found(text: str) -> None:
     assert STRONG.search(text) or not PERMISSIVE.search(text)

@@ -18,7 +18,9 @@ MAX_SIDE_BY_SIDE = 20
 
 
 def sources(*folders: str) -> Iterator[Path]:
-    return (path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")) if "node_modules" not in path.parts)
+    return (
+        path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")) if "node_modules" not in path.parts
+    )
 
 
 def module_of(path: Path) -> str:
@@ -29,7 +31,12 @@ def module_of(path: Path) -> str:
 def named_in_text() -> list[str]:
     """What strings of the code name: modules to import, functions to call, and attributes that tests replace."""
     trees = (ast.parse(path.read_text()) for path in sources("services", "tests"))
-    texts = (node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    texts = (
+        node.value
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
     return sorted({text for text in texts if NAME.fullmatch(text)})
 
 
@@ -70,5 +77,8 @@ def test_no_module_reaches_itself_by_its_imports() -> None:
 
 
 def test_no_folder_is_so_full_that_a_file_cannot_be_found() -> None:
-    counts = {folder: sum(path.stem != "__init__" for path in folder.glob("*.py")) for folder in {path.parent for path in sources("services")}}
+    counts = {
+        folder: sum(path.stem != "__init__" for path in folder.glob("*.py"))
+        for folder in {path.parent for path in sources("services")}
+    }
     assert not {str(folder.relative_to(ROOT)): count for folder, count in counts.items() if count > MAX_SIDE_BY_SIDE}

@@ -52,7 +52,9 @@ def cancel_once(client: httpx.Client, capture: Path) -> Cancelled:
     state = await_end(client, job)["state"]
     seconds = time.monotonic() - began
     if state != "CANCELLED" or renderer.is_running():
-        raise RuntimeError(f"Job {job} ended {state}, and its rendering process {'lives' if renderer.is_running() else 'is gone'}.")
+        raise RuntimeError(
+            f"Job {job} ended {state}, and its rendering process {'lives' if renderer.is_running() else 'is gone'}."
+        )
     return Cancelled(seconds, int((capture / "worker.pid").read_text()))
 
 
@@ -97,7 +99,10 @@ def main() -> None:
             after = worker_of_next(client, Path(folder) / f"after-{number}")
             seconds.append(cancelled.seconds)
             workers |= {cancelled.worker, after}
-            print(f"cancel {number + 1}: {cancelled.seconds:.2f} s, worker {cancelled.worker}, next job on {after}", flush=True)
+            print(
+                f"cancel {number + 1}: {cancelled.seconds:.2f} s, worker {cancelled.worker}, next job on {after}",
+                flush=True,
+            )
     print(f"{times} cancels in mid-kernel: {min(seconds):.2f} to {max(seconds):.2f} s; {len(workers)} worker process.")
 
 

@@ -113,7 +113,14 @@ class Bench:
     def rig(self) -> dict[str, Any]:
         """A rig that exposes for so long."""
         mouth = str(self.folder / "mouth")
-        return {"mouth": mouth, "dome": self._address, "exposure_s": EXPOSURE_S, "level": 0.5, "black_frames": 1, "tracking_every": 0}
+        return {
+            "mouth": mouth,
+            "dome": self._address,
+            "exposure_s": EXPOSURE_S,
+            "level": 0.5,
+            "black_frames": 1,
+            "tracking_every": 0,
+        }
 
     def new_folder(self) -> Path:
         """A folder that was not used before."""
@@ -125,7 +132,11 @@ class Bench:
         """``dentine serve`` with this dome, and its loads."""
         environment = os.environ | {"DENTINE__SERVER__DOME__ADDRESS": self._address}
         command = [sys.executable, "-m", "services", "serve", "--port", "0", "--data", str(self.new_folder())]
-        with (self.folder / "server.log").open("a") as log, running_server(command, log, environment=environment) as running, ExitStack() as loads:
+        with (
+            (self.folder / "server.log").open("a") as log,
+            running_server(command, log, environment=environment) as running,
+            ExitStack() as loads,
+        ):
             for load in self._loads:
                 loads.enter_context(loaded(load, str(running[0].base_url), log))
             yield running
@@ -157,7 +168,11 @@ def strike_by_page(bench: Bench) -> Iterator[float]:
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("google-chrome")
-    with bench.server() as (client, _), sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS)) as browser:
+    with (
+        bench.server() as (client, _),
+        sync_playwright() as playwright,
+        playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS)) as browser,
+    ):
         context = browser.new_context(base_url=str(client.base_url))
         dome, *tabs = (context.new_page() for _ in range(1 + TABS))
         dome.goto("/#/dome")
@@ -177,7 +192,10 @@ def strike_capture(bench: Bench) -> Iterator[float]:
     job.write_text("[rig]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in bench.rig.items()))
     while True:
         command = [sys.executable, "-m", "services", "capture", str(job), "--out", str(bench.new_folder())]
-        with (bench.folder / "capture.log").open("a") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+        with (
+            (bench.folder / "capture.log").open("a") as log,
+            subprocess.Popen(command, stdout=log, stderr=log) as process,
+        ):
             yield bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
 
 
@@ -228,10 +246,18 @@ def main() -> None:
                 strikes = WAYS[way](Bench(Path(folder) / way, host, port, observer, tuple(wanted.under)))
                 while len(seconds) < wanted.times:
                     seconds.append(round(next(strikes), 4))
-                    told[name] = {"n": len(seconds), "worst_s": max(seconds), "median_s": statistics.median(seconds), "seconds": seconds}
+                    told[name] = {
+                        "n": len(seconds),
+                        "worst_s": max(seconds),
+                        "median_s": statistics.median(seconds),
+                        "seconds": seconds,
+                    }
                     write_atomic(wanted.json, json.dumps(told, indent=1).encode())
                 strikes.close()  # type: ignore[attr-defined]
-                print(f"{name}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s", flush=True)
+                print(
+                    f"{name}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s",
+                    flush=True,
+                )
         finally:
             observer.close()
 

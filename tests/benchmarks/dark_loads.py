@@ -47,7 +47,10 @@ def loaded(load: str, address: str, log: IO[str]) -> Iterator[None]:
 def allow_many_connections() -> None:
     """For this process and those that it starts."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, FILES) if hard == resource.RLIM_INFINITY else min(max(soft, FILES), hard), hard))
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE,
+        (max(soft, FILES) if hard == resource.RLIM_INFINITY else min(max(soft, FILES), hard), hard),
+    )
 
 
 @cache
@@ -60,9 +63,21 @@ def upload(address: str) -> None:
     """Send one capture after the other, in big pieces, and have it checked."""
     with httpx.Client(base_url=address, trust_env=False, timeout=120) as client:
         while True:
-            text = json.dumps({"units": "mm", "channels": [], "cameras": [], "lights": [], "images": [], "is": os.urandom(TEXT_BYTES // 2).hex()})
+            text = json.dumps(
+                {
+                    "units": "mm",
+                    "channels": [],
+                    "cameras": [],
+                    "lights": [],
+                    "images": [],
+                    "is": os.urandom(TEXT_BYTES // 2).hex(),
+                }
+            )
             files = {"capture.json": text.encode(), "image.npy": os.urandom(IMAGE_BYTES)}
-            listed = [{"path": path, "bytes": len(body), "sha256": hashlib.sha256(body).hexdigest()} for path, body in files.items()]
+            listed = [
+                {"path": path, "bytes": len(body), "sha256": hashlib.sha256(body).hexdigest()}
+                for path, body in files.items()
+            ]
             with suppress(httpx.HTTPError, KeyError):
                 capture = client.post("/v1/captures", json={"files": listed}).json()["id"]
                 for number, (path, body) in enumerate(files.items()):
@@ -76,7 +91,9 @@ def _send(client: httpx.Client, capture: str, number: int, path: str, body: byte
     from services.client.tus import CHUNK_TYPE, VERSION, format_metadata
 
     metadata = format_metadata({"capture": capture, "path": path})
-    client.post("/v1/uploads", headers={"Tus-Resumable": VERSION, "Upload-Length": str(len(body)), "Upload-Metadata": metadata})
+    client.post(
+        "/v1/uploads", headers={"Tus-Resumable": VERSION, "Upload-Length": str(len(body)), "Upload-Metadata": metadata}
+    )
     for start in range(0, len(body), CHUNK_BYTES):
         headers = {"Tus-Resumable": VERSION, "Upload-Offset": str(start), "Content-Type": CHUNK_TYPE}
         client.patch(f"/v1/uploads/{capture}/{number}", headers=headers, content=body[start : start + CHUNK_BYTES])

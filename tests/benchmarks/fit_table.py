@@ -88,7 +88,10 @@ class Fit:
     def image_errors(self) -> tuple[float, float]:
         """On fitted and on held-out images, not below what can be resolved."""
         sums = self.prepared.errors(self.tissue, samples=JUDGE_SAMPLES, seed=23)
-        fitted, held_out = (max(one.resolved_error or 0.0, self.prepared.resolution(held)) for one, held in zip(sums, (False, True), strict=True))
+        fitted, held_out = (
+            max(one.resolved_error or 0.0, self.prepared.resolution(held))
+            for one, held in zip(sums, (False, True), strict=True)
+        )
         return fitted, held_out
 
     def note(self) -> str:
@@ -108,13 +111,20 @@ class Bench:
         folder = self.folder / f"{subject}-{label}"
         truth = write_capture(subject, folder / "capture", seed=1, tested_camera=tested_camera)
         held_out = {} if tested_camera is not None else {"held_out_lights": SIDE_LIGHTS}
-        chosen = {"capture": folder / "capture", "boundary": "matched", "dentin": "known", "seed": seed} | held_out | self.options | options
+        chosen = (
+            {"capture": folder / "capture", "boundary": "matched", "dentin": "known", "seed": seed}
+            | held_out
+            | self.options
+            | options
+        )
         spec = JobSpec.model_validate(chosen)
         began = time.process_time()
         prepared = prepared_tooth(folder / "job", spec)
         run(spec, LocalContext(folder / "job"))
         stage, report = open_stage(folder / "job", "fit", FitReport)
-        return Fit(truth, prepared, report, json.loads((stage / "history.json").read_text()), time.process_time() - began)
+        return Fit(
+            truth, prepared, report, json.loads((stage / "history.json").read_text()), time.process_time() - began
+        )
 
 
 Row = Callable[[Bench, Sequence[str]], Iterator[Figure]]
@@ -164,7 +174,9 @@ def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
             losses.append(sums.loss or 0.0)
         before, after = losses
         note = f"{before:.2e} to {after:.2e}, of which noise {sums.reference_variance / sums.reference_squared:.2e}"
-        yield Figure("stages", subject, "loss with dentin over the loss before", after / before, 0.8, None, fit.seconds, note)
+        yield Figure(
+            "stages", subject, "loss with dentin over the loss before", after / before, 0.8, None, fit.seconds, note
+        )
 
 
 def cameras(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
@@ -173,7 +185,9 @@ def cameras(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
         fit = bench.fit(subject, "cameras", tested_camera="c1")
         fitted, tested = fit.image_errors()
         note = f"{100 * fitted:.2f} % and {100 * tested:.2f} %; {fit.note()}"
-        yield Figure("cameras", subject, "error, third camera over the fitted two", tested / fitted, 1.5, 1.15, fit.seconds, note)
+        yield Figure(
+            "cameras", subject, "error, third camera over the fitted two", tested / fitted, 1.5, 1.15, fit.seconds, note
+        )
 
 
 def starts(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
@@ -186,10 +200,26 @@ def starts(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
             losses.append(fit.prepared.errors(fit.tissue, samples=JUDGE_SAMPLES, seed=23)[0].loss or 0.0)
             seconds += fit.seconds
         spread = (max(losses) - min(losses)) / float(np.median(losses))
-        yield Figure("starts", subject, "loss, largest less least over median", spread, 0.10, 0.03, seconds, ", ".join(f"{loss:.4e}" for loss in losses))
+        yield Figure(
+            "starts",
+            subject,
+            "loss, largest less least over median",
+            spread,
+            0.10,
+            0.03,
+            seconds,
+            ", ".join(f"{loss:.4e}" for loss in losses),
+        )
 
 
-CASES: dict[str, Row] = {"homogeneous": homogeneous, "known": known, "free": free, "stages": stages, "cameras": cameras, "starts": starts}
+CASES: dict[str, Row] = {
+    "homogeneous": homogeneous,
+    "known": known,
+    "free": free,
+    "stages": stages,
+    "cameras": cameras,
+    "starts": starts,
+}
 
 
 def thickness_mm(fit: Fit) -> NDArray[np.float64]:
@@ -204,7 +234,11 @@ def thickness_mm(fit: Fit) -> NDArray[np.float64]:
 def true_thickness_mm(fit: Fit) -> NDArray[np.float64]:
     """The same of the truth."""
     meshes = fit.truth.meshes
-    return np.asarray(thickness_image(meshes["outer"], meshes["dentin"], fit.prepared.observations.manifest.cameras[1])[_incisal_half(fit)])
+    return np.asarray(
+        thickness_image(meshes["outer"], meshes["dentin"], fit.prepared.observations.manifest.cameras[1])[
+            _incisal_half(fit)
+        ]
+    )
 
 
 def _incisal_half(fit: Fit) -> NDArray[np.bool_]:
@@ -232,8 +266,17 @@ def _perturbed(seed: int) -> Callable[[ChannelSchedule], Tissue]:
 
     def start(schedule: ChannelSchedule) -> Tissue:
         tissue = original(schedule)
-        sigma, alpha = tissue.enamel.sigma * np.exp(moves["sigma"]), 1 - (1 - tissue.enamel.alpha) * 10 ** -moves["alpha"]
-        return tissue.with_values({f"{part}.{leaf}": float(v) for part in ("enamel", "dentin") for leaf, v in (("sigma", sigma), ("alpha", alpha))})
+        sigma, alpha = (
+            tissue.enamel.sigma * np.exp(moves["sigma"]),
+            1 - (1 - tissue.enamel.alpha) * 10 ** -moves["alpha"],
+        )
+        return tissue.with_values(
+            {
+                f"{part}.{leaf}": float(v)
+                for part in ("enamel", "dentin")
+                for leaf, v in (("sigma", sigma), ("alpha", alpha))
+            }
+        )
 
     return start
 
@@ -250,7 +293,9 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in arguments.cases.split(","):
         with tempfile.TemporaryDirectory() as folder:
-            for figure in CASES[name](Bench(Path(folder), json.loads(arguments.options)), arguments.subjects.split(",")):
+            for figure in CASES[name](
+                Bench(Path(folder), json.loads(arguments.options)), arguments.subjects.split(",")
+            ):
                 goal = "" if figure.goal is None else f", goal {figure.goal:g}"
                 print(
                     f"{name:12} {figure.subject:16} {figure.figure:40} {figure.value:.4f} (must {figure.must:g}{goal}): {figure.reached}; {figure.note}",

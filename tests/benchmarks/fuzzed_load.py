@@ -81,7 +81,9 @@ def watched(process: psutil.Process) -> Iterator[Memory]:
         while not is_over.wait(SAMPLE_S):
             with suppress(psutil.Error):
                 own = process.memory_info().rss
-                readers = [one for one in process.children() if "services.api.captures.reading_process" in one.cmdline()]
+                readers = [
+                    one for one in process.children() if "services.api.captures.reading_process" in one.cmdline()
+                ]
                 memory.server = max(memory.server, own)
                 memory.with_readers = max(memory.with_readers, own + sum(one.memory_info().rss for one in readers))
 
@@ -195,7 +197,14 @@ def _damaged(content: bytes, dice: random.Random) -> bytes:
     """Some bytes of it others, left out or repeated."""
     start = dice.randrange(len(content))
     end = min(len(content), start + dice.choice([0, 1, 2, 8, 64]))
-    between = dice.choice([b"", bytes(dice.randrange(256) for _ in range(dice.randrange(1, 9))), b"9" * dice.randrange(1, 400), content[start:end] * 2])
+    between = dice.choice(
+        [
+            b"",
+            bytes(dice.randrange(256) for _ in range(dice.randrange(1, 9))),
+            b"9" * dice.randrange(1, 400),
+            content[start:end] * 2,
+        ]
+    )
     return content[:start] + between + content[end:] or b"{"
 
 
@@ -206,11 +215,22 @@ def _settle(client: httpx.Client) -> None:
 
 def _reads(witnesses: Witnesses) -> list[Ask]:
     job = f"/v1/jobs/{witnesses.job['id']}"
-    paths = ("/v1/jobs", job, f"{job}/logs", f"{job}/history", f"{job}/artifacts", "/v1/captures", f"/v1/captures/{witnesses.capture['id']}", "/v1/presets")
+    paths = (
+        "/v1/jobs",
+        job,
+        f"{job}/logs",
+        f"{job}/history",
+        f"{job}/artifacts",
+        "/v1/captures",
+        f"/v1/captures/{witnesses.capture['id']}",
+        "/v1/presets",
+    )
     return [Ask(path, "GET", path) for path in paths]
 
 
-def _pairs(target: Served, reads: Sequence[Ask], recorded: Sequence[Recorded], pairs: int, dice: random.Random) -> list[tuple[list[Answer], list[Answer]]]:
+def _pairs(
+    target: Served, reads: Sequence[Ask], recorded: Sequence[Recorded], pairs: int, dice: random.Random
+) -> list[tuple[list[Answer], list[Answer]]]:
     """Answers of quiet and of loaded stretches; every input is sent once more over all loaded ones."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
@@ -261,7 +281,9 @@ def _p99(answers: Sequence[Answer]) -> float:
     return float(np.quantile([answer.latency_s for answer in answers], 0.99))
 
 
-def _ratio(stretches: Sequence[tuple[list[Answer], list[Answer]]], dice: random.Random) -> tuple[float, tuple[float, float]]:
+def _ratio(
+    stretches: Sequence[tuple[list[Answer], list[Answer]]], dice: random.Random
+) -> tuple[float, tuple[float, float]]:
     """Of the loaded p99 to the quiet one, and its 95 % interval by resampling pairs."""
 
     def ratio(chosen: Sequence[tuple[list[Answer], list[Answer]]]) -> float:

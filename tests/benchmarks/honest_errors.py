@@ -59,7 +59,13 @@ def drawn_tissue(rng: np.random.Generator, *, with_shape: bool = False) -> Tissu
     """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits, blend weights where they are wanted."""
     cosines = {"enamel": COSINE, "dentin": WEAK["dentin.g1"]}
     reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
-    tissue = tissue_of(reduced, {part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2))) for part, (mean, sd) in cosines.items()})
+    tissue = tissue_of(
+        reduced,
+        {
+            part: to_natural("g1", mean + sd * float(np.clip(rng.standard_normal(), -2, 2)))
+            for part, (mean, sd) in cosines.items()
+        },
+    )
     return replace(tissue, shape=tuple(rng.uniform(0.2, 0.8, 3).tolist())) if with_shape else tissue
 
 
@@ -81,19 +87,33 @@ class FormulaTooth:
         write_prepared(root, truth=self.truth, seed=seed, engine=DirectFakeEngine)
 
 
-def fit_rows(tooth: Subject, truth: Tissue, seed: int, options: dict[str, object], engine: str = ENGINE) -> Iterator[dict[str, object]]:
+def fit_rows(
+    tooth: Subject, truth: Tissue, seed: int, options: dict[str, object], engine: str = ENGINE
+) -> Iterator[dict[str, object]]:
     """One fit's quantities with what they should be."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         tooth.photograph(root, seed)
-        spec = JobSpec.model_validate({"capture": root, "boundary": "matched", "dentin": "fit" if truth.shape else "known", "seed": seed, **options})
+        spec = JobSpec.model_validate(
+            {
+                "capture": root,
+                "boundary": "matched",
+                "dentin": "fit" if truth.shape else "known",
+                "seed": seed,
+                **options,
+            }
+        )
         report = run(spec, LocalContext(root), engine=engine)
         thickness = None
         if truth.shape:
             stage, prepared = open_stage(root, "prepared", PreparedManifest)
             thickness = fitted_thickness(read_teeth(stage, prepared.fdi)[0], prepared.cameras, spec, truth.shape, ())
         last = json.loads((root / "fit" / "history.json").read_text())[-1]
-    found = {f"{part}.{leaf}": (report.parameters["green"][f"{part}.{leaf}"], getattr(getattr(truth, part), leaf)) for part in CENTRE for leaf in LEAVES}
+    found = {
+        f"{part}.{leaf}": (report.parameters["green"][f"{part}.{leaf}"], getattr(getattr(truth, part), leaf))
+        for part in CENTRE
+        for leaf in LEAVES
+    }
     if thickness is not None:
         assert report.enamel_thickness is not None
         found["enamel.thickness"] = report.enamel_thickness, thickness.mean.value
@@ -142,7 +162,9 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=100)
     parser.add_argument("--truths", type=int, default=1)
     parser.add_argument("--formula", action="store_true", help="a formula in place of light transport")
-    parser.add_argument("--shape", action="store_true", help="draw and fit the dentin's shape; only with --formula and drawn truths")
+    parser.add_argument(
+        "--shape", action="store_true", help="draw and fit the dentin's shape; only with --formula and drawn truths"
+    )
     parser.add_argument("--paths", type=int, default=65536, help="of the truth, per pixel")
     parser.add_argument("--pixels", type=int, default=10, help="of a camera's side")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fit")
@@ -161,17 +183,29 @@ def main() -> None:
     }  # fmt: skip
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})
-    truths = [held] if arguments.truths == 1 else [drawn_tissue(rng, with_shape=arguments.shape) for _ in range(arguments.truths)]
+    truths = (
+        [held]
+        if arguments.truths == 1
+        else [drawn_tissue(rng, with_shape=arguments.shape) for _ in range(arguments.truths)]
+    )
     teeth: dict[int, Subject] = {}
     for number in range(arguments.first, arguments.first + arguments.fits):
         which = number % len(truths)
         if which not in teeth:
             rendered = {"samples": arguments.paths, "seed": 770_000 + which, "pixels": arguments.pixels}
-            teeth[which] = FormulaTooth(truths[which]) if arguments.formula else rendered_tooth(truths[which], **rendered)
+            teeth[which] = (
+                FormulaTooth(truths[which]) if arguments.formula else rendered_tooth(truths[which], **rendered)
+            )
         began_s = time.process_time()
         fresh = list(fit_rows(teeth[which], truths[which], number, options, FORMULA if arguments.formula else ENGINE))
         rows += fresh
-        print(number, f"{time.process_time() - began_s:.1f} s", fresh[0]["verdict"], [f"{row['z']:+.1f}" for row in fresh], flush=True)
+        print(
+            number,
+            f"{time.process_time() - began_s:.1f} s",
+            fresh[0]["verdict"],
+            [f"{row['z']:+.1f}" for row in fresh],
+            flush=True,
+        )
         arguments.json.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
     for line in summary(rows):
         print(line)

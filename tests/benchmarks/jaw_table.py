@@ -74,7 +74,9 @@ def fit(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int) ->
     from services.pipeline.stages import run_job
 
     write_jaw_capture(folder / "capture", truth, seed=1)
-    spec = JobSpec.model_validate({"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | options)
+    spec = JobSpec.model_validate(
+        {"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | options
+    )
     began, used = time.perf_counter(), _processor_s()
     run_job(spec, folder / "job", workers=workers)
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
@@ -101,12 +103,32 @@ def figures(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int
             estimate = tooth.parameters[CHANNEL][name]
             found = 1 - estimate.value if name.endswith("alpha_reduced") else estimate.value
             known = f"{note}, {100 * (found / right - 1):+.1f} %" + ("" if estimate.determined else ", not determined")
-            yield JawFigure("jaw", fdi, name, abs(found / right - 1), must, goal, cost.processor_s, known, (estimate.se or 0.0) / found)
+            yield JawFigure(
+                "jaw",
+                fdi,
+                name,
+                abs(found / right - 1),
+                must,
+                goal,
+                cost.processor_s,
+                known,
+                (estimate.se or 0.0) / found,
+            )
         if tooth.shape:
             off_mm = thickness_off_mm(folder, truth, spec, report, int(fdi))
             error = tooth.enamel_thickness.se if tooth.enamel_thickness else None
             note = f"c = {', '.join(f'{c:.2f}' for c in tooth.shape)}"
-            yield JawFigure("jaw", fdi, "thickness, occlusal half, mm", off_mm, THICKNESS_MUST, THICKNESS_GOAL, cost.processor_s, note, error or 0.0)
+            yield JawFigure(
+                "jaw",
+                fdi,
+                "thickness, occlusal half, mm",
+                off_mm,
+                THICKNESS_MUST,
+                THICKNESS_GOAL,
+                cost.processor_s,
+                note,
+                error or 0.0,
+            )
 
 
 def thickness_off_mm(folder: Path, truth: JawTruth, spec: JobSpec, report: FitReport, fdi: int) -> float:
@@ -142,14 +164,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--options", default="{}", help="options of the job, JSON")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--photographs", choices=("mitsuba", "engine"), default="mitsuba", help="stored ones by stock Mitsuba, or by the project's engine")
+    parser.add_argument(
+        "--photographs",
+        choices=("mitsuba", "engine"),
+        default="mitsuba",
+        help="stored ones by stock Mitsuba, or by the project's engine",
+    )
     parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     truth = read_jaw_truth() if arguments.photographs == "mitsuba" else by_engine(read_jaw_truth(), PHOTOGRAPH_SAMPLES)
     with tempfile.TemporaryDirectory() as folder:
         for one in figures(Path(folder), truth, json.loads(arguments.options), arguments.workers):
-            print(f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}): {one.reached}; {one.note}", flush=True)
+            print(
+                f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}): {one.reached}; {one.note}",
+                flush=True,
+            )
             rows.append(asdict(one) | {"reached": one.reached})
             arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
 

@@ -17,8 +17,16 @@ from typing import Any
 from tests.load import day, mixed, streams, submissions
 
 PARTS: dict[str, tuple[Callable[..., Iterable[dict[str, Any]]], dict[str, Any], dict[str, Any]]] = {
-    "mixed": (mixed.measure, {"rounds": 12, "round_s": 15.0, "jobs": 1000, "fitted": 10}, {"rounds": 2, "round_s": 4.0, "jobs": 50, "fitted": 2}),
-    "streams": (streams.measure, {"streams": 500, "steps": 400, "period_s": 0.05}, {"streams": 50, "steps": 40, "period_s": 0.02}),
+    "mixed": (
+        mixed.measure,
+        {"rounds": 12, "round_s": 15.0, "jobs": 1000, "fitted": 10},
+        {"rounds": 2, "round_s": 4.0, "jobs": 50, "fitted": 2},
+    ),
+    "streams": (
+        streams.measure,
+        {"streams": 500, "steps": 400, "period_s": 0.05},
+        {"streams": 50, "steps": 40, "period_s": 0.02},
+    ),
     "queue": (submissions.measure, {"jobs": 100}, {"jobs": 5}),
     "day": (day.measure, {"quarters": day.QUARTERS_OF_A_DAY}, {"quarters": 8}),
 }
@@ -29,7 +37,9 @@ def main() -> None:
     """Read the options, measure, print and write one row per point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the rows here")
-    parser.add_argument("--quick", action="store_true", help="a few seconds each, which say whether it works, not how fast it is")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few seconds each, which say whether it works, not how fast it is"
+    )
     parser.add_argument("--only", default=",".join(PARTS), help="parts to measure, separated by commas")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

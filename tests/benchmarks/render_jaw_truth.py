@@ -29,7 +29,9 @@ def load(folder: Path) -> Any:
     jaw = jaw_surfaces(SUBJECT)
     files = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.cavity)
     fdi = tuple(tooth.fdi for tooth in jaw.teeth)
-    return load_scene(mouth_scene(files, fdi, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights()[0].position_mm, 1.0))
+    return load_scene(
+        mouth_scene(files, fdi, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights()[0].position_mm, 1.0)
+    )
 
 
 def render_pass(scene: Any, number: int) -> list[NDArray[np.float32]]:
@@ -42,7 +44,14 @@ def render_pass(scene: Any, number: int) -> list[NDArray[np.float32]]:
         params["light.intensity.value"] = mi.Float(light.intensity[0])
         params.update()
         count = len(scene.sensors())
-        images.append([np.array(mi.render(scene, sensor=k, spp=SAMPLES, seed=(number * 64 + n) * 8 + k), dtype=np.float32)[..., 0] for k in range(count)])
+        images.append(
+            [
+                np.array(mi.render(scene, sensor=k, spp=SAMPLES, seed=(number * 64 + n) * 8 + k), dtype=np.float32)[
+                    ..., 0
+                ]
+                for k in range(count)
+            ]
+        )
     return [np.stack(of_camera) for of_camera in zip(*images, strict=True)]
 
 
@@ -63,7 +72,10 @@ def main() -> None:
                 np.savez(arguments.work / f"{number}.npz", *render_pass(scene, number))
                 print("pass", number, flush=True)
     with_passes = [np.load(arguments.work / f"{number}.npz") for number in range(arguments.passes)]
-    images = [np.stack([one[f"arr_{k}"] for one in with_passes]).astype(np.float64) for k in range(len(cameras(jaw_surfaces(SUBJECT))))]
+    images = [
+        np.stack([one[f"arr_{k}"] for one in with_passes]).astype(np.float64)
+        for k in range(len(cameras(jaw_surfaces(SUBJECT))))
+    ]
     pack(arguments.out, images, arguments.passes * SAMPLES)
     print(arguments.out, arguments.out.stat().st_size)
 

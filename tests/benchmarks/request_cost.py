@@ -59,7 +59,9 @@ async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
     drawn = (mix.draw() for _ in count())
     asks = list(islice((ask for ask in drawn if options.only in {None, ask.kind}), options.requests))
     bare = build(str(settings.database_url).removeprefix("sqlite:///"))
-    reads = [Ask("read", "GET", f"/jobs/{random.Random(number).choice(library.jobs)}") for number in range(options.requests)]
+    reads = [
+        Ask("read", "GET", f"/jobs/{random.Random(number).choice(library.jobs)}") for number in range(options.requests)
+    ]
     app = create_app(settings, lambda *_: None)
     stream = (work / "log.jsonl").open("w")
     configure_logs(stream)
@@ -67,7 +69,10 @@ async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
     async with app.router.lifespan_context(app):
         took_s = await _cost((bare, reads, {}), (app, asks, headers))
     stream.close()
-    by_kind = {kind: [(ours, theirs) for this, theirs, ours in took_s if this == kind] for kind in sorted({kind for kind, _, _ in took_s})}
+    by_kind = {
+        kind: [(ours, theirs) for this, theirs, ours in took_s if this == kind]
+        for kind in sorted({kind for kind, _, _ in took_s})
+    }
     every = [(ours, theirs) for _, theirs, ours in took_s]
     return [
         _row("bare", "read", [(s, s) for _, s, _ in took_s]),
@@ -100,7 +105,11 @@ async def _cost(bare: Asked, ours: Asked) -> list[tuple[str, float, float]]:
 
 async def _send(app: App, ask: Ask, headers: dict[str, str]) -> int:
     url, body = urlsplit(ask.path), b"" if ask.body is None else json.dumps(ask.body).encode()
-    sent = {"Host": "127.0.0.1:8000", "Accept": "*/*", "Accept-Encoding": "gzip, deflate", "User-Agent": "cost"} | headers | ask.headers
+    sent = (
+        {"Host": "127.0.0.1:8000", "Accept": "*/*", "Accept-Encoding": "gzip, deflate", "User-Agent": "cost"}
+        | headers
+        | ask.headers
+    )
     if body:
         sent |= {"Content-Type": "application/json", "Content-Length": str(len(body))}
     scope = {

@@ -108,7 +108,14 @@ def run_case(client: httpx.Client, folder: Path, case: Case, seconds: float) -> 
     return row_of(case, sources, (since_s, until_s), alone_s, beside_s, client)
 
 
-def row_of(case: Case, sources: Sequence[Path], window: tuple[float, float], alone_s: list[float], beside_s: list[float], client: httpx.Client) -> Row:
+def row_of(
+    case: Case,
+    sources: Sequence[Path],
+    window: tuple[float, float],
+    alone_s: list[float],
+    beside_s: list[float],
+    client: httpx.Client,
+) -> Row:
     """The blocks within the window, cut at its ends."""
     traces = [read_trace(source) for source in sources]
     used_s = [sum(max(min(end, window[1]) - max(start, window[0]), 0.0) for start, end, _ in trace) for trace in traces]
@@ -133,9 +140,16 @@ def capture_wait_s(client: httpx.Client, source: Path) -> float:
         time.sleep(0.02)
     client.post(f"/v1/jobs/{job}/cancel")
     end(client, job)
-    events = [json.loads(line.removeprefix("data: ")) for line in client.get(f"/v1/jobs/{job}/events").text.splitlines() if '"kind"' in line]
+    events = [
+        json.loads(line.removeprefix("data: "))
+        for line in client.get(f"/v1/jobs/{job}/events").text.splitlines()
+        if '"kind"' in line
+    ]
     submitted = next(event["time_s"] for event in events if event["kind"] == "state")
-    return float(next(event["time_s"] for event in events if event["stage"] == "capture" and event["kind"] == "started") - submitted)
+    return float(
+        next(event["time_s"] for event in events if event["stage"] == "capture" and event["kind"] == "started")
+        - submitted
+    )
 
 
 def submit(client: httpx.Client, spec: dict[str, Any]) -> str:
@@ -153,7 +167,10 @@ def end(client: httpx.Client, job: str) -> None:
 def summary(rows: list[Row]) -> dict[str, Any]:
     """By case, and all rows."""
     by_case = {case.name: [row for row in rows if row.case == case.name] for case in CASES}
-    return {"cases": {name: told(mine) for name, mine in by_case.items() if mine}, "rows": [asdict(row) for row in rows]}
+    return {
+        "cases": {name: told(mine) for name, mine in by_case.items() if mine},
+        "rows": [asdict(row) for row in rows],
+    }
 
 
 def told(rows: list[Row]) -> dict[str, Any]:

@@ -35,7 +35,9 @@ def rule(tolerance: NDArray[np.float64], seconds: float) -> Callable[[Sums], flo
     return lambda sums: float((sums.standard_error() / allowed).max()) if time.monotonic() < begun_s + seconds else 0.0
 
 
-def measure(case: SlabCase, tolerance: NDArray[np.float64], shortfall: Callable[[Sums], float], seed: int) -> Iterator[dict[str, object]]:
+def measure(
+    case: SlabCase, tolerance: NDArray[np.float64], shortfall: Callable[[Sums], float], seed: int
+) -> Iterator[dict[str, object]]:
     """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the rule."""
     began = time.perf_counter()
     sums = simulate(case, shortfall, seed)
@@ -63,8 +65,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=("derivatives", "totals"))
     parser.add_argument("--passes", type=int, default=2, help="of 262144 paths, each next one up to four times as long")
-    parser.add_argument("--seconds", type=float, help="instead of passes: until a third of every tolerance, at most so long per case")
-    parser.add_argument("--tolerance", type=float, default=1e-3, help="of totals, absolute; of the deepest white slabs at least 1e-3")
+    parser.add_argument(
+        "--seconds", type=float, help="instead of passes: until a third of every tolerance, at most so long per case"
+    )
+    parser.add_argument(
+        "--tolerance", type=float, default=1e-3, help="of totals, absolute; of the deepest white slabs at least 1e-3"
+    )
     parser.add_argument("--cases", help="only these, separated by commas; a first word, as S01")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, required=True)
@@ -74,13 +80,17 @@ def main() -> None:
         cases = named(cases, *arguments.cases.split(","))
     rows: list[dict[str, object]] = []
     for number, case in enumerate(cases):
-        tolerance = tolerances(case, max(arguments.tolerance, DEEP_TOLERANCE) if is_costly(case) else arguments.tolerance)
+        tolerance = tolerances(
+            case, max(arguments.tolerance, DEEP_TOLERANCE) if is_costly(case) else arguments.tolerance
+        )
         shortfall = rule(tolerance, arguments.seconds) if arguments.seconds else passes(arguments.passes)
         rows += measure(case, tolerance, shortfall, arguments.seed + number)
         arguments.json.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n")
     z = np.array([row["z"] for row in rows], dtype=np.float64)
     fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)
-    print(f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a third of their tolerance")
+    print(
+        f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a third of their tolerance"
+    )
 
 
 if __name__ == "__main__":

@@ -42,9 +42,22 @@ def write_phantoms(folder: Path) -> list[Path]:
 
 def draw_job(chance: random.Random, captures: list[Path], samples: tuple[int, ...]) -> JobSpec:
     """A small job: the same thing done to another size."""
-    options: dict[str, Any] = {"boundary": "matched", "dentin": "known", "max_steps": 1, "search_candidates": 100, "advise": False, "workers": 1}
+    options: dict[str, Any] = {
+        "boundary": "matched",
+        "dentin": "known",
+        "max_steps": 1,
+        "search_candidates": 100,
+        "advise": False,
+        "workers": 1,
+    }
     drawn = chance.choice(samples)
-    return JobSpec(capture=chance.choice(captures), samples_per_pixel=drawn, max_samples_per_pixel=drawn, seed=chance.randrange(2**31), **options)
+    return JobSpec(
+        capture=chance.choice(captures),
+        samples_per_pixel=drawn,
+        max_samples_per_pixel=drawn,
+        seed=chance.randrange(2**31),
+        **options,
+    )
 
 
 def run_job(client: Client, job: str, told: dict[str, Any]) -> dict[str, Any]:
@@ -71,11 +84,16 @@ def ask(client: Client, job: str) -> dict[str, Any]:
     return {"low_s": None, "high_s": None, **(remaining or {}), "asked_s": asked_s}
 
 
-def measure(client: Client, captures: list[Path], samples: tuple[int, ...], jobs: int, seed: int) -> list[dict[str, Any]]:
+def measure(
+    client: Client, captures: list[Path], samples: tuple[int, ...], jobs: int, seed: int
+) -> list[dict[str, Any]]:
     """Jobs in small groups."""
     chance, rows = random.Random(seed), list[dict[str, Any]]()
     while len(rows) < jobs:
-        group = [client.submit(draw_job(chance, captures, samples))["id"] for _ in range(min(chance.choice((1, 1, 1, 2, 3)), jobs - len(rows)))]
+        group = [
+            client.submit(draw_job(chance, captures, samples))["id"]
+            for _ in range(min(chance.choice((1, 1, 1, 2, 3)), jobs - len(rows)))
+        ]
         told = [ask(client, job) for job in group]
         for place, (job, range_) in enumerate(zip(group, told, strict=True)):
             rows.append(run_job(client, job, range_) | {"jobs_before": place, "load": os.getloadavg()[0]})
@@ -86,7 +104,12 @@ def measure(client: Client, captures: list[Path], samples: tuple[int, ...], jobs
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """How often ranges held, by the moment and by whether others came first."""
     loads = [row["load"] for row in rows]
-    told: dict[str, Any] = {"machine": machine_class(), "jobs": len(rows), "load_least": min(loads), "load_most": max(loads)}
+    told: dict[str, Any] = {
+        "machine": machine_class(),
+        "jobs": len(rows),
+        "load_least": min(loads),
+        "load_most": max(loads),
+    }
     groups = {
         "submitted": rows,
         "submitted_first": [row for row in rows if not row["jobs_before"]],
@@ -109,7 +132,12 @@ def main() -> None:
     """Read the options, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=45)
-    parser.add_argument("--stages", choices=("real", "drawn"), default="real", help="real fits of tiny teeth, or stages of drawn durations")
+    parser.add_argument(
+        "--stages",
+        choices=("real", "drawn"),
+        default="real",
+        help="real fits of tiny teeth, or stages of drawn durations",
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, default=None)
     options = parser.parse_args()

@@ -16,7 +16,9 @@ WIDE, PHONE = (1440, 900), (390, 844)
 
 
 @contextmanager
-def watched_page(chromium: Browser, address: str, scheme: str = "light", width: int = WIDE[0], expected: tuple[str, ...] = ()) -> Iterator[Page]:
+def watched_page(
+    chromium: Browser, address: str, scheme: str = "light", width: int = WIDE[0], expected: tuple[str, ...] = ()
+) -> Iterator[Page]:
     """A page on a server.
 
     Args:

@@ -45,7 +45,9 @@ class ScriptedJob:
                 "enamel.sigma": Estimate(value=4.0321, se=0.0512, unit="1/mm", determined=True),
                 "dentin.g1": Estimate(value=0.41, se=0.9, unit="1", determined=False),
             }
-            (folder / "parameters.json").write_text("{" + ",".join(f'"{c}": {{{_json(table)}}}' for c in ("green", "red")) + "}")
+            (folder / "parameters.json").write_text(
+                "{" + ",".join(f'"{c}": {{{_json(table)}}}' for c in ("green", "red")) + "}"
+            )
             (folder / "report.html").write_text("<!doctype html><title>report</title>")
             log.append(export, StageEvent(stage="export", kind="finished", done=1.0))
 
@@ -59,7 +61,12 @@ class ScriptedJob:
                 "held_out_se": 0.012 if step % 2 else None,
                 "parameters": {"enamel.sigma": 4.0 + 0.01 * step},
             }
-            log.append(attempt, StageEvent(stage="fit", kind="step", message=f"{channel} step {step}.", done=(step + 1) / STEPS, data=data))
+            log.append(
+                attempt,
+                StageEvent(
+                    stage="fit", kind="step", message=f"{channel} step {step}.", done=(step + 1) / STEPS, data=data
+                ),
+            )
         paths = {kind: f"previews/{step}-{kind}.png" for kind in ("render", "photo", "residual")}
         (folder / "previews").mkdir(exist_ok=True)
         for kind, path in paths.items():

@@ -40,7 +40,9 @@ def page(chromium: Browser, tmp_path: Path, job: ScriptedJob, request: pytest.Fi
         pytest.skip("the dashboard is not built; run make dashboard")
     scheme = getattr(request, "param", "light")
     with serving(create_app(ServerSettings(data=tmp_path / "data"), job)) as client:
-        context = chromium.new_context(base_url=str(client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 1000})
+        context = chromium.new_context(
+            base_url=str(client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 1000}
+        )
         page = context.new_page()
         said: list[str] = []
         asked: list[str] = []
@@ -69,8 +71,12 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     page.goto("/")
     expect(page.locator(".job .badge")).to_have_text("running")
     expect(page.locator(".stages li", has_text="prepare").locator(".state")).to_have_text("finished")
-    expect(page.locator("#workers")).to_contain_text("Workers start with the next job. Done: 0 in the last hour, 0 in 24 h.")
-    expect(page.locator(".remaining")).to_have_text("No time range: The size of its capture cannot be read, so it cannot be compared with other jobs.")
+    expect(page.locator("#workers")).to_contain_text(
+        "Workers start with the next job. Done: 0 in the last hour, 0 in 24 h."
+    )
+    expect(page.locator(".remaining")).to_have_text(
+        "No time range: The size of its capture cannot be read, so it cannot be compared with other jobs."
+    )
     for step in range(STEPS - 1):
         job.steps.release()
         expect(page.locator(".chart figcaption")).to_contain_text(f"{step + 1} steps.")
@@ -154,11 +160,17 @@ def test_a_stage_that_was_begun_is_stopped_while_its_job_waits(page: Page, job: 
     page.reload()
     expect(fit).to_have_text("stopped")
     stages = page.request.get(f"/v1/jobs/{job_id}").json()["stages"]
-    assert [(stage["stage"], stage["state"]) for stage in stages] == [("prepare", "finished"), ("fit", "stopped"), ("export", "waiting")]
+    assert [(stage["stage"], stage["state"]) for stage in stages] == [
+        ("prepare", "finished"),
+        ("fit", "stopped"),
+        ("export", "waiting"),
+    ]
     job.problem = None
 
 
-def test_single_teeth_of_a_jaw_are_named_and_give_way_to_the_whole_jaw(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
+def test_single_teeth_of_a_jaw_are_named_and_give_way_to_the_whole_jaw(
+    page: Page, job: ScriptedJob, tmp_path: Path
+) -> None:
     job_id = submit(page)
     page.goto(f"/#/{job_id}")
     expect(page.locator(".stages li", has_text="fit").locator(".state")).to_have_text("running")
@@ -187,7 +199,9 @@ def test_single_teeth_of_a_jaw_are_named_and_give_way_to_the_whole_jaw(page: Pag
 
 
 @pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_job_fits_a_phone_however_long_its_names_are(page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_a_job_fits_a_phone_however_long_its_names_are(
+    page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     page.set_viewport_size({"width": 375, "height": 800})
     name = "-".join(["incisor"] * 12)
     (tmp_path / name).mkdir()
@@ -200,7 +214,9 @@ def test_a_job_fits_a_phone_however_long_its_names_are(page: Page, job: Scripted
     repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
     pictures = dict.fromkeys(("render", "photo", "residual"), "previews/0-photo.png")
     data = {"camera": name, "light": name, "channel": "green", "step": 0, "held_out": True} | pictures
-    EventLog(repository.engine, job_id).append(1, StageEvent(stage="fit", kind="preview", message=f"{name}.", data=data))
+    EventLog(repository.engine, job_id).append(
+        1, StageEvent(stage="fit", kind="preview", message=f"{name}.", data=data)
+    )
     repository.close()
     page.get_by_label("Picture").select_option(f"green · {name} · {name} (held out)")
     expect(page.locator(".stack .over")).to_have_attribute("alt", f"Render: camera {name}, light {name}, step 0")
@@ -244,7 +260,9 @@ def test_a_queued_job_says_what_it_waits_for(page: Page, job: ScriptedJob, monke
     monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.2)
     number = submit(page)
     page.goto(f"/#/{number}")
-    expect(page.locator(".job header + p + p")).to_have_text(re.compile(r"Waits for disk: about [0-9.]+ GiB are needed and [0-9.]+ GiB are free\."))
+    expect(page.locator(".job header + p + p")).to_have_text(
+        re.compile(r"Waits for disk: about [0-9.]+ GiB are needed and [0-9.]+ GiB are free\.")
+    )
     assert contrast_failures(page) == []
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=f"{folder}/waiting.png", full_page=True)
@@ -259,7 +277,9 @@ def test_a_running_job_says_when_it_ends(page: Page, job: ScriptedJob, tmp_path:
     remember_runs(tmp_path / "data", capture, (900.0, 950.0, 1000.0, 1050.0, 1100.0))
     running = str(page.request.post("/v1/jobs", data={"capture": capture}).json()["id"])
     page.goto(f"/#/{running}")
-    expect(page.locator(".remaining")).to_have_text(re.compile(r"Ends in \d+ to \d+ min: 80 % range from 5 past jobs\."))
+    expect(page.locator(".remaining")).to_have_text(
+        re.compile(r"Ends in \d+ to \d+ min: 80 % range from 5 past jobs\.")
+    )
     assert contrast_failures(page) == []
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=f"{folder}/remaining.png", full_page=True)

@@ -74,8 +74,19 @@ def test_a_refused_event_stream_is_opened_anew_and_counts_as_lost_until_then(pag
     note = page.locator(".stages li", has_text="prepare").locator(".note")
     expect(note).to_have_text("24 images prepared.")
     assert page.evaluate(OPEN_STREAMS) == 1
-    replayed = {"id": 1, "job": job_id, "attempt": 1, "stage": "prepare", "kind": "log", "message": "Told again.", "done": None, "data": {}}
-    page.evaluate("event => streams.at(-1).dispatchEvent(new MessageEvent('message', {data: JSON.stringify(event)}))", replayed)
+    replayed = {
+        "id": 1,
+        "job": job_id,
+        "attempt": 1,
+        "stage": "prepare",
+        "kind": "log",
+        "message": "Told again.",
+        "done": None,
+        "data": {},
+    }
+    page.evaluate(
+        "event => streams.at(-1).dispatchEvent(new MessageEvent('message', {data: JSON.stringify(event)}))", replayed
+    )
     expect(note).to_have_text("24 images prepared.")
 
 

@@ -38,7 +38,12 @@ def page(chromium: Browser, server: str, request: pytest.FixtureRequest) -> Iter
     page = context.new_page()
     broken: list[str] = []
     page.on("pageerror", lambda problem: broken.append(str(problem)))
-    page.on("console", lambda message: broken.append(message.text) if message.type == "error" and "Failed to load" not in message.text else None)
+    page.on(
+        "console",
+        lambda message: (
+            broken.append(message.text) if message.type == "error" and "Failed to load" not in message.text else None
+        ),
+    )
     page.goto("/")
     page.get_by_role("link", name="Dome").click()
     yield page
@@ -116,7 +121,10 @@ def test_nothing_is_shown_as_known_while_the_dome_does_not_answer(page: Page) ->
     page.get_by_label("Seconds").fill("30")
     third.click()
     expect(state).to_have_text("light 3 is on")
-    page.route("**/v1/dome", lambda route: route.fulfill(status=502, json={"detail": "The dome does not answer; check its cable."}))
+    page.route(
+        "**/v1/dome",
+        lambda route: route.fulfill(status=502, json={"detail": "The dome does not answer; check its cable."}),
+    )
     expect(page.get_by_role("alert")).to_have_text("The dome does not answer; check its cable.")
     expect(state).to_have_text("unknown")
     expect(page.locator(".lights [aria-pressed]")).to_have_count(0)
@@ -196,6 +204,8 @@ def test_a_server_without_a_dome_says_so(chromium: Browser, tmp_path: Path) -> N
     with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
         page = chromium.new_page(base_url=str(client.base_url))
         page.goto("/#/dome")
-        expect(page.get_by_role("alert")).to_contain_text("This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS")
+        expect(page.get_by_role("alert")).to_contain_text(
+            "This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS"
+        )
         expect(page.locator(".all-off")).to_be_visible()
         page.close()

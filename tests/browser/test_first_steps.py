@@ -36,8 +36,13 @@ def address_of(server: httpx.Client) -> str:
 
 
 @pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
-def test_an_empty_page_leads_to_the_report_in_three_clicks(chromium: Browser, tmp_path: Path, scheme: str, width: int) -> None:
-    with toy_server(tmp_path / "data") as (server, _), watched_page(chromium, address_of(server), scheme, width) as page:
+def test_an_empty_page_leads_to_the_report_in_three_clicks(
+    chromium: Browser, tmp_path: Path, scheme: str, width: int
+) -> None:
+    with (
+        toy_server(tmp_path / "data") as (server, _),
+        watched_page(chromium, address_of(server), scheme, width) as page,
+    ):
         page.goto("/")
         expect(page.get_by_role("heading", name="New job")).to_be_visible()
         looked_at(page, f"empty-{scheme}-{width}")
@@ -61,7 +66,11 @@ def test_what_the_demonstration_is_refused_for_is_told(chromium: Browser, server
         page.goto("/")
         page.route(
             "**/v1/jobs",
-            lambda route: route.fulfill(status=507, json={"detail": "2 workers need more memory."}) if route.request.method == "POST" else route.fallback(),
+            lambda route: (
+                route.fulfill(status=507, json={"detail": "2 workers need more memory."})
+                if route.request.method == "POST"
+                else route.fallback()
+            ),
         )
         page.get_by_role("button", name="Run the demo").click()
         expect(page.get_by_role("alert")).to_have_text("2 workers need more memory.")
@@ -69,11 +78,15 @@ def test_what_the_demonstration_is_refused_for_is_told(chromium: Browser, server
 
 @pytest.mark.parametrize("server", ["simulated"], indirect=True)
 @pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
-def test_a_rig_is_explained_and_its_dome_is_looked_at(chromium: Browser, server: httpx.Client, scheme: str, width: int) -> None:
+def test_a_rig_is_explained_and_its_dome_is_looked_at(
+    chromium: Browser, server: httpx.Client, scheme: str, width: int
+) -> None:
     with watched_page(chromium, address_of(server), scheme, width) as page:
         page.goto("/")
         page.get_by_role("link", name="Connect a rig").click()
-        expect(page.locator(".rig [role=status]")).to_have_text(re.compile(r"The dome at simulated.* answers: 155 lights, firmware .+\."))
+        expect(page.locator(".rig [role=status]")).to_have_text(
+            re.compile(r"The dome at simulated.* answers: 155 lights, firmware .+\.")
+        )
         looked_at(page, f"rig-{scheme}-{width}")
         page.get_by_role("link", name="Submit a job with a rig").click()
         expect(page.get_by_label("What is fitted from")).to_have_value("rig")
@@ -92,13 +105,18 @@ def submitted(server: httpx.Client, page: Page) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("scheme", "width"), LOOKS)
-def test_the_form_is_the_schema_and_submits_what_was_changed(chromium: Browser, server: httpx.Client, tmp_path: Path, scheme: str, width: int) -> None:
+def test_the_form_is_the_schema_and_submits_what_was_changed(
+    chromium: Browser, server: httpx.Client, tmp_path: Path, scheme: str, width: int
+) -> None:
     uploaded = upload_capture(server, contents_of(write_capture(tmp_path / "mine")))
     with watched_page(chromium, address_of(server), scheme, width) as page:
         page.goto(f"/#/submit/{uploaded}")
         expect(page.get_by_label("What is fitted from")).to_have_value("capture")
         expect(page.get_by_label("Capture", exact=True)).to_have_value(uploaded)
-        shown = {name.removeprefix("option-") for name in page.locator("details [id^=option-]").evaluate_all("all => all.map(one => one.id)")}
+        shown = {
+            name.removeprefix("option-")
+            for name in page.locator("details [id^=option-]").evaluate_all("all => all.map(one => one.id)")
+        }
         shown = {name for name in shown if not name.endswith(("-help", "-wrong"))}
         assert shown == set(JobSpec.model_fields) - {"capture", "rig"}
 
@@ -118,8 +136,20 @@ def test_the_form_is_the_schema_and_submits_what_was_changed(chromium: Browser, 
         page.get_by_role("button", name="Submit the job").click()
         job = submitted(server, page)
     changed = JobSpec.model_validate(job["spec"])
-    asked = {"capture": f"captures/{uploaded}", "samples_per_pixel": 128, "max_samples_per_pixel": 4096, "max_steps": 24, "search_candidates": 200000}
-    asked |= {"dentin": "known", "lobes": 2, "held_out_lights": ["l1"], "held": {"enamel.sigma": 4.5, "enamel.alpha": 0.99}, "advise": False}
+    asked = {
+        "capture": f"captures/{uploaded}",
+        "samples_per_pixel": 128,
+        "max_samples_per_pixel": 4096,
+        "max_steps": 24,
+        "search_candidates": 200000,
+    }
+    asked |= {
+        "dentin": "known",
+        "lobes": 2,
+        "held_out_lights": ["l1"],
+        "held": {"enamel.sigma": 4.5, "enamel.alpha": 0.99},
+        "advise": False,
+    }
     assert changed == JobSpec.model_validate(asked)
     assert job["name"] == "Anna"
 
@@ -151,9 +181,15 @@ def test_a_rig_is_submitted_with_its_options(chromium: Browser, server: httpx.Cl
         expect(page.get_by_label("Mouth")).to_be_focused()
         page.get_by_label("Mouth").fill("/nowhere")
         page.get_by_role("button", name="Submit the job").click()
-        expect(page.locator("#option-rig-mouth-wrong")).to_contain_text("/nowhere does not exist on the server; upload it")
+        expect(page.locator("#option-rig-mouth-wrong")).to_contain_text(
+            "/nowhere does not exist on the server; upload it"
+        )
         page.get_by_label("Mouth").fill(str(mouth))
         page.get_by_label("Exposure, s", exact=True).fill("0.02")
         page.get_by_role("button", name="Submit the job").click()
         job = submitted(server, page)
-    assert (job["spec"]["rig"]["mouth"], job["spec"]["rig"]["exposure_s"], job["spec"]["rig"]["dome"]) == (str(mouth), 0.02, "simulated")
+    assert (job["spec"]["rig"]["mouth"], job["spec"]["rig"]["exposure_s"], job["spec"]["rig"]["dome"]) == (
+        str(mouth),
+        0.02,
+        "simulated",
+    )

@@ -33,8 +33,12 @@ def page(chromium: Browser, tmp_path: Path, job: ScriptedJob, request: pytest.Fi
         job.steps.release(STEPS)
 
 
-@pytest.mark.parametrize("page", [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])], indirect=True)
-def test_a_job_is_named_downloaded_and_deleted(page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(
+    "page", [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])], indirect=True
+)
+def test_a_job_is_named_downloaded_and_deleted(
+    page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     shown = "-".join(map(str, request.node.callspec.params["page"]))
     job.steps.release(2 * STEPS)
     older, newer = submit(page), submit(page)

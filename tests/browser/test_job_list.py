@@ -25,7 +25,9 @@ PAGE = 50
 def page(chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Page]:
     if not (STATIC / "app.js").exists():
         pytest.skip("the dashboard is not built; run make dashboard")
-    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 600.0)  # jobs that a test writes into the database stay queued
+    monkeypatch.setattr(
+        "services.api.jobs.runner.ROUND_S", 600.0
+    )  # jobs that a test writes into the database stay queued
     with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as client:
         page = chromium.new_page(base_url=str(client.base_url))
         broken: list[str] = []
@@ -67,7 +69,9 @@ def test_older_jobs_stay_in_line_while_new_ones_come(page: Page, create: Callabl
     expect(page.get_by_role("button", name="Older jobs")).to_be_hidden()
 
 
-def test_older_jobs_change_their_state_and_go_when_they_are_deleted(page: Page, repository: Repository, create: Callable[[int], list[str]]) -> None:
+def test_older_jobs_change_their_state_and_go_when_they_are_deleted(
+    page: Page, repository: Repository, create: Callable[[int], list[str]]
+) -> None:
     jobs = create(PAGE + 10)
     page.goto("/")
     page.get_by_role("button", name="Older jobs").click()
@@ -81,11 +85,17 @@ def test_older_jobs_change_their_state_and_go_when_they_are_deleted(page: Page, 
     expect(page.locator("#jobs a")).to_have_count(PAGE + 9)
 
 
-def test_a_failed_question_for_older_jobs_is_told_and_can_be_repeated(page: Page, create: Callable[[int], list[str]]) -> None:
+def test_a_failed_question_for_older_jobs_is_told_and_can_be_repeated(
+    page: Page, create: Callable[[int], list[str]]
+) -> None:
     create(PAGE + 1)
     page.goto("/")
     expect(page.locator("#jobs a")).to_have_count(PAGE)
-    page.route("**/v1/jobs?*before=*", lambda route: route.fulfill(status=429, json={"detail": "Too many requests; wait 7 s."}), times=1)
+    page.route(
+        "**/v1/jobs?*before=*",
+        lambda route: route.fulfill(status=429, json={"detail": "Too many requests; wait 7 s."}),
+        times=1,
+    )
     page.get_by_role("button", name="Older jobs").click()
     expect(page.locator("#jobs").get_by_role("alert")).to_have_text("Too many requests; wait 7 s.")
     page.get_by_role("button", name="Older jobs").click()
@@ -95,7 +105,13 @@ def test_a_failed_question_for_older_jobs_is_told_and_can_be_repeated(page: Page
 
 def test_the_list_takes_no_focus_from_elsewhere(page: Page, create: Callable[[int], list[str]]) -> None:
     (job,) = create(1)
-    worker = {"name": "1", "host": "here", "tasks": [{"stage": "fit", "job": job}], "memory_bytes": 1, "memory_limit_bytes": None}
+    worker = {
+        "name": "1",
+        "host": "here",
+        "tasks": [{"stage": "fit", "job": job}],
+        "memory_bytes": 1,
+        "memory_limit_bytes": None,
+    }
     told = {"workers": [worker], "sentence": "1 worker.", "succeeded_last_hour": 0, "succeeded_last_day": 0}
     page.route("**/v1/workers", lambda route: route.fulfill(json=told))
     page.goto("/")

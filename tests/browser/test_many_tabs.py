@@ -50,13 +50,19 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         pytest.skip("the dashboard is not built; run make dashboard")
     bench = Bench("", ScriptedJob())
     with simulated_dome(LIGHTS, 10.0) as (host, port):
-        settings = ServerSettings(data=tmp_path_factory.mktemp("data"), dome=DomeSettings(address=f"{host}:{port}", watchdog_s=10.0), jobs_at_once=TABS)
+        settings = ServerSettings(
+            data=tmp_path_factory.mktemp("data"),
+            dome=DomeSettings(address=f"{host}:{port}", watchdog_s=10.0),
+            jobs_at_once=TABS,
+        )
         app = create_app(settings, bench.job)
 
         async def counting(scope: Any, receive: Any, send: Any) -> None:
             asked, path = scope.get("query_string", b"").decode(), scope.get("path", "")
             by_page = any(name == b"sec-fetch-mode" for name, _ in scope.get("headers", ())) and path.startswith("/v1/")
-            under_way = bench.streams if path.endswith("/events") else bench.asked if by_page and path != "/v1/dome/off" else []
+            under_way = (
+                bench.streams if path.endswith("/events") else bench.asked if by_page and path != "/v1/dome/off" else []
+            )
             under_way.append(asked)
             bench.most_asked = max(bench.most_asked, len(bench.asked))
             try:
@@ -123,7 +129,9 @@ def test_eight_job_pages_are_live_by_one_stream_and_all_off_answers(context: Bro
         expect(tab.locator(".stages li", has_text="prepare").locator(".note")).to_have_text("24 images prepared.")
         expect(tab.locator(".chart figcaption")).to_contain_text(f"{STEPS} steps.")
     until(dome, lambda: not bench.streams)
-    assert 1 <= bench.most_asked <= LANES, "what pages ask together leaves connections for the stream, an upload and ALL OFF"
+    assert 1 <= bench.most_asked <= LANES, (
+        "what pages ask together leaves connections for the stream, an upload and ALL OFF"
+    )
 
 
 def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: BrowserContext, bench: Bench) -> None:
@@ -141,7 +149,9 @@ def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: 
     expect(page.locator(".chart figcaption")).to_contain_text(f"{STEPS} steps.")
 
 
-def test_all_off_is_answered_while_every_connection_is_held(context: BrowserContext, monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
+def test_all_off_is_answered_while_every_connection_is_held(
+    context: BrowserContext, monkeypatch: pytest.MonkeyPatch, bench: Bench
+) -> None:
     """As by long downloads; a server that asks nobody for a token is asked over a connection of its own."""
     dome = dome_page(context)
     light_up(dome)
@@ -154,7 +164,10 @@ def test_all_off_is_answered_while_every_connection_is_held(context: BrowserCont
 
     monkeypatch.setattr("services.api.jobs.history_routes.list_artifacts", hang)
     job = submit(dome)
-    dome.evaluate("job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }", job)
+    dome.evaluate(
+        "job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }",
+        job,
+    )
     until(dome, lambda: len(asked) == CONNECTIONS)
     dome.locator(".all-off").click()
     expect(dome.locator(".done")).to_have_text("All is dark. No job was capturing.")
@@ -176,7 +189,9 @@ def test_an_all_off_without_an_answer_is_told_in_red_after_a_second(context: Bro
     expect(trouble).to_be_hidden()
     dome.locator(".all-off").click()
     expect(trouble).to_be_visible()
-    expect(trouble).to_have_text("ALL OFF has had no answer for 1 s; it is still being sent. Press the dome's emergency stop, or cut its power.")
+    expect(trouble).to_have_text(
+        "ALL OFF has had no answer for 1 s; it is still being sent. Press the dome's emergency stop, or cut its power."
+    )
     assert trouble.evaluate("one => getComputedStyle(one).color") == dome.evaluate(
         "() => { const one = document.createElement('i'); one.style.color = 'var(--bad)'; document.body.append(one); return getComputedStyle(one).color; }"
     )

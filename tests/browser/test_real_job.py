@@ -51,7 +51,9 @@ def test_a_tooth_is_measured_before_the_visitors_eyes(chromium: Browser, server:
     subprocess.run([*DENTINE, "submit", str(tmp_path / "job.toml"), "--server", server], check=True)
 
     page.locator("#jobs a").first.click()
-    expect(page.locator(".stages li", has_text="capture").locator(".state")).to_have_text("finished", timeout=2 * MINUTES_MS)
+    expect(page.locator(".stages li", has_text="capture").locator(".state")).to_have_text(
+        "finished", timeout=2 * MINUTES_MS
+    )
     expect(page.locator(".chart canvas")).to_be_visible(timeout=8 * MINUTES_MS)
     expect(page.locator(".job .badge")).to_have_text("running")
     expect(page.locator(".job .badge")).to_have_text("not converged", timeout=8 * MINUTES_MS)  # with one step

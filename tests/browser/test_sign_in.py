@@ -41,11 +41,15 @@ def server(tmp_path: Path) -> Iterator[Guarded]:
 @pytest.fixture
 def page(chromium: Browser, server: Guarded, request: pytest.FixtureRequest) -> Iterator[Page]:
     scheme = getattr(request, "param", "light")
-    context = chromium.new_context(base_url=str(server.client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 700})
+    context = chromium.new_context(
+        base_url=str(server.client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 700}
+    )
     page = context.new_page()
     broken: list[str] = []
     page.on("pageerror", lambda problem: broken.append(str(problem)))
-    page.on("console", lambda message: broken.append(message.text) if "Content Security Policy" in message.text else None)
+    page.on(
+        "console", lambda message: broken.append(message.text) if "Content Security Policy" in message.text else None
+    )
     yield page
     context.close()
     assert not broken
@@ -57,12 +61,16 @@ def sign_in(page: Page, token: str) -> None:
 
 
 @pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: Page, server: Guarded, request: pytest.FixtureRequest) -> None:
+def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(
+    page: Page, server: Guarded, request: pytest.FixtureRequest
+) -> None:
     page.goto("/")
     expect(page.get_by_label("Token")).to_be_focused()
     expect(page.locator("#jobs")).to_be_hidden()
     sign_in(page, "dentine_0123456789ab_a-guess")
-    expect(page.get_by_role("alert")).to_have_text("This token is unknown, expired or revoked; ask an administrator for a new one.")
+    expect(page.get_by_role("alert")).to_have_text(
+        "This token is unknown, expired or revoked; ask an administrator for a new one."
+    )
     assert contrast_failures(page) == []
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=f"{folder}/sign-in-{request.node.callspec.params['page']}.png")
@@ -85,7 +93,9 @@ def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: P
 
 
 @pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_reader_is_shown_nothing_that_he_may_not_press(page: Page, server: Guarded, request: pytest.FixtureRequest) -> None:
+def test_a_reader_is_shown_nothing_that_he_may_not_press(
+    page: Page, server: Guarded, request: pytest.FixtureRequest
+) -> None:
     failed = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED}).json()["id"]
     page.goto("/")
     sign_in(page, server.tokens[Scope.READ])
@@ -97,7 +107,12 @@ def test_a_reader_is_shown_nothing_that_he_may_not_press(page: Page, server: Gua
     for name in ("New job", "Dome"):
         expect(page.get_by_role("link", name=name)).to_have_count(0)
     looked_at(page, f"reader-{request.node.callspec.params['page']}")
-    for address, lacking in (("#/new", "submit"), ("#/rig", "submit"), ("#/submit", "submit"), ("#/dome", "operate-dome")):
+    for address, lacking in (
+        ("#/new", "submit"),
+        ("#/rig", "submit"),
+        ("#/submit", "submit"),
+        ("#/dome", "operate-dome"),
+    ):
         page.goto(f"/{address}")
         expect(page.get_by_role("alert")).to_contain_text(f"the scope {lacking}.")
         expect(page.locator("main button, main input")).to_have_count(0)

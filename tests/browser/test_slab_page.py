@@ -38,13 +38,13 @@ def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
             log.append(fit, StageEvent(stage="fit", kind="progress", done=number / 2, message=message, data=data))
         log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged."))
         export = log.begin_stage("export")
-        row = (
-            '{"sigma_s": {"value": 1.204, "se": 0.008, "unit": "1/mm", "determined": true}, "g": {"value": 0.61, "se": 0.2, "unit": "1", "determined": false}}'
-        )
+        row = '{"sigma_s": {"value": 1.204, "se": 0.008, "unit": "1/mm", "determined": true}, "g": {"value": 0.61, "se": 0.2, "unit": "1", "determined": false}}'  # noqa: E501
         (folder / "parameters.json").write_text("{" + ", ".join(f'"{nm}": {row}' for nm in WAVELENGTHS_NM) + "}")
         p = hg_values(0.6)
         told = tuple(bool(angle > 0.12) for angle in ANGLES_RAD)
-        phase = PhaseFunction(theta_deg=tuple(np.degrees(ANGLES_RAD)), value_per_sr=tuple(p), se_per_sr=tuple(0.05 * p), determined=told)
+        phase = PhaseFunction(
+            theta_deg=tuple(np.degrees(ANGLES_RAD)), value_per_sr=tuple(p), se_per_sr=tuple(0.05 * p), determined=told
+        )
         for nm in WAVELENGTHS_NM:
             (folder / f"phase_{nm}.svg").write_text(phase_picture(f"Phase function at {nm} nm", phase))
         log.append(export, StageEvent(stage="export", kind="finished", done=1.0))
@@ -64,18 +64,24 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
 
 @pytest.mark.parametrize("width", [WIDE[0], PHONE[0]])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_shows_wavelengths_coefficients_and_phase_functions(chromium: Browser, server: tuple[httpx.Client, str], scheme: str, width: int) -> None:
+def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
+    chromium: Browser, server: tuple[httpx.Client, str], scheme: str, width: int
+) -> None:
     client, job = server
     with watched_page(chromium, str(client.base_url).rstrip("/"), scheme, width) as page:
         page.goto(f"/#/{job}")
         expect_state(page, job, "SUCCEEDED")
-        expect(page.locator(".wavelengths li")).to_have_text([f"{nm} nm: σs 1.204 ± 0.008 per mm; error on fitted images 0.31 %." for nm in WAVELENGTHS_NM])
+        expect(page.locator(".wavelengths li")).to_have_text(
+            [f"{nm} nm: σs 1.204 ± 0.008 per mm; error on fitted images 0.31 %." for nm in WAVELENGTHS_NM]
+        )
         expect(page.locator("thead th")).to_have_text(["parameter", "unit", "532 nm", "635 nm"])
         expect(page.locator("td.number").first).to_have_text("1.2040 ± 0.0080")
         expect(page.locator(".phases img")).to_have_count(2)
         picture = page.get_by_alt_text("Phase function at 532 nm")
         picture.scroll_into_view_if_needed()
-        page.wait_for_function("[...document.querySelectorAll('.phases img')].every((image) => image.complete && image.naturalWidth === 640)")
+        page.wait_for_function(
+            "[...document.querySelectorAll('.phases img')].every((image) => image.complete && image.naturalWidth === 640)"
+        )
         expect(page.locator(".job")).not_to_contain_text("No step yet")
         expect(page.locator(".job")).not_to_contain_text("No picture yet")
         looked_at(page, f"slab-{scheme}-{width}")

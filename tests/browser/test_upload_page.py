@@ -53,7 +53,9 @@ def expect_uploaded(page: Page, server: httpx.Client, data: Path, contents: dict
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", WIDE[0]), ("dark", PHONE[0])])
-def test_a_folder_is_uploaded_and_its_job_submitted(chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path, scheme: str, width: int) -> None:
+def test_a_folder_is_uploaded_and_its_job_submitted(
+    chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path, scheme: str, width: int
+) -> None:
     contents = contents_of(folder)
     (folder / "notes.txt").write_text("mine")
     (folder / ".hidden.json").write_text("{}")
@@ -72,7 +74,9 @@ def test_a_folder_is_uploaded_and_its_job_submitted(chromium: Browser, server: h
         expect(page.locator(".job .badge")).to_have_text("succeeded")
 
 
-def test_a_broken_connection_is_gone_on_with(chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path) -> None:
+def test_a_broken_connection_is_gone_on_with(
+    chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path
+) -> None:
     with watched_page(chromium, str(server.base_url).rstrip("/"), expected=BROKEN) as page:
         page.goto("/")
         sent: list[str] = []
@@ -91,11 +95,18 @@ def test_a_broken_connection_is_gone_on_with(chromium: Browser, server: httpx.Cl
         assert sent == ["broken"] * 3
 
 
-def test_the_same_folder_goes_on_after_a_reload(chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path) -> None:
+def test_the_same_folder_goes_on_after_a_reload(
+    chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path
+) -> None:
     with watched_page(chromium, str(server.base_url).rstrip("/"), expected=BROKEN) as page:
         page.on("dialog", lambda dialog: dialog.accept())
         page.goto("/")
-        page.route("**/v1/uploads/**", lambda route: route.abort() if route.request.headers.get("upload-offset") == str(BLOCK_BYTES) else route.fallback())
+        page.route(
+            "**/v1/uploads/**",
+            lambda route: (
+                route.abort() if route.request.headers.get("upload-offset") == str(BLOCK_BYTES) else route.fallback()
+            ),
+        )
         choose(page, folder)
         expect(page.locator(".upload [role=status]")).to_contain_text(f"Sending {LARGE}")
         page.wait_for_event("requestfailed", lambda request: request.method == "PATCH")
@@ -103,10 +114,19 @@ def test_the_same_folder_goes_on_after_a_reload(chromium: Browser, server: httpx
         page.reload()
         expect(page.locator(".upload progress")).to_be_hidden()
         offsets: list[int] = []
-        page.on("request", lambda request: offsets.append(int(request.headers["upload-offset"])) if request.method == "PATCH" else None)
+        page.on(
+            "request",
+            lambda request: (
+                offsets.append(int(request.headers["upload-offset"])) if request.method == "PATCH" else None
+            ),
+        )
         choose(page, folder)
         expect_uploaded(page, server, tmp_path / "data", contents_of(folder))
-    assert offsets == [BLOCK_BYTES, 2 * BLOCK_BYTES, 0]  # the rest of the large file and the one after it; nothing was sent twice
+    assert offsets == [
+        BLOCK_BYTES,
+        2 * BLOCK_BYTES,
+        0,
+    ]  # the rest of the large file and the one after it; nothing was sent twice
 
 
 def test_a_dropped_folder_is_uploaded(chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path) -> None:
@@ -114,14 +134,20 @@ def test_a_dropped_folder_is_uploaded(chromium: Browser, server: httpx.Client, f
         page.goto("/")
         box = page.locator(".drop").bounding_box()
         assert box is not None
-        where = {"x": box["x"] + 20, "y": box["y"] + 20, "data": {"items": [], "files": [str(folder)], "dragOperationsMask": 1}}
+        where = {
+            "x": box["x"] + 20,
+            "y": box["y"] + 20,
+            "data": {"items": [], "files": [str(folder)], "dragOperationsMask": 1},
+        }
         devtools = page.context.new_cdp_session(page)
         for kind in ("dragEnter", "dragOver", "drop"):
             devtools.send("Input.dispatchDragEvent", {"type": kind} | where)
         expect_uploaded(page, server, tmp_path / "data", contents_of(folder))
 
 
-def test_a_folder_that_is_no_capture_is_refused_in_a_sentence(chromium: Browser, server: httpx.Client, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_capture_is_refused_in_a_sentence(
+    chromium: Browser, server: httpx.Client, tmp_path: Path
+) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("x")
     (tmp_path / "meshes").mkdir()
@@ -129,6 +155,8 @@ def test_a_folder_that_is_no_capture_is_refused_in_a_sentence(chromium: Browser,
     with watched_page(chromium, str(server.base_url).rstrip("/"), expected=("422",)) as page:
         page.goto("/")
         choose(page, tmp_path / "other")
-        expect(page.get_by_role("alert")).to_contain_text("The folder holds no file of a capture; choose the one with capture.json.")
+        expect(page.get_by_role("alert")).to_contain_text(
+            "The folder holds no file of a capture; choose the one with capture.json."
+        )
         choose(page, tmp_path / "meshes")
         expect(page.get_by_role("alert")).to_contain_text("The capture holds neither capture.json nor manifest.json")

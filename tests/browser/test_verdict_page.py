@@ -27,9 +27,19 @@ THICKNESS = Estimate(value=0.703, se=0.061, unit="mm", determined=True)
 
 def report(error: float, *, converged: bool) -> FitReport:
     errors = {"green": error, "red": error + 0.02}
-    advice = "" if converged else "red: the images are still 35 % off; check mesh, lights and boundary model, or raise the samples."
-    told: dict[str, Any] = {"held_out_error": errors, "held_out_error_se": {"green": 0.0042, "red": 0.0051}, "enamel_thickness": THICKNESS}
-    return FitReport(converged=converged, advice=advice, parameters={}, fit_error=errors, steps=2 * STEPS, seconds=1.0, **told)
+    advice = (
+        ""
+        if converged
+        else "red: the images are still 35 % off; check mesh, lights and boundary model, or raise the samples."
+    )
+    told: dict[str, Any] = {
+        "held_out_error": errors,
+        "held_out_error_se": {"green": 0.0042, "red": 0.0051},
+        "enamel_thickness": THICKNESS,
+    }
+    return FitReport(
+        converged=converged, advice=advice, parameters={}, fit_error=errors, steps=2 * STEPS, seconds=1.0, **told
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +58,13 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])])
+@pytest.mark.parametrize(
+    ("scheme", "width"), [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])]
+)
 @pytest.mark.parametrize("is_good", [True, False], ids=["converged", "not-converged"])
-def test_the_page_leads_with_the_reports_judgement(chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, is_good: bool) -> None:
+def test_the_page_leads_with_the_reports_judgement(
+    chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, is_good: bool
+) -> None:
     verdict = job.verdict = verdict_of(report(0.0741 if is_good else 0.336, converged=is_good))
     with watched_page(chromium, address_of(server), scheme, width) as page:
         submitted = submit(page)
@@ -62,7 +76,9 @@ def test_the_page_leads_with_the_reports_judgement(chromium: Browser, server: ht
         shown = page.locator(".job .verdict")
         expect(shown.locator("dd strong").first).to_have_text(percent(verdict.error))
         expect(shown.locator("dd strong").last).to_have_text(_spread(THICKNESS))
-        expect(shown).to_contain_text(f"green {percent(verdict.channels['green'])}, red {percent(verdict.channels['red'])}")
+        expect(shown).to_contain_text(
+            f"green {percent(verdict.channels['green'])}, red {percent(verdict.channels['red'])}"
+        )
         result = f"Result: held-out error green {percent(verdict.channels['green'])}, red {percent(verdict.channels['red'])}."
         expect(page.locator(".chart figcaption")).to_contain_text(result)
         expect(page.locator(".comparison .scale")).to_contain_text("−25 % of white")
@@ -86,10 +102,15 @@ def test_a_job_without_a_verdict_shows_none(chromium: Browser, server: httpx.Cli
         expect(page.locator(".job .verdict")).to_be_hidden()
 
 
-def test_a_job_that_waits_for_disk_says_so_at_once(chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: ScriptedJob) -> None:
+def test_a_job_that_waits_for_disk_says_so_at_once(
+    chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: ScriptedJob
+) -> None:
     """By an event and not by asking again: the page asks anew only after five seconds, and a round comes every ten."""
     monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 3600.0)
-    with serving(create_app(ServerSettings(data=tmp_path), job)) as client, watched_page(chromium, address_of(client)) as page:
+    with (
+        serving(create_app(ServerSettings(data=tmp_path), job)) as client,
+        watched_page(chromium, address_of(client)) as page,
+    ):
         page.clock.install()  # time stands still in the page, so that it asks for nothing by itself
         full = Machine(free_disk_bytes=2**20, disk_bytes=2**40, memory_bytes=2**40)
         monkeypatch.setattr(Machine, "of", classmethod(lambda *_, **__: full))

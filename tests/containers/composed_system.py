@@ -81,7 +81,9 @@ class ComposedSystem:
 
     def address_of(self, service: str, network: str) -> str:
         """Where a container is reached on a network."""
-        return str(self.inspect(self.container(service))["NetworkSettings"]["Networks"][self.network(network)]["IPAddress"])
+        return str(
+            self.inspect(self.container(service))["NetworkSettings"]["Networks"][self.network(network)]["IPAddress"]
+        )
 
     def client(self, token: str | None = None) -> httpx.Client:
         """A client of the API."""

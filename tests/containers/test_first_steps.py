@@ -59,9 +59,14 @@ def test_three_clicks_lead_from_the_link_to_the_report(fresh: ComposedSystem, ch
 
 
 def test_what_the_system_weighs_is_measured(system: ComposedSystem, figures: dict[str, Any]) -> None:
-    images = {role: system.inspect(system.inspect(system.container(role))["Image"])["Size"] / MEGA for role in ("api", "worker")}
+    images = {
+        role: system.inspect(system.inspect(system.container(role))["Image"])["Size"] / MEGA
+        for role in ("api", "worker")
+    }
     figures["image_mb"] = {role: round(size) for role, size in images.items()}
     told = system.engine("stats", "--no-stream", "--format", "{{.Name}} {{.MemUsage}}")
-    figures["memory_at_rest"] = {line.split()[0]: line.split()[1] for line in told.splitlines() if line.startswith(system.project)}
+    figures["memory_at_rest"] = {
+        line.split()[0]: line.split()[1] for line in told.splitlines() if line.startswith(system.project)
+    }
     assert len(figures["memory_at_rest"]) == 6
     assert images["api"] < images["worker"] < 1500

@@ -50,7 +50,11 @@ def result_of(system: ComposedSystem, token: str, job: str) -> dict[str, Any]:
         detail = follow(client, job)
         assert detail["state"] == "SUCCEEDED", detail["failure"]
         found = client.get(f"/v1/jobs/{job}/artifacts/parameters.json").json()
-        events = [json.loads(line[6:]) for line in client.get(f"/v1/jobs/{job}/events").text.splitlines() if line.startswith('data: {"id"')]
+        events = [
+            json.loads(line[6:])
+            for line in client.get(f"/v1/jobs/{job}/events").text.splitlines()
+            if line.startswith('data: {"id"')
+        ]
     for stage, folder in STAGES.items():
         finished = [event["attempt"] for event in events if event["stage"] == stage and event["kind"] == "finished"]
         published = json.loads((system.data / "jobs" / job / folder / "manifest.json").read_text())["attempt"]
@@ -58,7 +62,9 @@ def result_of(system: ComposedSystem, token: str, job: str) -> dict[str, Any]:
     return {name: value for name, value in found.items() if name != "seconds"}
 
 
-def test_the_asset_of_a_job_renders(system: ComposedSystem, token: str, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+def test_the_asset_of_a_job_renders(
+    system: ComposedSystem, token: str, undisturbed: dict[str, Any], tmp_path: Path
+) -> None:
     assert undisturbed
     with system.client(token) as client:
         job = next(one["id"] for one in client.get("/v1/jobs").json()["jobs"] if one["state"] == "SUCCEEDED")
@@ -118,7 +124,13 @@ FAULTS: dict[str, Callable[[ComposedSystem, StoreDisk], None]] = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_disturbed_job_gives_the_undisturbed_answer(
-    system: ComposedSystem, disk: StoreDisk, token: str, capture: str, undisturbed: dict[str, Any], figures: dict[str, Any], name: str
+    system: ComposedSystem,
+    disk: StoreDisk,
+    token: str,
+    capture: str,
+    undisturbed: dict[str, Any],
+    figures: dict[str, Any],
+    name: str,
 ) -> None:
     job = submit(system, token, capture)
     system.wait_until(lambda: is_fitting(system, token, job), "the fit does not begin")
@@ -132,6 +144,9 @@ def test_a_disturbed_job_gives_the_undisturbed_answer(
 def is_fitting(system: ComposedSystem, token: str, job: str) -> bool:
     try:
         with system.client(token) as client:
-            return any(one["stage"] == "fit" and one["state"] == "running" for one in client.get(f"/v1/jobs/{job}").json()["stages"])
+            return any(
+                one["stage"] == "fit" and one["state"] == "running"
+                for one in client.get(f"/v1/jobs/{job}").json()["stages"]
+            )
     except (httpx.TransportError, KeyError):
         return False

@@ -32,19 +32,25 @@ def digests(system: ComposedSystem, token: str, job: str) -> dict[str, str]:
     """SHA-256 of every artifact, as the API gives it."""
     with system.client(token) as client:
         paths = [one["path"] for one in client.get(f"/v1/jobs/{job}/artifacts").json()]
-        return {path: hashlib.sha256(client.get(f"/v1/jobs/{job}/artifacts/{path}").content).hexdigest() for path in paths}
+        return {
+            path: hashlib.sha256(client.get(f"/v1/jobs/{job}/artifacts/{path}").content).hexdigest() for path in paths
+        }
 
 
 def script(system: ComposedSystem, name: str, folder: Path, *, check: bool = True) -> subprocess.CompletedProcess[str]:
     files = " ".join(f"--file {file}" for file in COMPOSE_FILES)
     compose = os.environ.get("DENTINE_COMPOSE", "docker compose")
     environment = system.environment | {"DENTINE_COMPOSE": f"{compose} --project-name {system.project} {files}"}
-    done = subprocess.run([str(DEPLOY / name), str(folder)], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [str(DEPLOY / name), str(folder)], env=environment, capture_output=True, text=True, check=False
+    )
     assert not check or done.returncode == 0, done.stdout + done.stderr
     return done
 
 
-def test_a_backup_brings_everything_back(system: ComposedSystem, token: str, finished: str, tmp_path: Path, figures: dict[str, Any]) -> None:
+def test_a_backup_brings_everything_back(
+    system: ComposedSystem, token: str, finished: str, tmp_path: Path, figures: dict[str, Any]
+) -> None:
     before = digests(system, token, finished)
     script(system, "backup.sh", tmp_path / "backup")
     system.down("--volumes", "--timeout", "20")
@@ -58,7 +64,9 @@ def test_a_backup_brings_everything_back(system: ComposedSystem, token: str, fin
     figures["restored_files"] = len(before)
 
 
-def test_a_damaged_backup_is_refused_before_anything_is_changed(system: ComposedSystem, token: str, finished: str, tmp_path: Path) -> None:
+def test_a_damaged_backup_is_refused_before_anything_is_changed(
+    system: ComposedSystem, token: str, finished: str, tmp_path: Path
+) -> None:
     script(system, "backup.sh", tmp_path / "backup")
     with (tmp_path / "backup" / "data.tar").open("r+b") as stream:
         stream.seek(10_000)
@@ -73,11 +81,15 @@ def test_a_new_database_password_needs_no_restart(system: ComposedSystem, token:
     before = system.inside("api", "cat", "/secrets/database/password")
     system.compose("run", "--rm", "--no-deps", "change-password")
     assert system.inside("api", "cat", "/secrets/database/password") != before
-    system.engine("restart", system.container("postgres"))  # ends all connections, so that new ones show the new password
+    system.engine(
+        "restart", system.container("postgres")
+    )  # ends all connections, so that new ones show the new password
     system.wait_until(lambda: system.is_ready(token), "the API does not come back with the new password")
     assert system.inspect(system.container("api"))["State"]["StartedAt"] == started
     with system.client(token) as client:
-        assert client.post(f"/v1/jobs/{finished}/retry").status_code == 409  # answered, as it reads and writes the database
+        assert (
+            client.post(f"/v1/jobs/{finished}/retry").status_code == 409
+        )  # answered, as it reads and writes the database
 
 
 def test_a_wrong_password_is_told_in_one_sentence(system: ComposedSystem) -> None:
@@ -113,7 +125,13 @@ def further_machine(system: ComposedSystem, folder: Path) -> Iterator[None]:
     """Another project of the engine with one worker, as another host would run it on the same network as the scheduler."""
     secrets = folder / "secrets"
     for name in ("tls", "database"):
-        volume = system.engine("volume", "inspect", "--format", "{{.Mountpoint}}", f"{system.project}_{'tls' if name == 'tls' else 'password'}").strip()
+        volume = system.engine(
+            "volume",
+            "inspect",
+            "--format",
+            "{{.Mountpoint}}",
+            f"{system.project}_{'tls' if name == 'tls' else 'password'}",
+        ).strip()
         shutil.copytree(volume, secrets / name, symlinks=True)
         for one in [secrets / name, *(secrets / name).iterdir()]:
             os.chown(one, 10001, 10001)
@@ -125,7 +143,11 @@ def further_machine(system: ComposedSystem, folder: Path) -> Iterator[None]:
         "DENTINE_SECRETS": str(secrets),
         "DENTINE_WORKER_NETWORK": system.network("parts"),
     }
-    compose = [*os.environ.get("DENTINE_COMPOSE", "docker compose").split(), "--project-name", f"{system.project}further"]
+    compose = [
+        *os.environ.get("DENTINE_COMPOSE", "docker compose").split(),
+        "--project-name",
+        f"{system.project}further",
+    ]
     compose += ["--file", str(DEPLOY / "compose.worker.yaml")]
     subprocess.run([*compose, "up", "--detach"], env=environment, check=True, capture_output=True)
     try:
@@ -135,7 +157,9 @@ def further_machine(system: ComposedSystem, folder: Path) -> Iterator[None]:
         system.engine("network", "disconnect", system.network("parts"), system.container("postgres"), check=False)
 
 
-def test_a_second_machine_joins_in_one_command(system: ComposedSystem, token: str, mouth: Path, finished: str, tmp_path: Path) -> None:
+def test_a_second_machine_joins_in_one_command(
+    system: ComposedSystem, token: str, mouth: Path, finished: str, tmp_path: Path
+) -> None:
     def able() -> int:
         with system.client(token) as client:
             return sum(not one["has_dome"] for one in client.get("/v1/workers").json()["workers"])

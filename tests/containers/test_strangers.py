@@ -27,7 +27,11 @@ def listening(system: ComposedSystem, service: str) -> set[int]:
     lines = system.inside(service, "cat", "/proc/net/tcp", "/proc/net/tcp6", check=False).splitlines()
     rows = [line.split() for line in lines if ":" in line]
     ours = (row[1].rpartition(":") for row in rows if len(row) > 3 and row[3] == _LISTENING)
-    return {int(port, 16) for address, _, port in ours if address not in {"0100007F", "0B00007F"} and not address.endswith("01000000")}
+    return {
+        int(port, 16)
+        for address, _, port in ours
+        if address not in {"0100007F", "0B00007F"} and not address.endswith("01000000")
+    }
 
 
 def targets(system: ComposedSystem) -> dict[tuple[str, int], str]:
@@ -53,14 +57,26 @@ def test_a_container_on_a_network_is_let_into_nothing(system: ComposedSystem, ne
     aims = targets(system)
     image = system.inspect(system.container("api"))["Config"]["Image"]
     mount = ["--volume", f"{STRANGER}:/stranger.py:ro"]
-    told = system.engine("run", "--rm", "--network", system.network(network), *mount, image, "python", "/stranger.py", json.dumps(list(aims)))
+    told = system.engine(
+        "run",
+        "--rm",
+        "--network",
+        system.network(network),
+        *mount,
+        image,
+        "python",
+        "/stranger.py",
+        json.dumps(list(aims)),
+    )
     check(aims, json.loads(told.strip().splitlines()[-1]))
 
 
 def test_another_user_of_the_host_is_let_into_nothing(system: ComposedSystem) -> None:
     aims = targets(system)
     command = [PYTHON, "-c", STRANGER.read_text(), json.dumps(list(aims))]
-    told = subprocess.run(command, user=NOBODY, group=NOBODY, extra_groups=[], capture_output=True, text=True, check=True, cwd="/")
+    told = subprocess.run(
+        command, user=NOBODY, group=NOBODY, extra_groups=[], capture_output=True, text=True, check=True, cwd="/"
+    )
     reached = check(aims, json.loads(told.stdout))
     assert reached <= {"api", "scheduler", "worker", "rig", "postgres", "dome"}
 
@@ -77,7 +93,9 @@ def check(aims: dict[tuple[str, int], str], told: dict[str, str]) -> set[str]:
 def test_the_database_wants_its_password(system: ComposedSystem) -> None:
     image = system.inspect(system.container("api"))["Config"]["Image"]
     code = "import psycopg; psycopg.connect('postgresql://dentine:guess@postgres/dentine', connect_timeout=5)"
-    told = system.engine("run", "--rm", "--network", system.network("database"), image, "python", "-c", code, check=False)
+    told = system.engine(
+        "run", "--rm", "--network", system.network("database"), image, "python", "-c", code, check=False
+    )
     assert "password authentication failed" in told
 
 
@@ -85,7 +103,9 @@ def test_a_dask_client_without_certificate_runs_nothing(system: ComposedSystem) 
     image = system.inspect(system.container("api"))["Config"]["Image"]
     for scheme in ("tcp", "tls"):
         code = f"from distributed import Client; Client('{scheme}://scheduler:8786', timeout=5)"
-        told = system.engine("run", "--rm", "--network", system.network("parts"), image, "python", "-c", code, check=False)
+        told = system.engine(
+            "run", "--rm", "--network", system.network("parts"), image, "python", "-c", code, check=False
+        )
         assert "Error" in told.strip().splitlines()[-1]
 
 

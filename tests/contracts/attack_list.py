@@ -21,7 +21,9 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "services" / "api" / "ATTACKS.md"
-MARK = re.compile(r'^@pytest\.mark\.attack\("(?P<kind>[^"]+)", "(?P<what>[^"]+)"\)\n(?:@.*\n)*def (?P<test>\w+)\(', re.MULTILINE)
+MARK = re.compile(
+    r'^@pytest\.mark\.attack\("(?P<kind>[^"]+)", "(?P<what>[^"]+)"\)\n(?:@.*\n)*def (?P<test>\w+)\(', re.MULTILINE
+)
 TITLE = """# Attacks that are tried
 
 `make attacks` runs these tests and writes this page; what each of them does stands in its source below `tests/`. `make contracts` sends ten thousand generated
@@ -43,7 +45,13 @@ class Attack:
 
     def row(self) -> dict[str, Any]:
         """The attack as JSON."""
-        return {"kind": self.kind, "attack": self.what, "test": self.test, "outcome": self.outcome, "cases": dict(self.outcomes)}
+        return {
+            "kind": self.kind,
+            "attack": self.what,
+            "test": self.test,
+            "outcome": self.outcome,
+            "cases": dict(self.outcomes),
+        }
 
     @property
     def outcome(self) -> str:
@@ -58,7 +66,9 @@ def listed() -> list[Attack]:
     found = []
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         of = path.relative_to(ROOT)
-        found += [Attack(match["kind"], match["what"], f"{of}::{match['test']}") for match in MARK.finditer(path.read_text())]
+        found += [
+            Attack(match["kind"], match["what"], f"{of}::{match['test']}") for match in MARK.finditer(path.read_text())
+        ]
     return found
 
 
@@ -83,7 +93,10 @@ def table(attacks: Iterable[Attack]) -> str:
     lines = [TITLE]
     for kind, rows in sorted(by_kind.items()):
         lines += [f"\n## {kind[0].upper()}{kind[1:]}\n\n| attack | cases | outcome | test |\n|---|---|---|---|\n"]
-        lines += [f"| {row.what} | {row.outcomes.total()} | {row.outcome} | `{row.test.removeprefix('tests/')}` |\n" for row in rows]
+        lines += [
+            f"| {row.what} | {row.outcomes.total()} | {row.outcome} | `{row.test.removeprefix('tests/')}` |\n"
+            for row in rows
+        ]
     return "".join(lines)
 
 
@@ -95,15 +108,21 @@ def main() -> None:
     arguments = parser.parse_args()
     attacks = [attack for attack in listed() if arguments.only in {None, attack.kind}]
     if not attacks:
-        parser.error(f"there is no kind {arguments.only!r}; known are {', '.join(sorted({attack.kind for attack in listed()}))}")
-    status = pytest.main([*(str(ROOT / attack.test) for attack in attacks), "-m", "attack"], plugins=[Collector(attacks)])
+        parser.error(
+            f"there is no kind {arguments.only!r}; known are {', '.join(sorted({attack.kind for attack in listed()}))}"
+        )
+    status = pytest.main(
+        [*(str(ROOT / attack.test) for attack in attacks), "-m", "attack"], plugins=[Collector(attacks)]
+    )
     arguments.json.write_text(json.dumps([attack.row() for attack in attacks], indent=1) + "\n")
     if arguments.only is None:
         PAGE.write_text(table(attacks))
     broken = [attack for attack in attacks if not attack.outcome.startswith("held off")]
     for attack in broken:
         print(f"{attack.kind}: {attack.what}: {attack.outcome} ({attack.test})")
-    print(f"{len(attacks)} attacks in {sum(attack.outcomes.total() for attack in attacks)} cases, {len(attacks) - len(broken)} held off.")
+    print(
+        f"{len(attacks)} attacks in {sum(attack.outcomes.total() for attack in attacks)} cases, {len(attacks) - len(broken)} held off."
+    )
     raise SystemExit(bool(broken) or status != 0)
 
 

@@ -72,7 +72,11 @@ class ExistingIds:
         """Let a case that is right by the description be right for the server too."""
         match f"{case.method.upper()} {case.path}":
             case "POST /v1/jobs":
-                case.body = {name: value for name, value in case.body.items() if name not in {"rig", "held", "samples_per_pixel", "max_samples_per_pixel"}}
+                case.body = {
+                    name: value
+                    for name, value in case.body.items()
+                    if name not in {"rig", "held", "samples_per_pixel", "max_samples_per_pixel"}
+                }
                 case.body |= {"capture": self._source if choice % 3 else f"/{case.body.get('capture')}", "workers": 1}
                 case.headers.pop("idempotency-key", None)
             case "POST /v1/captures":
@@ -91,11 +95,19 @@ class ExistingIds:
                 case.body = {"mouth": str(self._mouth)}
             case "POST /v1/uploads" if self._contents:
                 capture, content = list(self._contents.items())[choice % len(self._contents)]
-                case.headers.update(TUS | {"upload-length": str(len(content)), "upload-metadata": format_metadata({"capture": capture, "path": _FILE})})
+                case.headers.update(
+                    TUS
+                    | {
+                        "upload-length": str(len(content)),
+                        "upload-metadata": format_metadata({"capture": capture, "path": _FILE}),
+                    }
+                )
             case "PATCH /v1/uploads/{capture}/{number}":
                 content = self._contents.get(case.path_parameters["capture"], b"{}")
                 part = content if choice % 2 else content[: choice % len(content)]
-                case.headers.update(TUS | {"upload-offset": "0", "content-type": CHUNK_TYPE, "upload-checksum": checksum(part)})
+                case.headers.update(
+                    TUS | {"upload-offset": "0", "content-type": CHUNK_TYPE, "upload-checksum": checksum(part)}
+                )
                 case.body, case.media_type = part, CHUNK_TYPE
             case route if "/v1/uploads" in route:
                 case.headers.update(TUS)

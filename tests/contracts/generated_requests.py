@@ -70,7 +70,11 @@ STRAY_HEADERS: Mapping[str, tuple[str, ...]] = {
     "Accept": ("text/html", "*/*;q=x"),
     "Content-Encoding": ("gzip",),
 }
-_PHRASES = {status.phrase.lower().replace(" ", "-") for status in HTTPStatus} | {"foreign-host", "foreign-origin", "not-ready"}
+_PHRASES = {status.phrase.lower().replace(" ", "-") for status in HTTPStatus} | {
+    "foreign-host",
+    "foreign-origin",
+    "not-ready",
+}
 
 
 @dataclass(frozen=True)
@@ -152,23 +156,39 @@ class Sender:
         dice = random.Random(start)
         border = [case for operation in self._operations for case in self._border(operation)]
         border = dice.sample(border, min(len(border), round(BORDER_SHARE * cases)))
-        pairs = [(operation, mode) for operation in self._operations for mode in GenerationMode if mode.is_positive or _takes_input(operation)]
+        pairs = [
+            (operation, mode)
+            for operation in self._operations
+            for mode in GenerationMode
+            if mode.is_positive or _takes_input(operation)
+        ]
         while (left := cases - len(border) - self.tally.cases) > 0:
             start += 1
             most = min(MAX_AT_ONCE, -(-left // len(pairs)))
             pairs = [(operation, mode) for operation, mode in pairs if self._draw(operation, mode, most, start)]
             tell(f"{self.tally.cases} cases, {len(self.tally.faults)} kinds of fault")
         for case in border:
-            self._send(case, Dressing(dice.choice(CALLERS), dice.randrange(2**16), dice.random() < 0.75, dice.random() < 0.5, {}))
+            self._send(
+                case,
+                Dressing(dice.choice(CALLERS), dice.randrange(2**16), dice.random() < 0.75, dice.random() < 0.5, {}),
+            )
 
     def _border(self, operation: Any) -> Iterator[Case]:
         modes = list(GenerationMode)
-        yield from self._schema.iter_coverage_cases(operation, generation_modes=modes, generation_config=self._schema.config.generation)
+        yield from self._schema.iter_coverage_cases(
+            operation, generation_modes=modes, generation_config=self._schema.config.generation
+        )
 
     def _draw(self, operation: Any, mode: GenerationMode, most: int, start: int) -> bool:
         # Whether there are such cases at all.
         @seed(start)
-        @settings(max_examples=most, database=None, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+        @settings(
+            max_examples=most,
+            database=None,
+            deadline=None,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
         @given(case=operation.as_strategy(generation_mode=mode), dressing=dressings)
         def send(case: Case, dressing: Dressing) -> None:
             self._send(case, dressing)
@@ -195,7 +215,9 @@ class Sender:
             self.tally.blame(label, "no answer", type(problem).__name__, f"{case!r} {problem}")
             return
         self.tally.statuses[label][response.status_code] += 1
-        for kind, sentence in _faults(case, response, headers, CHECKS if is_fit else [*CHECKS, checks.negative_data_rejection]):
+        for kind, sentence in _faults(
+            case, response, headers, CHECKS if is_fit else [*CHECKS, checks.negative_data_rejection]
+        ):
             self.tally.blame(label, kind, sentence, f"{case.as_curl_command(headers)}\n{response.content[:600]!r}")
         self._living.learn(case, response)
 
@@ -263,17 +285,26 @@ def served(folder: Path, database: str | None) -> Iterator[tuple[httpx.Client, A
     """A server that asks for tokens and runs toy jobs, a client that may do anything, and the callers' tokens."""
     data = folder / "data"
     data.mkdir()
-    tokens: dict[str, str | None] = {scope: make_token(data, f"of-{scope}", scope, database=database) for scope in (Scope.ADMIN, Scope.READ)}
+    tokens: dict[str, str | None] = {
+        scope: make_token(data, f"of-{scope}", scope, database=database) for scope in (Scope.ADMIN, Scope.READ)
+    }
     tokens |= {"wrong": f"dentine_{'0' * 12}_{'x' * 43}", "nobody": None}
     with (folder / "server.log").open("w") as log:
         more: dict[str, Any] = {} if database is None else {"database": database}
-        more |= {"access": "tokens", "job_roots": str(folder), "private_webhooks": True, "dome": {"address": "simulated", "watchdog_s": 60.0}}
+        more |= {
+            "access": "tokens",
+            "job_roots": str(folder),
+            "private_webhooks": True,
+            "dome": {"address": "simulated", "watchdog_s": 60.0},
+        }
         with toy_server(data, log, "tests.contracts.stages", **more) as (client, process):
             client.headers["Authorization"] = f"Bearer {tokens['admin']}"
             yield client, process, tokens
 
 
-def survey(folder: Path, cases: int, start: int, database: str | None = None, tell: Callable[[str], None] = lambda _: None) -> Outcome:
+def survey(
+    folder: Path, cases: int, start: int, database: str | None = None, tell: Callable[[str], None] = lambda _: None
+) -> Outcome:
     """Serve a new data folder in ``folder``, send the cases and judge what is left."""
     began = time.monotonic()
     with served(folder, database) as (client, process, tokens):
@@ -320,12 +351,18 @@ def main() -> None:
     if outcome.faults:
         arguments.json.with_suffix(".log").write_text(log)
     for name, answers in outcome.classes.items():
-        print(f"{name:10} {sum(answers.values()):6}  " + "  ".join(f"{kind} {times}" for kind, times in answers.items()))
+        print(
+            f"{name:10} {sum(answers.values()):6}  " + "  ".join(f"{kind} {times}" for kind, times in answers.items())
+        )
     for fault in outcome.faults:
         print(f"\n{fault.operation}: {fault.kind}, {fault.times} times: {fault.sentence}\n{fault.example}")
-    if unanswered := [label for label, statuses in outcome.operations.items() if not any(200 <= status < 300 for status in statuses)]:
+    if unanswered := [
+        label for label, statuses in outcome.operations.items() if not any(200 <= status < 300 for status in statuses)
+    ]:
         print(f"\nNever answered 2xx: {', '.join(unanswered)}.")
-    print(f"\n{outcome.cases} cases in {outcome.seconds:.0f} s, jobs {outcome.jobs}, {len(outcome.faults)} kinds of fault.")
+    print(
+        f"\n{outcome.cases} cases in {outcome.seconds:.0f} s, jobs {outcome.jobs}, {len(outcome.faults)} kinds of fault."
+    )
     raise SystemExit(bool(outcome.faults))
 
 

@@ -31,7 +31,12 @@ class KeptData:
             client.get(f"/v1/captures/{capture}").raise_for_status().json(),
             contents_of(data / "captures" / capture),
             client.get(f"/v1/jobs/{job}").raise_for_status().json(),
-            {path: hashlib.sha256(client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content).hexdigest() for path in paths},
+            {
+                path: hashlib.sha256(
+                    client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content
+                ).hexdigest()
+                for path in paths
+            },
             client.get(f"/v1/jobs/{job}/events").raise_for_status().text,
             [preview["id"] for preview in client.get(f"/v1/jobs/{job}/previews").raise_for_status().json()["previews"]],
         )

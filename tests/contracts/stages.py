@@ -25,10 +25,14 @@ def prepare(_spec: JobSpec, context: StageContext) -> PreparedManifest:
     camera = Camera.model_validate(CAMERA)
     writer = StageWriter(context.root, "prepared", context.attempt)
     shape = (1, len(LIGHTS), camera.size[1], camera.size[0])
-    create_array(writer.folder / "prepared.zarr", "valid", shape, (1, 1, *shape[2:]), "uint16", ("camera", "light", "y", "x"))[:] = 1
+    create_array(
+        writer.folder / "prepared.zarr", "valid", shape, (1, 1, *shape[2:]), "uint16", ("camera", "light", "y", "x")
+    )[:] = 1
     masks = digest_of(read_masks(context.root))
     made = {"masks": masks, "dentin_known": (), "valid_fraction": 0.0, "median_motion_px": None}
-    record = PreparedManifest.model_validate({"channels": ("green",), "cameras": (camera,), "lights": LIGHTS, "held_out": (), "fdi": ()} | made)
+    record = PreparedManifest.model_validate(
+        {"channels": ("green",), "cameras": (camera,), "lights": LIGHTS, "held_out": (), "fdi": ()} | made
+    )
     writer.publish(record)
     return record
 
@@ -38,6 +42,14 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
     path = "previews/0.png"
     (context.root / "previews").mkdir(exist_ok=True)
     (context.root / path).write_bytes(picture_of(np.zeros((6, 8), dtype=np.uint8)))
-    shown = {"camera": "c0", "light": "l0", "channel": "green", "step": 0, "render": path, "photo": path, "residual": path}
+    shown = {
+        "camera": "c0",
+        "light": "l0",
+        "channel": "green",
+        "step": 0,
+        "render": path,
+        "photo": path,
+        "residual": path,
+    }
     context.report(StageEvent(stage="fit", kind="preview", data=shown))
     return toy_stages.fit(spec, context)

@@ -6,7 +6,17 @@ from collections import Counter
 
 from tests.contracts.attack_list import PAGE, ROOT, listed
 
-KINDS = ("traversal", "webhooks", "uploads", "routes × scopes", "cross-site", "tokens", "exhaustion", "Dask and files as another user", "light")
+KINDS = (
+    "traversal",
+    "webhooks",
+    "uploads",
+    "routes × scopes",
+    "cross-site",
+    "tokens",
+    "exhaustion",
+    "Dask and files as another user",
+    "light",
+)
 
 
 def test_every_attack_is_on_the_page() -> None:

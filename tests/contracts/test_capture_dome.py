@@ -74,7 +74,9 @@ class DomeContract:
         assert not observer.outputs().any()
 
     @pytest.mark.parametrize("problem", [ValueError, KeyboardInterrupt, SystemExit])
-    def test_dark_after_any_exception(self, make: type[Dome], observer: DomeObserver, problem: type[BaseException]) -> None:
+    def test_dark_after_any_exception(
+        self, make: type[Dome], observer: DomeObserver, problem: type[BaseException]
+    ) -> None:
         def interrupted() -> None:
             with make() as dome:
                 dome.light(3, LEVEL, ON_S)
@@ -92,7 +94,9 @@ class DomeContract:
         time.sleep(max(0.0, asked_s + ON_S + HANG_MARGIN_S + 0.1 - time.monotonic()))
         assert not observer.outputs().any()
 
-    def test_stays_lit_longer_than_the_watchdog_while_the_driver_lives(self, make: type[Dome], observer: DomeObserver) -> None:
+    def test_stays_lit_longer_than_the_watchdog_while_the_driver_lives(
+        self, make: type[Dome], observer: DomeObserver
+    ) -> None:
         with make(watchdog_s=0.6) as dome:
             dome.light(3, LEVEL, 2.0)
             time.sleep(1.2)
@@ -129,7 +133,9 @@ class TestModbusDome(DomeContract):
                 time.sleep(0.02)
             assert not observer.outputs().any()
 
-    @pytest.mark.parametrize(("light_limit_s", "total_limit_s", "which"), [(0.01, 10.0, "Light 3"), (10.0, 0.01, "All lights together")])
+    @pytest.mark.parametrize(
+        ("light_limit_s", "total_limit_s", "which"), [(0.01, 10.0, "Light 3"), (10.0, 0.01, "All lights together")]
+    )
     def test_a_dose_over_the_limit_is_refused_before_it_is_sent(
         self, address: tuple[str, int], observer: DomeObserver, light_limit_s: float, total_limit_s: float, which: str
     ) -> None:

@@ -24,16 +24,69 @@ from services.core.stage import LocalContext
 from services.preprocess.stage import run as prepare
 from tests.support.mouth import write_mouth
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of arithmetic with what is absurd; the answer counts
-EXAMPLES = settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning"
+)  # of arithmetic with what is absurd; the answer counts
+EXAMPLES = settings(
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 
 NUMBERS = st.one_of(
-    st.sampled_from([0, -1, 1, 2, 7, 65, 2**15, 2**31, 2**63, 10**30, 0.0, -0.0, 1e-300, 5e-324, 1e-6, 0.5, 1e38, 1e39, 1e200, 1.7e308, -1e200]),
+    st.sampled_from(
+        [
+            0,
+            -1,
+            1,
+            2,
+            7,
+            65,
+            2**15,
+            2**31,
+            2**63,
+            10**30,
+            0.0,
+            -0.0,
+            1e-300,
+            5e-324,
+            1e-6,
+            0.5,
+            1e38,
+            1e39,
+            1e200,
+            1.7e308,
+            -1e200,
+        ]
+    ),
     st.integers(-100, 100),
     st.floats(allow_nan=False, allow_infinity=False),
 )
 TEXTS = st.one_of(
-    st.sampled_from(["", ".", "..", "/", "\\", "\0", "a\0b", "NaN", "inf", "1e400", "simulated", "c0", "l0", "green", "x" * 5000, "²", "\ud7ff", "%s", "{}"]),
+    st.sampled_from(
+        [
+            "",
+            ".",
+            "..",
+            "/",
+            "\\",
+            "\0",
+            "a\0b",
+            "NaN",
+            "inf",
+            "1e400",
+            "simulated",
+            "c0",
+            "l0",
+            "green",
+            "x" * 5000,
+            "²",
+            "\ud7ff",
+            "%s",
+            "{}",
+        ]
+    ),
     st.text(max_size=20),
 )
 VALUES = st.recursive(
@@ -129,7 +182,9 @@ def test_the_capture_is_taken_as_it_is(capture: Path, tmp_path: Path) -> None:
 
 @EXAMPLES
 @given(data=st.data())
-def test_every_field_of_a_captures_description(capture: Path, description: Any, tmp_path: Path, data: st.DataObject) -> None:
+def test_every_field_of_a_captures_description(
+    capture: Path, description: Any, tmp_path: Path, data: st.DataObject
+) -> None:
     folder = tmp_path / "capture"
     if not folder.exists():
         shutil.copytree(capture, folder)
@@ -166,7 +221,9 @@ SPECIAL = (0.0, -1.0, 1e-45, 1e38, 3e38, np.nan, np.inf, -np.inf)
     value=st.sampled_from(SPECIAL),
     as_expected=st.booleans(),
 )
-def test_every_kind_of_array(capture: Path, tmp_path: Path, shape: list[int], kind: str, value: float, as_expected: bool) -> None:
+def test_every_kind_of_array(
+    capture: Path, tmp_path: Path, shape: list[int], kind: str, value: float, as_expected: bool
+) -> None:
     folder = tmp_path / "capture"
     if not folder.exists():
         shutil.copytree(capture, folder)
@@ -207,9 +264,13 @@ def plan(path: Path) -> None:
 
 @EXAMPLES
 @given(option=st.sampled_from(JOB_OPTIONS), value=VALUES, other=st.sampled_from(JOB_OPTIONS), another=VALUES)
-def test_every_option_of_a_job(capture: Path, tmp_path: Path, option: str, value: Any, other: str, another: Any) -> None:
+def test_every_option_of_a_job(
+    capture: Path, tmp_path: Path, option: str, value: Any, other: str, another: Any
+) -> None:
     options = {"capture": str(capture), option: value, other: another}
-    (tmp_path / "JOB.toml").write_text("".join(f"{name} = {toml(value)}\n" for name, value in options.items()), errors="replace")
+    (tmp_path / "JOB.toml").write_text(
+        "".join(f"{name} = {toml(value)}\n" for name, value in options.items()), errors="replace"
+    )
     plan(tmp_path / "JOB.toml")
 
 
@@ -226,7 +287,9 @@ def test_every_option_of_a_job(capture: Path, tmp_path: Path, option: str, value
 )
 def test_every_option_of_a_rig(capture: Path, tmp_path: Path, rig: dict[str, Any], simulation: dict[str, Any]) -> None:
     options = {"mouth": str(capture), **rig, "simulation": simulation}
-    (tmp_path / "JOB.toml").write_text("[rig]\n" + "".join(f"{name} = {toml(value)}\n" for name, value in options.items()), errors="replace")
+    (tmp_path / "JOB.toml").write_text(
+        "[rig]\n" + "".join(f"{name} = {toml(value)}\n" for name, value in options.items()), errors="replace"
+    )
     plan(tmp_path / "JOB.toml")
 
 
@@ -237,7 +300,9 @@ def test_every_text_as_a_job_file(tmp_path: Path, text: str) -> None:
     plan(tmp_path / "JOB.toml")
 
 
-SETTING = st.lists(st.sampled_from(["SERVER", "CLIENT", "PORT", "DOME", "RATES", "HOST", "TOKEN", "", "X"]), min_size=1, max_size=4).map("__".join)
+SETTING = st.lists(
+    st.sampled_from(["SERVER", "CLIENT", "PORT", "DOME", "RATES", "HOST", "TOKEN", "", "X"]), min_size=1, max_size=4
+).map("__".join)
 
 
 @EXAMPLES

@@ -12,7 +12,9 @@ from services.api.openapi import STORED, describe
 
 
 def test_the_stored_description_is_current() -> None:
-    assert json.loads(STORED.read_text()) == json.loads(json.dumps(describe())), "routes have changed: run python -m services.api.openapi"
+    assert json.loads(STORED.read_text()) == json.loads(json.dumps(describe())), (
+        "routes have changed: run python -m services.api.openapi"
+    )
 
 
 NAMED_ANEW = {413: "Content Too Large", 414: "URI Too Long", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
@@ -23,11 +25,16 @@ def test_the_description_is_the_same_on_every_python(monkeypatch: pytest.MonkeyP
     for status, name in NAMED_ANEW.items():
         monkeypatch.setitem(http.client.responses, status, name)
     assert not set(NAMED_ANEW.values()) & {
-        response["description"] for path in describe()["paths"].values() for operation in path.values() for response in operation["responses"].values()
+        response["description"]
+        for path in describe()["paths"].values()
+        for operation in path.values()
+        for response in operation["responses"].values()
     }
 
 
-@pytest.mark.parametrize(("status", "title"), [(413, "Request Entity Too Large"), (422, "Unprocessable Entity"), (404, "Not Found")])
+@pytest.mark.parametrize(
+    ("status", "title"), [(413, "Request Entity Too Large"), (422, "Unprocessable Entity"), (404, "Not Found")]
+)
 def test_a_problem_has_the_same_title_on_every_python(status: int, title: str) -> None:
     assert Problem.of(status, "some-code", "A sentence.", "/").title == title
 

@@ -44,11 +44,22 @@ class House:
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     data, folder = tmp_path_factory.mktemp("data"), write_capture(tmp_path_factory.mktemp("capture"))
-    tokens = {(whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group) for whose, group in GROUPS.items() for scope in Scope}
+    tokens = {
+        (whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group)
+        for whose, group in GROUPS.items()
+        for scope in Scope
+    }
     with guarded(data, run_to_report, rates=RateSettings(refusals_per_minute=10_000)) as server:
-        with httpx.Client(base_url=server.client.base_url, headers={"Authorization": f"Bearer {tokens['own', Scope.SUBMIT]}"}, timeout=60) as own:
+        with httpx.Client(
+            base_url=server.client.base_url,
+            headers={"Authorization": f"Bearer {tokens['own', Scope.SUBMIT]}"},
+            timeout=60,
+        ) as own:
             capture = upload_capture(own, contents_of(folder))
-            jobs = [own.post("/v1/jobs", json={"capture": f"captures/{capture}", "seed": seed}).json()["id"] for seed in (1, 2)]
+            jobs = [
+                own.post("/v1/jobs", json={"capture": f"captures/{capture}", "seed": seed}).json()["id"]
+                for seed in (1, 2)
+            ]
             for job in jobs:
                 own.get(f"/v1/jobs/{job}/events")
             receipt = own.delete(f"/v1/jobs/{jobs[1]}").json()["job"]
@@ -69,7 +80,14 @@ def operations(house: House) -> list[tuple[str, str, Scope]]:
 
 def path_of(template: str, ids: Mapping[str, str], receipt: str) -> str:
     ids = {**ids, "job_id": receipt} if template.startswith("/v1/deletions") else ids
-    others = {"number": "0", "path": "report.html", "preview_id": "1", "picture": "render", "camera": "c0", "light": "l0"}
+    others = {
+        "number": "0",
+        "path": "report.html",
+        "preview_id": "1",
+        "picture": "render",
+        "camera": "c0",
+        "light": "l0",
+    }
     return template.format(**others | ids)
 
 
@@ -78,7 +96,9 @@ def told(answer: httpx.Response, ids: Mapping[str, str], receipt: str) -> tuple[
     text = answer.text
     for name in {*ids.values(), receipt}:
         text = text.replace(name, "ID")
-    headers = {name: value for name, value in answer.headers.items() if name not in {"x-request-id", "date", "content-length"}}
+    headers = {
+        name: value for name, value in answer.headers.items() if name not in {"x-request-id", "date", "content-length"}
+    }
     return answer.status_code, text, headers
 
 
@@ -102,7 +122,9 @@ def test_every_route_with_every_scope_for_every_owner(house: House) -> None:
             if needed in scope.included and not (scope is Scope.ADMIN and f"{method} {template}" in LAST):
                 answer = house.ask(method, there, whose, scope)
                 assert answer.status_code != 403, f"{method} {template} as {scope} of {whose}: {answer.text}"
-                is_lost = re.search(r'"code":"(job|capture)-unknown"', answer.text) and not re.search("has no (artifact|upload|render)", answer.text)
+                is_lost = re.search(r'"code":"(job|capture)-unknown"', answer.text) and not re.search(
+                    "has no (artifact|upload|render)", answer.text
+                )
                 assert not is_lost, f"{method} {template} as {scope} of {whose}: {answer.text}"
 
 
@@ -110,7 +132,11 @@ def test_every_route_with_every_scope_for_every_owner(house: House) -> None:
 def fresh(tmp_path: Path) -> Iterator[House]:
     """A server of its own, for what changes who has what."""
     data = tmp_path / "data"
-    tokens = {(whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group) for whose, group in GROUPS.items() for scope in Scope}
+    tokens = {
+        (whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group)
+        for whose, group in GROUPS.items()
+        for scope in Scope
+    }
     with guarded(data, run_to_report) as server:
         yield House(server, tokens, {}, "")
 
@@ -121,7 +147,9 @@ def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     made = {}
     for whose in GROUPS:
         with httpx.Client(
-            base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"}, timeout=60
+            base_url=fresh.server.client.base_url,
+            headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"},
+            timeout=60,
         ) as client:
             capture = upload_capture(client, contents)
             job = client.post("/v1/jobs", json={"capture": f"captures/{capture}"}, headers={"Idempotency-Key": "one"})
@@ -133,7 +161,9 @@ def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     assert len({capture for capture, _, _ in made.values()}) == 3  # the same files, and no capture in common
 
     def seen(whose: str, scope: Scope) -> tuple[set[str], ...]:
-        answers = [fresh.ask("GET", path, whose, scope).json() for path in ("/v1/captures", "/v1/jobs", "/v1/calibrations")]
+        answers = [
+            fresh.ask("GET", path, whose, scope).json() for path in ("/v1/captures", "/v1/jobs", "/v1/calibrations")
+        ]
         return tuple({one["id"] for one in found} for found in (answers[0]["captures"], answers[1]["jobs"], answers[2]))
 
     for whose in ("own", "other"):
@@ -143,16 +173,25 @@ def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     assert seen("alone", Scope.READ) == (set(), set(), set())  # another token, in no group
     assert seen("other", Scope.ADMIN) == tuple(set(column) for column in zip(*made.values(), strict=True))
 
-    for option, theirs in (("capture", f"captures/{made['own'][0]}"), ("rig", {"mouth": f"captures/{made['own'][0]}", "dome": "simulated"})):
+    for option, theirs in (
+        ("capture", f"captures/{made['own'][0]}"),
+        ("rig", {"mouth": f"captures/{made['own'][0]}", "dome": "simulated"}),
+    ):
         refused = fresh.ask("POST", "/v1/jobs", "other", Scope.SUBMIT, json={option: theirs})
         assert (refused.status_code, "There is no capture" in refused.json()["detail"]) == (422, True), refused.text
     foreign = {"capture": f"captures/{made['other'][0]}", "calibration": f"calibrations/{made['own'][2]}"}
     refused = fresh.ask("POST", "/v1/jobs", "other", Scope.SUBMIT, json=foreign)
     assert (refused.status_code, "there is no calibrations/" in refused.json()["detail"]) == (422, True), refused.text
-    metadata = {"Upload-Length": "1", "Upload-Metadata": f"capture {_base64(made['own'][0])},path {_base64('capture.json')}"} | TUS
+    metadata = {
+        "Upload-Length": "1",
+        "Upload-Metadata": f"capture {_base64(made['own'][0])},path {_base64('capture.json')}",
+    } | TUS
     assert fresh.ask("POST", "/v1/uploads", "other", Scope.SUBMIT, headers=metadata).json()["code"] == "capture-unknown"
     assert fresh.ask("GET", "/v1/workers", "other", Scope.READ).status_code == 200
-    streams = [fresh.ask("GET", f"/v1/events?job={job}", "other", Scope.READ).text for job in (made["own"][1], UNKNOWN["job_id"])]
+    streams = [
+        fresh.ask("GET", f"/v1/events?job={job}", "other", Scope.READ).text
+        for job in (made["own"][1], UNKNOWN["job_id"])
+    ]
     assert streams[0].replace(made["own"][1], "ID") == streams[1].replace(UNKNOWN["job_id"], "ID")
     assert streams[0].count("event:") == 1
     assert '"SUCCEEDED"' in fresh.ask("GET", f"/v1/events?job={made['other'][1]}", "other", Scope.READ).text
@@ -165,10 +204,16 @@ def _base64(text: str) -> str:
 
 
 @pytest.mark.attack("uploads", "another's content by its SHA-256 alone")
-def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_here(fresh: House, tmp_path: Path) -> None:
+def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_here(
+    fresh: House, tmp_path: Path
+) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
     own, other = (
-        httpx.Client(base_url=fresh.server.client.base_url, headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"}, timeout=60)
+        httpx.Client(
+            base_url=fresh.server.client.base_url,
+            headers={"Authorization": f"Bearer {fresh.tokens[whose, Scope.SUBMIT]}"},
+            timeout=60,
+        )
         for whose in ("own", "other")
     )
     with own, other:
@@ -202,21 +247,39 @@ def test_folders_of_the_server_are_for_those_who_may_name_them(tmp_path: Path) -
     with guarded(data, run, job_roots=f"{root}, {tmp_path / 'data' / 'jobs'}") as server:
         taken = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": str(root / "mouth")})
         assert taken.status_code == 201, taken.text
-        names = (beside / "mouth", beside / "absent", root / ".." / "beside" / "mouth", root / "way-out" / "mouth", data / "jobs", "/etc/passwd\0")
+        names = (
+            beside / "mouth",
+            beside / "absent",
+            root / ".." / "beside" / "mouth",
+            root / "way-out" / "mouth",
+            data / "jobs",
+            "/etc/passwd\0",
+        )
         refusals = {
             re.sub(r"'[\w.]+'", "", server.ask("POST", "/v1/jobs", scope, json=asked).json()["detail"])
             for scope in (Scope.SUBMIT, Scope.ADMIN)
             for path in names
-            for asked in ({"capture": str(path)}, {"rig": {"mouth": str(path), "dome": "simulated"}}, {"capture": str(root), "calibration": str(path)})
+            for asked in (
+                {"capture": str(path)},
+                {"rig": {"mouth": str(path), "dome": "simulated"}},
+                {"capture": str(root), "calibration": str(path)},
+            )
         }
         assert len(refusals) == 1, refusals
         assert "takes no folder of its own there" in refusals.pop()
 
         job = taken.json()["id"]
-        for scope, shown in ((Scope.READ, "mouth"), (Scope.SUBMIT, str(root / "mouth")), (Scope.ADMIN, str(root / "mouth"))):
+        for scope, shown in (
+            (Scope.READ, "mouth"),
+            (Scope.SUBMIT, str(root / "mouth")),
+            (Scope.ADMIN, str(root / "mouth")),
+        ):
             listed = server.ask("GET", "/v1/jobs", scope).json()["jobs"][0]["spec"]["capture"]
             assert (listed, server.ask("GET", f"/v1/jobs/{job}", scope).json()["spec"]["capture"]) == (shown, shown)
-            found = {text: len(server.ask("GET", "/v1/jobs", scope, params={"capture": text}).json()["jobs"]) for text in ("MOUTH", "captures-root")}
+            found = {
+                text: len(server.ask("GET", "/v1/jobs", scope, params={"capture": text}).json()["jobs"])
+                for text in ("MOUTH", "captures-root")
+            }
             assert found == {"MOUTH": 1, "captures-root": int(scope is not Scope.READ)}
         events = server.ask("GET", f"/v1/jobs/{job}/events", Scope.READ).text
         failure = server.ask("GET", f"/v1/jobs/{job}", Scope.READ).json()["failure"]["message"]
@@ -235,7 +298,10 @@ def test_without_roots_a_server_with_tokens_takes_no_folder(tmp_path: Path) -> N
 @pytest.mark.attack("tokens", "a copied cookie after signing out")
 def test_a_session_that_was_signed_out_opens_nothing(tmp_path: Path) -> None:
     with guarded(tmp_path) as server:
-        cookie, other = ({"Cookie": server.ask("POST", "/v1/session", Scope.READ).headers["set-cookie"].split(";")[0]} for _ in range(2))
+        cookie, other = (
+            {"Cookie": server.ask("POST", "/v1/session", Scope.READ).headers["set-cookie"].split(";")[0]}
+            for _ in range(2)
+        )
         assert server.client.get("/v1/jobs", headers=cookie).status_code == 200
         here = cookie | {"Origin": str(server.client.base_url).rstrip("/")}
         assert server.client.delete("/v1/session", headers=here).status_code == 204

@@ -139,12 +139,22 @@ def main() -> None:
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one; may be repeated")
     parser.add_argument("--stage", action="append", choices=STAGES, help="only in this stage; may be repeated")
     arguments = parser.parse_args()
-    cells = [cell for cell in all_cells() if (not arguments.fault or cell[0] in arguments.fault) and (not arguments.stage or cell[1] in arguments.stage)]
+    cells = [
+        cell
+        for cell in all_cells()
+        if (not arguments.fault or cell[0] in arguments.fault) and (not arguments.stage or cell[1] in arguments.stage)
+    ]
     done: list[Cell] = []
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, small_system(Path(folder), on_hosts=True) as system:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        small_system(Path(folder), on_hosts=True) as system,
+    ):
         for cell in run_cells(system, cells):
             done.append(cell)
-            print(f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}", flush=True)
+            print(
+                f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}",
+                flush=True,
+            )
             arguments.json.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n")
         late = [fault for cell in done for fault in _store_faults(system.data / "jobs" / cell.job, cell.attempts)]
     good = sum(not cell.faults for cell in done)

@@ -71,7 +71,8 @@ class Held:
     def require_pause(self, what: str) -> None:
         """Wait until the API says that the job waits for something."""
         self.system.wait_until(
-            lambda: str(self.get(f"/v1/jobs/{self.job}").get("waits_for")).startswith(f"Waits for {what}: "), f"job {self.job} does not wait for {what}"
+            lambda: str(self.get(f"/v1/jobs/{self.job}").get("waits_for")).startswith(f"Waits for {what}: "),
+            f"job {self.job} does not wait for {what}",
         )
 
     def require_bad(self, *parts: str) -> None:
@@ -108,7 +109,9 @@ def worker_cut_off(held: Held) -> Iterator[None]:
         if held.stage == "capture":
             held.outlast()
         else:
-            held.system.wait_until(lambda: held.reached.read_text() not in {"", str(held.pid)}, f"nobody else began stage {held.stage}")
+            held.system.wait_until(
+                lambda: held.reached.read_text() not in {"", str(held.pid)}, f"nobody else began stage {held.stage}"
+            )
         yield
 
 

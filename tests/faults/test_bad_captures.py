@@ -24,7 +24,18 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "tooth"
-    write_phantom(folder, pixel_mm=0.8, cameras=2, lights=5, held_out=1, channels=1, boundary="matched", renderer="engine", samples=512, seed=1)
+    write_phantom(
+        folder,
+        pixel_mm=0.8,
+        cameras=2,
+        lights=5,
+        held_out=1,
+        channels=1,
+        boundary="matched",
+        renderer="engine",
+        samples=512,
+        seed=1,
+    )
     return folder
 
 
@@ -32,12 +43,20 @@ def fit(root: Path, capture: Path, damage: Callable[[Path], None], **options: An
     """Fit a damaged copy of a capture; returns the report and its page."""
     shutil.copytree(capture, root / "capture")
     damage(root / "capture")
-    short: dict[str, Any] = {"boundary": "matched", "dentin": "known", "samples_per_pixel": 16, "max_samples_per_pixel": 128, "max_steps": 3}
+    short: dict[str, Any] = {
+        "boundary": "matched",
+        "dentin": "known",
+        "samples_per_pixel": 16,
+        "max_samples_per_pixel": 128,
+        "max_steps": 3,
+    }
     spec = JobSpec(capture=root / "capture", search_candidates=1000, advise=False, **(short | options))
     for stage in (prepare, run, export):
         stage(spec, LocalContext(root / "job"))
     page = (root / "job" / "report.html").read_text()
-    return FitReport.model_validate_json(json.dumps(json.loads((root / "job" / "fit" / "manifest.json").read_text())["record"])), page
+    return FitReport.model_validate_json(
+        json.dumps(json.loads((root / "job" / "fit" / "manifest.json").read_text())["record"])
+    ), page
 
 
 def move_meshes(offset_mm: tuple[float, float, float]) -> Callable[[Path], None]:

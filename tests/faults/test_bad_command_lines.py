@@ -26,11 +26,18 @@ AT_WORK_S = 30.0
 """A drawn call that is still at work after this time is ended: it was taken."""
 
 
-def call(*arguments: str, environment: Mapping[str, str] | None = None, folder: Path | None = None, patience_s: float = PATIENCE_S) -> tuple[int | None, str]:
+def call(
+    *arguments: str,
+    environment: Mapping[str, str] | None = None,
+    folder: Path | None = None,
+    patience_s: float = PATIENCE_S,
+) -> tuple[int | None, str]:
     """Exit status and standard error of one call; no status where it went to work."""
     command = [sys.executable, "-m", "services", *arguments]
     where = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])} | (environment or {})
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=where, cwd=folder) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=where, cwd=folder
+    ) as process:
         try:
             told = process.communicate(timeout=patience_s)[1]
         except subprocess.TimeoutExpired:
@@ -55,16 +62,31 @@ def mouth(folder: Path) -> str:
 
 
 BAD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
-    "brackets 5,000 deep": (lambda folder: ["run", text(folder, "x = " + "[" * 5000 + "]" * 5000), "--out", "out"], "nests brackets too deeply"),
-    "NUL in a path": (lambda folder: ["run", text(folder, 'capture = "a\\u0000b"'), "--out", "out"], "'capture' holds the character NUL"),
-    "no channel": (lambda folder: ["run", text(folder, 'capture = "x"\nchannels = []'), "--out", "out"], "'channels' is empty"),
+    "brackets 5,000 deep": (
+        lambda folder: ["run", text(folder, "x = " + "[" * 5000 + "]" * 5000), "--out", "out"],
+        "nests brackets too deeply",
+    ),
+    "NUL in a path": (
+        lambda folder: ["run", text(folder, 'capture = "a\\u0000b"'), "--out", "out"],
+        "'capture' holds the character NUL",
+    ),
+    "no channel": (
+        lambda folder: ["run", text(folder, 'capture = "x"\nchannels = []'), "--out", "out"],
+        "'channels' is empty",
+    ),
     "results into a file": (lambda folder: ["run", job(folder), "--out", "JOB.toml"], "JOB.toml is a file"),
     "results below a file": (lambda folder: ["run", job(folder), "--out", "JOB.toml/out"], "JOB.toml is a file"),
-    "results into the capture": (lambda folder: ["run", job(folder, mouth(folder)), "--out", "mouth/out"], "mouth/out lies in"),
+    "results into the capture": (
+        lambda folder: ["run", job(folder, mouth(folder)), "--out", "mouth/out"],
+        "mouth/out lies in",
+    ),
     "phantom into a file": (lambda folder: ["phantom", "--out", job(folder)], "JOB.toml is a file"),
     "name beyond all file systems": (lambda folder: ["run", job(folder), "--out", "x" * 300], "cannot be a folder"),
     "worker of nobody": (lambda _: ["worker", "--nthreads", "1"], "No scheduler is named"),
-    "data that cannot be made": (lambda folder: ["serve", "--port", "0", "--data", f"{job(folder)}/data"], "cannot use its data folder"),
+    "data that cannot be made": (
+        lambda folder: ["serve", "--port", "0", "--data", f"{job(folder)}/data"],
+        "cannot use its data folder",
+    ),
 }
 
 
@@ -79,7 +101,10 @@ def test_bad_calls_end_in_one_sentence(case: str, tmp_path: Path) -> None:
 
 
 def test_a_group_and_one_of_its_values_are_not_both_set(tmp_path: Path) -> None:
-    for both in ({"DENTINE__SERVER": "x", "DENTINE__SERVER__PORT": "1"}, {"DENTINE__SERVER__PORT": "1", "DENTINE__SERVER": "x"}):
+    for both in (
+        {"DENTINE__SERVER": "x", "DENTINE__SERVER__PORT": "1"},
+        {"DENTINE__SERVER__PORT": "1", "DENTINE__SERVER": "x"},
+    ):
         status, told = call("serve", environment=both, folder=tmp_path)
         assert status == 2
         assert told.startswith("dentine: Setting DENTINE__SERVER")
@@ -99,7 +124,9 @@ def test_a_group_and_one_of_its_values_are_not_both_set(tmp_path: Path) -> None:
         (["host"], {}, False),
     ],
 )
-def test_a_scheduler_is_named_in_any_of_dasks_ways(arguments: list[str], environment: dict[str, str], is_named: bool) -> None:
+def test_a_scheduler_is_named_in_any_of_dasks_ways(
+    arguments: list[str], environment: dict[str, str], is_named: bool
+) -> None:
     if is_named:
         require_scheduler_named(arguments, environment)
     else:
@@ -107,20 +134,26 @@ def test_a_scheduler_is_named_in_any_of_dasks_ways(arguments: list[str], environ
             require_scheduler_named(arguments, environment)
 
 
-@pytest.mark.parametrize("problem", [OSError(28, "No space left on device"), OperationalError("", {}, Exception("database or disk is full"))])
+@pytest.mark.parametrize(
+    "problem", [OSError(28, "No space left on device"), OperationalError("", {}, Exception("database or disk is full"))]
+)
 def test_a_server_on_a_full_disk_says_so(problem: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise problem
 
     monkeypatch.setattr(server, "create_app", fail)
-    with pytest.raises(PlatformError, match=r"cannot use its data folder .* \((No space left|database or disk is full).*free some disk"):
+    with pytest.raises(
+        PlatformError, match=r"cannot use its data folder .* \((No space left|database or disk is full).*free some disk"
+    ):
         server.serve(ServerSettings(data=tmp_path / "data", port=0))
 
 
 @pytest.mark.parametrize("lengths", ["[1e400]", "[1e300]", "[-1e400, 2]", "[[1]]", '["x"]', "[null]", "{}", "[" * 500])
 def test_a_stored_array_of_any_shape_is_a_sentence(lengths: str, tmp_path: Path) -> None:
     path = tmp_path / "zarr.json"
-    path.write_text(f'{{"node_type": "array", "data_type": "uint16", "chunk_grid": {{"configuration": {{"chunk_shape": {lengths}}}}}}}')
+    path.write_text(
+        f'{{"node_type": "array", "data_type": "uint16", "chunk_grid": {{"configuration": {{"chunk_shape": {lengths}}}}}}}'
+    )
     told = content_fault(path, "capture.zarr/zarr.json", UploadLimits(), frozenset())
     assert told is None or told.endswith(".")
     assert lengths == "{}" or told is not None
@@ -130,13 +163,37 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "run": ("--out", "--workers", "--json"),
     "capture": ("--out",),
     "export": (),
-    "phantom": ("--out", "--jaw", "--subject", "--scan", "--pixel-mm", "--cameras", "--lights", "--held-out", "--channels", "--samples", "--outer", "--fdi"),
+    "phantom": (
+        "--out",
+        "--jaw",
+        "--subject",
+        "--scan",
+        "--pixel-mm",
+        "--cameras",
+        "--lights",
+        "--held-out",
+        "--channels",
+        "--samples",
+        "--outer",
+        "--fdi",
+    ),
     "upload": ("--server", "--subject"),
     "submit": ("--server", "--key", "--calibration"),
     "watch": ("--server",),
     "cancel": ("--server",),
     "bench": ("--json", "--case", "--quick"),
-    "simulate slab": ("--sigma", "--alpha", "--width", "--layers", "--g", "--ior", "--exit-cosines", "--ring-edges", "--rel-error", "--max-seconds"),
+    "simulate slab": (
+        "--sigma",
+        "--alpha",
+        "--width",
+        "--layers",
+        "--g",
+        "--ior",
+        "--exit-cosines",
+        "--ring-edges",
+        "--rel-error",
+        "--max-seconds",
+    ),
     "token create": ("--scope", "--expires-days", "--group", "--data"),
     "token revoke": ("--data",),
     "dome-sim": ("--port", "--lights", "--watchdog-s", "--host"),

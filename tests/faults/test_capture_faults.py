@@ -78,7 +78,14 @@ def require_dark_within_watchdog(observer: DomeObserver, since_s: float) -> None
     ],
 )
 def test_a_fault_ends_in_its_error_and_in_the_dark(
-    address: Address, observer: DomeObserver, kind: FaultKind, argument: int, times: int, on: reg.Register | None, error: type[RigError], words: str
+    address: Address,
+    observer: DomeObserver,
+    kind: FaultKind,
+    argument: int,
+    times: int,
+    on: reg.Register | None,
+    error: type[RigError],
+    words: str,
 ) -> None:
     def light_into_the_fault() -> None:
         with open_dome(address) as dome:
@@ -105,7 +112,9 @@ def test_a_fault_ends_in_its_error_and_in_the_dark(
         (FaultKind.DROP_REPLY, 0, reg.OUTPUTS),
     ],
 )
-def test_what_the_readback_settles_does_not_stop_a_capture(address: Address, observer: DomeObserver, kind: FaultKind, argument: int, on: reg.Register) -> None:
+def test_what_the_readback_settles_does_not_stop_a_capture(
+    address: Address, observer: DomeObserver, kind: FaultKind, argument: int, on: reg.Register
+) -> None:
     with open_dome(address) as dome:
         order_fault(*address, kind, argument, 1, on)
         dome.light(3, 0.5, 0.5)
@@ -113,7 +122,9 @@ def test_what_the_readback_settles_does_not_stop_a_capture(address: Address, obs
     assert not observer.outputs().any()
 
 
-@pytest.mark.parametrize("kind", [FaultKind.DROP_REQUEST, FaultKind.DROP_REPLY, FaultKind.WRONG_REPLY, FaultKind.EXCEPTION])
+@pytest.mark.parametrize(
+    "kind", [FaultKind.DROP_REQUEST, FaultKind.DROP_REPLY, FaultKind.WRONG_REPLY, FaultKind.EXCEPTION]
+)
 def test_all_off_is_insisted_on(address: Address, observer: DomeObserver, kind: FaultKind) -> None:
     with open_dome(address) as dome:
         dome.light(3, 0.5, 0.5)
@@ -202,9 +213,16 @@ with ModbusDome("127.0.0.1", int(sys.argv[1]), ExposureBudget(1e3, 1e3), watchdo
 """
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 128 + signal.SIGHUP), (signal.SIGINT, -signal.SIGINT)])
-def test_a_signal_goes_dark_before_the_process_ends(address: Address, observer: DomeObserver, number: signal.Signals, status: int) -> None:
-    with subprocess.Popen([sys.executable, "-c", SIGNALLED, str(address[1])], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 128 + signal.SIGHUP), (signal.SIGINT, -signal.SIGINT)],
+)
+def test_a_signal_goes_dark_before_the_process_ends(
+    address: Address, observer: DomeObserver, number: signal.Signals, status: int
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", SIGNALLED, str(address[1])], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"lit\n"
         assert observer.outputs()[3].all()

@@ -100,7 +100,9 @@ def test_killed_in_mid_exposure(tmp_path: Path) -> None:
     exposed = [event.data["frame"] for event in events if event.kind == "progress"]
     assert exposed == list(range(len(acknowledged), len(fresh.frames)))
     untimed = {"time_s": 0.0}
-    assert [f.model_copy(update=untimed) for f in resumed.frames] == [f.model_copy(update=untimed) for f in fresh.frames]
+    assert [f.model_copy(update=untimed) for f in resumed.frames] == [
+        f.model_copy(update=untimed) for f in fresh.frames
+    ]
     assert [f.time_s for f in resumed.frames[: len(acknowledged)]] == [line["frame"]["time_s"] for line in acknowledged]
     arrays = [zarr.open_array(root / "capture" / "capture.zarr", mode="r")[:] for root in (killed, undisturbed)]
     assert np.array_equal(*arrays)

@@ -42,7 +42,12 @@ def listening() -> set[int]:
     """Ports on which this process and what it started listen."""
     here = psutil.Process()
     those = [here, *here.children(recursive=True)]
-    return {one.laddr.port for process in those for one in process.net_connections("tcp") if one.status == psutil.CONN_LISTEN}
+    return {
+        one.laddr.port
+        for process in those
+        for one in process.net_connections("tcp")
+        if one.status == psutil.CONN_LISTEN
+    }
 
 
 @pytest.mark.attack("Dask and files as another user", "every port of the workers, as another user")
@@ -53,7 +58,14 @@ def test_whoever_shows_no_certificate_is_refused_on_every_port() -> None:
         opened = listening() - before
         assert len(opened) >= 3  # scheduler and two workers
         targets = json.dumps([["127.0.0.1", port] for port in opened])
-        told = subprocess.run([PYTHON, "-c", STRANGER.read_text(), targets], capture_output=True, text=True, check=True, cwd="/", **OTHER_USER)
+        told = subprocess.run(
+            [PYTHON, "-c", STRANGER.read_text(), targets],
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd="/",
+            **OTHER_USER,
+        )
         assert set(json.loads(told.stdout).values()) == {"tls refuses"}, told.stdout
 
 
@@ -65,14 +77,19 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
     try:
         with log.open("w") as stream:
             limits = {"most": PLACES, "header_s": HEADER_S}
-            with toy_server(data, stream, connections=limits, dome={"address": "simulated", "watchdog_s": 60}) as (client, _):
+            with toy_server(data, stream, connections=limits, dome={"address": "simulated", "watchdog_s": 60}) as (
+                client,
+                _,
+            ):
                 yield client, data
     finally:
         os.umask(before)
 
 
 @pytest.mark.attack("Dask and files as another user", "files of the service and its workers")
-def test_what_the_service_and_its_workers_write_is_for_its_user_alone(served: tuple[httpx.Client, Path], tmp_path: Path) -> None:
+def test_what_the_service_and_its_workers_write_is_for_its_user_alone(
+    served: tuple[httpx.Client, Path], tmp_path: Path
+) -> None:
     client, data = served
     capture = upload_capture(client, contents_of(write_capture(tmp_path / "capture")))
     job = client.post("/v1/jobs", json={"capture": f"captures/{capture}", "workers": 1}).json()["id"]
@@ -142,7 +159,9 @@ def is_closed(connection: socket.socket) -> bool:
 
 
 @pytest.mark.attack("exhaustion", "a head that never ends")
-def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(served: tuple[httpx.Client, Path]) -> None:
+def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(
+    served: tuple[httpx.Client, Path],
+) -> None:
     client, _ = served
     began = time.monotonic()
     (slow,) = half_open(client.base_url, 1)
@@ -166,7 +185,10 @@ def test_a_lack_of_descriptors_is_told_once(caplog: pytest.LogCaptureFixture) ->
     async def run_out() -> int:
         loop, crowd = asyncio.get_running_loop(), Crowd(ConnectionLimits())
         loop.set_exception_handler(crowd.handle_exception)
-        context = {"message": "socket.accept() out of system resource", "exception": OSError(errno.EMFILE, "Too many open files")}
+        context = {
+            "message": "socket.accept() out of system resource",
+            "exception": OSError(errno.EMFILE, "Too many open files"),
+        }
         for _ in range(5000):
             loop.call_exception_handler(context)
         told = len(caplog.records)

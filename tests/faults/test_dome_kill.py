@@ -43,12 +43,20 @@ def test_killed_under_light(tmp_path: Path, killed: str) -> None:
 
 
 def kill(killed: str, data: Path, address: tuple[str, int], observer: DomeObserver) -> None:
-    settings = ServerSettings(data=data, port=0, dome=DomeSettings(address=f"{address[0]}:{address[1]}", watchdog_s=WATCHDOG_S))
-    with subprocess.Popen([sys.executable, "-c", SERVER, settings.model_dump_json()], stdout=subprocess.PIPE, text=True) as process:
+    settings = ServerSettings(
+        data=data, port=0, dome=DomeSettings(address=f"{address[0]}:{address[1]}", watchdog_s=WATCHDOG_S)
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER, settings.model_dump_json()], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         with connect(process.stdout.readline().strip()) as client:
             client.put("/v1/dome/light", json={"light": 3, "on_s": 30}).raise_for_status()
-            console = next(child for child in psutil.Process(process.pid).children() if "services.capture.console" in child.cmdline())
+            console = next(
+                child
+                for child in psutil.Process(process.pid).children()
+                if "services.capture.console" in child.cmdline()
+            )
             assert observer.status().lit == (3,)
             os.kill(process.pid if killed == "server" else console.pid, signal.SIGKILL)
             killed_s = time.monotonic()

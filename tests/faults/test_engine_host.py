@@ -29,7 +29,10 @@ MIB = 2**20
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> StoredFile:
-    return write_recipe(tmp_path_factory.mktemp("recipe"), single_tooth(build_incisor().outer, None, np.array([[0.0, 0.0, 99.0]]), np.ones(1)))
+    return write_recipe(
+        tmp_path_factory.mktemp("recipe"),
+        single_tooth(build_incisor().outer, None, np.array([[0.0, 0.0, 99.0]]), np.ones(1)),
+    )
 
 
 @pytest.fixture
@@ -52,7 +55,9 @@ def test_a_process_that_outgrows_its_share_is_ended_with_evidence(recipe: Stored
     host.close()
 
 
-def test_an_exception_that_cannot_be_sent_is_told_in_words_and_the_process_stays(host: ChildHost, recipe: StoredFile) -> None:
+def test_an_exception_that_cannot_be_sent_is_told_in_words_and_the_process_stays(
+    host: ChildHost, recipe: StoredFile
+) -> None:
     assert host.call("answer", recipe, 1) == 1
     child = host.pid
     with pytest.raises(RuntimeError, match="PickyError: refused with code 7"):
@@ -86,7 +91,9 @@ def test_closing_does_not_wait_for_a_kernel(recipe: StoredFile, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT, signal.SIGKILL])
-def test_a_crash_is_told_by_its_signal_after_a_second_try(host: ChildHost, recipe: StoredFile, number: signal.Signals) -> None:
+def test_a_crash_is_told_by_its_signal_after_a_second_try(
+    host: ChildHost, recipe: StoredFile, number: signal.Signals
+) -> None:
     before = memory_kills()
     with pytest.raises(CrashError, match=f"ended by {number.name} twice") as failure:
         host.call("die", recipe, int(number))
@@ -95,7 +102,9 @@ def test_a_crash_is_told_by_its_signal_after_a_second_try(host: ChildHost, recip
     assert host.call("answer", recipe, 4) == 4
 
 
-def test_a_kill_that_the_system_counts_as_one_for_memory_is_told_as_that(host: ChildHost, recipe: StoredFile, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_that_the_system_counts_as_one_for_memory_is_told_as_that(
+    host: ChildHost, recipe: StoredFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # The system's counter moves while the process is killed; nothing in the process differs from any other kill.
     counted = iter([7, 8])
     monkeypatch.setattr("services.fit.execution.engine_process.memory_kills", lambda: next(counted))
@@ -108,10 +117,16 @@ def test_evidence_survives_pickling() -> None:
 
     told = pickle.loads(pickle.dumps(MemoryKillError("Too large; take less.", {"peak_memory_bytes": 5})))
     assert isinstance(told, ResourceError)
-    assert (str(told), told.message, dict(told.evidence)) == ("Too large; take less.", "Too large; take less.", {"peak_memory_bytes": 5})
+    assert (str(told), told.message, dict(told.evidence)) == (
+        "Too large; take less.",
+        "Too large; take less.",
+        {"peak_memory_bytes": 5},
+    )
 
 
-def test_a_cancel_ends_a_kernel_and_nothing_is_started_after_it(host: ChildHost, recipe: StoredFile, tmp_path: Path) -> None:
+def test_a_cancel_ends_a_kernel_and_nothing_is_started_after_it(
+    host: ChildHost, recipe: StoredFile, tmp_path: Path
+) -> None:
     flag, started = tmp_path / "cancel", tmp_path / "started"
 
     def cancel() -> None:
@@ -142,7 +157,9 @@ def worker_pid(_host: EngineHost) -> int:
 @pytest.mark.timeout(600)
 def test_a_cancel_in_mid_kernel_leaves_the_worker_the_same_process(recipe: StoredFile, tmp_path: Path) -> None:
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50) as cluster,
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50
+        ) as cluster,
         Client(cluster) as client,
     ):
         flag, started = tmp_path / "cancel", tmp_path / "started"

@@ -86,14 +86,25 @@ def held_after_preparation(client: httpx.Client, tmp_path: Path) -> tuple[Path, 
 @pytest.mark.parametrize(
     ("damage", "told"),
     [
-        (lambda shard: shard.write_text("9\n"), "by.txt of published stage prepared differs from its published checksum"),
-        (lambda shard: os.truncate(shard, 1), "by.txt of published stage prepared has 1 bytes instead of 2 (truncated?)"),
+        (
+            lambda shard: shard.write_text("9\n"),
+            "by.txt of published stage prepared differs from its published checksum",
+        ),
+        (
+            lambda shard: os.truncate(shard, 1),
+            "by.txt of published stage prepared has 1 bytes instead of 2 (truncated?)",
+        ),
         (Path.unlink, "by.txt is missing from published stage prepared"),
-        (lambda shard: os.truncate(shard.with_name("manifest.json"), 40), "manifest.json, the list of what stage prepared published, cannot be read"),
+        (
+            lambda shard: os.truncate(shard.with_name("manifest.json"), 40),
+            "manifest.json, the list of what stage prepared published, cannot be read",
+        ),
     ],
     ids=["altered", "truncated", "removed", "its list truncated"],
 )
-def test_a_shard_damaged_between_two_stages(client: httpx.Client, data: Path, tmp_path: Path, damage: Callable[[Path], object], told: str) -> None:
+def test_a_shard_damaged_between_two_stages(
+    client: httpx.Client, data: Path, tmp_path: Path, damage: Callable[[Path], object], told: str
+) -> None:
     steering, job = held_after_preparation(client, tmp_path)
     folder = data / "jobs" / job
     damage(folder / "prepared" / "by.txt")
@@ -101,7 +112,10 @@ def test_a_shard_damaged_between_two_stages(client: httpx.Client, data: Path, tm
 
     ended = await_end(client, job)
     assert (ended["state"], ended["failure"]["code"], ended["failure"]["stage"]) == ("FAILED", "store-corrupt", "fit")
-    assert ended["failure"]["message"] == f"{folder}/prepared/{told}; restore it, or retry the job, which then makes prepared anew."
+    assert (
+        ended["failure"]["message"]
+        == f"{folder}/prepared/{told}; restore it, or retry the job, which then makes prepared anew."
+    )
     assert (steering / "publications.txt").read_text().split() == ["prepare"]
 
     client.post(f"/v1/jobs/{job}/retry").raise_for_status()
@@ -110,7 +124,9 @@ def test_a_shard_damaged_between_two_stages(client: httpx.Client, data: Path, tm
     assert client.get(f"/v1/jobs/{job}/artifacts/report.html").status_code == 200
 
 
-def test_a_damaged_shard_that_is_restored_costs_no_preparation(client: httpx.Client, data: Path, tmp_path: Path) -> None:
+def test_a_damaged_shard_that_is_restored_costs_no_preparation(
+    client: httpx.Client, data: Path, tmp_path: Path
+) -> None:
     steering, job = held_after_preparation(client, tmp_path)
     shard = data / "jobs" / job / "prepared" / "by.txt"
     good = shard.read_bytes()
@@ -124,7 +140,9 @@ def test_a_damaged_shard_that_is_restored_costs_no_preparation(client: httpx.Cli
     assert (steering / "publications.txt").read_text().split() == ["prepare", "fit", "export"]
 
 
-def test_a_cancel_in_mid_kernel_of_the_real_engine_leaves_the_worker_the_same_process(client: httpx.Client, tmp_path: Path) -> None:
+def test_a_cancel_in_mid_kernel_of_the_real_engine_leaves_the_worker_the_same_process(
+    client: httpx.Client, tmp_path: Path
+) -> None:
     before = worker_of_next(client, tmp_path / "before")
     cancelled = cancel_once(client, tmp_path / "cancelled")
     assert cancelled.seconds < LONGEST_CANCEL_S
@@ -164,7 +182,10 @@ def test_a_want_of_disk_refuses_what_never_fits_and_loses_nothing_of_what_will(t
             job = submit(client, tmp_path / "teeth", "answer")
             while (told := client.get(f"/v1/jobs/{job}").json())["waits_for"] is None:
                 pass
-            assert (told["state"], told["waits_for"]) == ("QUEUED", "Waits for disk: about 0.3 GiB are needed and 0.1 GiB are free.")
+            assert (told["state"], told["waits_for"]) == (
+                "QUEUED",
+                "Waits for disk: about 0.3 GiB are needed and 0.1 GiB are free.",
+            )
             assert bad_parts(client) == {"disk"}
 
         while not (steering / "at-fit-middle").exists():

@@ -34,7 +34,9 @@ SLOW_MOUTH = "tests.support.fake_mouth:SlowFakeMouthEngine"
 def client() -> Iterator[Client]:
     with (
         dask.config.set({"distributed.worker.daemon": False}),
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50) as cluster,
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50
+        ) as cluster,
         Client(cluster) as client,
     ):
         yield client
@@ -89,15 +91,22 @@ def test_a_cluster_gives_the_answer_of_one_process(undisturbed: Path, tmp_path: 
     assert answer(tmp_path) == answer(undisturbed)
 
 
-@pytest.mark.parametrize("options", [{"stains": True, "loss": "robust"}, pytest.param({"solver": "adam", "adam_steps": 20}, marks=pytest.mark.slow)])
-def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(client: Client, tmp_path: Path, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{"stains": True, "loss": "robust"}, pytest.param({"solver": "adam", "adam_steps": 20}, marks=pytest.mark.slow)],
+)
+def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(
+    client: Client, tmp_path: Path, options: dict[str, Any]
+) -> None:
     # Photographs too uneven for media alone: stains and weights have something to say.
     for name in ("cluster", "here"):
         write_prepared(tmp_path / name, uneven=0.2, shadowed=0.05)
     client.submit(fit_once, tmp_path / "cluster", FAKE, pure=False, **options).result(timeout=PATIENCE_S)
     fit_once(tmp_path / "here", FAKE, **options)
     assert answer(tmp_path / "cluster") == answer(tmp_path / "here")
-    assert {row["kind"] for row in trace(tmp_path / "cluster")} >= {"stain" if "stains" in options else "gradient" if "solver" in options else "image"}
+    assert {row["kind"] for row in trace(tmp_path / "cluster")} >= {
+        "stain" if "stains" in options else "gradient" if "solver" in options else "image"
+    }
 
 
 def echo(_host: object, number: int) -> int:
@@ -110,16 +119,25 @@ def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
 
 
 @pytest.mark.slow
-def test_fits_side_by_side_give_the_answer_that_each_gives_alone(client: Client, undisturbed: Path, tmp_path: Path) -> None:
+def test_fits_side_by_side_give_the_answer_that_each_gives_alone(
+    client: Client, undisturbed: Path, tmp_path: Path
+) -> None:
     roots = [tmp_path / "first", tmp_path / "second"]
     for root in roots:
         write_prepared(root)
-    futures = [client.submit(_fit_with, root, {"priority": priority}, pure=False) for root, priority in zip(roots, ("low", "high"), strict=True)]
+    futures = [
+        client.submit(_fit_with, root, {"priority": priority}, pure=False)
+        for root, priority in zip(roots, ("low", "high"), strict=True)
+    ]
     for future in futures:
         future.result(timeout=PATIENCE_S)
     assert [answer(root) for root in roots] == [answer(undisturbed)] * 2
     first, second = (trace(root) for root in roots)
-    assert any(a["worker"] != b["worker"] and min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"]) for a in first for b in second)
+    assert any(
+        a["worker"] != b["worker"] and min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"])
+        for a in first
+        for b in second
+    )
 
 
 def test_blocks_run_only_where_their_stage_may(client: Client, tmp_path: Path) -> None:
@@ -232,4 +250,6 @@ def await_attempt(root: Path, attempt: int) -> None:
 
 
 def _children(dask_worker: Any) -> int | None:
-    return next((plugin.host.pid for name, plugin in dask_worker.plugins.items() if name.endswith("SlowFakeEngine")), None)
+    return next(
+        (plugin.host.pid for name, plugin in dask_worker.plugins.items() if name.endswith("SlowFakeEngine")), None
+    )

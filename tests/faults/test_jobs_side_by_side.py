@@ -123,15 +123,23 @@ def test_what_a_queued_job_waits_for_is_told(tmp_path: Path) -> None:
         time.sleep(1.0)
         for job in (waiting, low, high):
             told = jobs.get(job)
-            assert (told["state"], told["waits_for"]) == ("QUEUED", "Waits for a place: job 1 runs, and 1 at once is the most.")
+            assert (told["state"], told["waits_for"]) == (
+                "QUEUED",
+                "Waits for a place: job 1 runs, and 1 at once is the most.",
+            )
         captured, captured_steering = jobs.submit("capture-end", rig=True, priority="low")
         second, _ = jobs.submit(None, rig=True, priority="low")
         wait_until((captured_steering / "at-capture-end").exists, "the capture waits for a place")
         wait_until(lambda: jobs.get(second)["waits_for"], "it is not told that the dome is busy")
-        assert jobs.get(second)["waits_for"] == f"Waits for the dome simulated: job {jobs.get(captured)['number']} captures with it."
+        assert (
+            jobs.get(second)["waits_for"]
+            == f"Waits for the dome simulated: job {jobs.get(captured)['number']} captures with it."
+        )
         release(captured_steering)
         wait_until(lambda: jobs.get(captured)["state"] == "QUEUED", "it goes on without a place")
-        wait_until(lambda: "place" in (jobs.get(captured)["waits_for"] or ""), "it is not told that it waits for a place")
+        wait_until(
+            lambda: "place" in (jobs.get(captured)["waits_for"] or ""), "it is not told that it waits for a place"
+        )
         release(steering)
         ids = [running, waiting, low, high, captured, second]
         assert {jobs.end(job) for job in ids} == {"SUCCEEDED"}
@@ -141,7 +149,9 @@ def test_what_a_queued_job_waits_for_is_told(tmp_path: Path) -> None:
 
 def test_a_job_waits_for_workers_that_can_run_its_stages(system: SmallSystem, jobs: HeldJobs) -> None:
     with system.without("worker", "worker2"):
-        wait_until(lambda: jobs.client.get("/v1/health/ready").status_code == 503, "readiness does not miss the workers")
+        wait_until(
+            lambda: jobs.client.get("/v1/health/ready").status_code == 503, "readiness does not miss the workers"
+        )
         job, _ = jobs.submit(None)
         wait_until(lambda: jobs.get(job)["waits_for"], "it is not told what the job waits for")
         told = jobs.get(job)

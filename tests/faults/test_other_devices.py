@@ -107,7 +107,10 @@ def test_all_off_switches_off_before_it_is_told_what_it_is(first: int | None) ->
 
 
 def test_a_driver_goes_dark_where_the_identity_gets_no_answer() -> None:
-    with device(None) as silent, pytest.raises(RigUnreachableError, match="does not answer for identity; lights were switched off"):
+    with (
+        device(None) as silent,
+        pytest.raises(RigUnreachableError, match="does not answer for identity; lights were switched off"),
+    ):
         drive(*silent.address)
     assert ALL_OFF_WRITTEN in silent.written
 

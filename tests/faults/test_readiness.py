@@ -95,7 +95,9 @@ def without_folder(data: Path) -> Iterator[None]:
         (without_folder, "store", "cannot be written"),
     ],
 )
-def test_a_fault_is_named_while_it_lasts(client: httpx.Client, tmp_path: Path, fault: Callable[[Path], Any], part: str, sentence: str) -> None:
+def test_a_fault_is_named_while_it_lasts(
+    client: httpx.Client, tmp_path: Path, fault: Callable[[Path], Any], part: str, sentence: str
+) -> None:
     assert bad_checks(client) == {}
     with fault(tmp_path):
         bad = bad_checks(client)
@@ -116,18 +118,24 @@ def test_a_database_replaced_under_the_server_is_told(tmp_path: Path) -> None:
 
 def test_a_disk_that_is_almost_full_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as full:
-        full.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=KEPT_FREE_BYTES - 1, total=2 * KEPT_FREE_BYTES))
+        full.setattr(
+            shutil, "disk_usage", lambda _path: SimpleNamespace(free=KEPT_FREE_BYTES - 1, total=2 * KEPT_FREE_BYTES)
+        )
         assert bad_checks(client) == {"disk": "Only 255 MiB of disk are free; free at least 256 MiB."}
     assert bad_checks(client) == {}
 
 
-def test_a_disk_that_takes_no_byte_is_told(client: httpx.Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_disk_that_takes_no_byte_is_told(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as failing:
         failing.setattr(readiness_module.os, "fsync", full)
-        assert bad_checks(client) == {"store": "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the disk."}
+        assert bad_checks(client) == {
+            "store": "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the disk."
+        }
     assert bad_checks(client) == {}
     assert list((tmp_path / "jobs").iterdir()) == []
 
@@ -144,7 +152,10 @@ def test_a_runner_that_died_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         while client.get("/v1/health/ready").status_code == 200:
             pass
         assert set(bad_checks(client)) == {"scheduler"}
-        assert client.get(f"/v1/jobs/{job}").json()["waits_for"] == "This server does not run jobs; restart it and read its log."
+        assert (
+            client.get(f"/v1/jobs/{job}").json()["waits_for"]
+            == "This server does not run jobs; restart it and read its log."
+        )
 
 
 def test_a_read_only_data_folder_is_told() -> None:
@@ -190,7 +201,17 @@ def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path) -> None:
     told = {"scheduler": f"The scheduler {settings.scheduler} does not answer; start it, jobs wait for it."}
     with serving(create_app(settings, lambda *_: None)) as client:
         assert bad_checks(client) == told
-        command = [sys.executable, "-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        command = [
+            sys.executable,
+            "-m",
+            "dask",
+            "scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            str(port),
+            "--no-dashboard",
+        ]
         with subprocess.Popen(command, stderr=subprocess.DEVNULL) as scheduler:
             try:
                 while client.get("/v1/health/ready").status_code != 200:
@@ -226,7 +247,9 @@ def test_a_store_that_hangs_is_told(client: httpx.Client, monkeypatch: pytest.Mo
     with monkeypatch.context() as frozen:
         frozen.setattr(readiness_module.os, "fsync", lambda _descriptor: thawed.wait())
         try:
-            assert bad_checks(client) == {"store": "The jobs' folder takes no file within 0.2 s; look at its disk, or at the network to it."}
+            assert bad_checks(client) == {
+                "store": "The jobs' folder takes no file within 0.2 s; look at its disk, or at the network to it."
+            }
         finally:
             thawed.set()
     monkeypatch.undo()

@@ -19,7 +19,16 @@ from services.api.captures.captures import Captures
 from services.client.capture_records import UploadManifest
 from services.core.settings import UploadLimits
 from tests.support.live_server import toy_server
-from tests.support.uploading import announce, contents_of, create_upload, manifest_of, offset_of, patch, upgraded, write_capture
+from tests.support.uploading import (
+    announce,
+    contents_of,
+    create_upload,
+    manifest_of,
+    offset_of,
+    patch,
+    upgraded,
+    write_capture,
+)
 
 MIB = 2**20
 KILLS = 3
@@ -36,7 +45,9 @@ def upload_in_new_process(folder: Path, server: str) -> dict[str, object]:
     return json.loads(answer.stdout)
 
 
-def send_until_killed(server: httpx.Client, process: subprocess.Popen[str], upload: str, offset: int, content: bytes) -> None:
+def send_until_killed(
+    server: httpx.Client, process: subprocess.Popen[str], upload: str, offset: int, content: bytes
+) -> None:
     """Send some bytes of a request that never ends, then kill the server once it has read them all but the last ones."""
     is_sent = threading.Event()
 
@@ -47,7 +58,10 @@ def send_until_killed(server: httpx.Client, process: subprocess.Popen[str], uplo
         process.wait()
 
     def request() -> None:
-        with suppress(httpx.TransportError), httpx.Client(base_url=server.base_url, trust_env=False, timeout=60) as client:
+        with (
+            suppress(httpx.TransportError),
+            httpx.Client(base_url=server.base_url, trust_env=False, timeout=60) as client,
+        ):
             patch(client, upload, offset, body())
 
     thread = threading.Thread(target=request)
@@ -134,9 +148,16 @@ def die(*_: object, **__: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "step", ["services.api.captures.captures.sync_folders", "pathlib.Path.rename", "services.api.captures.table.CaptureTable.change_state"]
+    "step",
+    [
+        "services.api.captures.captures.sync_folders",
+        "pathlib.Path.rename",
+        "services.api.captures.table.CaptureTable.change_state",
+    ],
 )
-def test_a_commit_that_died_anywhere_is_invisible_or_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+def test_a_commit_that_died_anywhere_is_invisible_or_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
     contents = contents_of(write_capture(tmp_path / "mine"))
     with captures_of(tmp_path) as captures:
         capture = receive_all(captures, contents, contents)
@@ -154,8 +175,17 @@ def test_a_commit_that_died_anywhere_is_invisible_or_complete(tmp_path: Path, mo
     assert [path.name for path in (tmp_path / "captures").iterdir()] == [capture]
 
 
-@pytest.mark.parametrize("step", ["shutil.rmtree", "services.api.captures.blobs.Blobs.remove", "services.api.captures.table.CaptureTable.delete_files"])
-def test_a_deletion_that_died_anywhere_is_completed_by_the_next_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+@pytest.mark.parametrize(
+    "step",
+    [
+        "shutil.rmtree",
+        "services.api.captures.blobs.Blobs.remove",
+        "services.api.captures.table.CaptureTable.delete_files",
+    ],
+)
+def test_a_deletion_that_died_anywhere_is_completed_by_the_next_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
     contents = contents_of(write_capture(tmp_path / "mine"))
     with captures_of(tmp_path) as captures:
         capture = receive_all(captures, contents, contents)
@@ -167,11 +197,15 @@ def test_a_deletion_that_died_anywhere_is_completed_by_the_next_server(tmp_path:
     with captures_of(tmp_path) as captures:
         assert captures.get(capture).state == "expired"
         captures.sweep()
-    left = [path for folder in ("blobs", "captures", "partial") for path in (tmp_path / folder).rglob("*") if path.is_file()]
+    left = [
+        path for folder in ("blobs", "captures", "partial") for path in (tmp_path / folder).rglob("*") if path.is_file()
+    ]
     assert left == []
 
 
-def test_what_a_dead_server_received_whole_but_never_verified_is_verified_at_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_dead_server_received_whole_but_never_verified_is_verified_at_the_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     contents = contents_of(write_capture(tmp_path / "mine"))
     damaged = contents | {"c0_l1.npy": contents["c0_l1.npy"][:-1] + b"\0"}
     with captures_of(tmp_path) as captures:

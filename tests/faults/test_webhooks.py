@@ -48,7 +48,9 @@ class Service:
         self.now_s = time.time()
 
     @contextmanager
-    def sending(self, policy: AddressPolicy = OPEN, total_s: float = 30.0, tls: ssl.SSLContext | None = None) -> Iterator[None]:
+    def sending(
+        self, policy: AddressPolicy = OPEN, total_s: float = 30.0, tls: ssl.SSLContext | None = None
+    ) -> Iterator[None]:
         sender = WebhookSender(self.deliveries, policy, 0.02, total_s, lambda: self.now_s, lambda: 0.5, tls)
         loop = asyncio.new_event_loop()
         task = loop.create_task(sender.run())
@@ -70,7 +72,11 @@ class Service:
             assert task.cancelled()
 
     def subscribe(self, url: str, *states: str) -> NewWebhook:
-        return self.webhooks.create(WebhookRequest(url=url, states=tuple(JobState(state) for state in states or ("SUCCEEDED", "FAILED", "CANCELLED"))))
+        return self.webhooks.create(
+            WebhookRequest(
+                url=url, states=tuple(JobState(state) for state in states or ("SUCCEEDED", "FAILED", "CANCELLED"))
+            )
+        )
 
     def run_job(self, *triggers: Trigger, failure: Failure | None = None) -> str:
         job = self.repository.create(JobSpec(capture=Path("/people/jane-doe")), None).job
@@ -112,7 +118,11 @@ def test_a_change_is_told_signed_and_without_personal_data(service: Service) -> 
         told = Verifier(webhook.secret).verify(body, headers)
         assert told["type"] == "job.state"
         assert told["data"] == {"job": job, "state": state, "failure_code": None}
-        assert (headers[":path"], headers["content-type"], headers["host"]) == ("/hook?key=k1", "application/json", receiver.url.removeprefix("http://"))
+        assert (headers[":path"], headers["content-type"], headers["host"]) == (
+            "/hook?key=k1",
+            "application/json",
+            receiver.url.removeprefix("http://"),
+        )
         assert "jane" not in body
     assert len({headers["webhook-id"] for headers, _ in receiver.received}) == 3
     with pytest.raises(Exception, match="No matching signature"):
@@ -168,7 +178,10 @@ def test_a_redirect_is_not_followed(service: Service) -> None:
         webhook = service.subscribe(receiver.url)
         service.run_job()
         delivery = service.wait_for_tries(webhook, 1)
-        assert (delivery.attempts[0].status, delivery.attempts[0].error) == (302, "The receiver answered 302; redirects are not followed.")
+        assert (delivery.attempts[0].status, delivery.attempts[0].error) == (
+            302,
+            "The receiver answered 302; redirects are not followed.",
+        )
     assert [headers[":path"] for headers, _ in receiver.received] == ["/"]
 
 
@@ -189,7 +202,9 @@ def test_nobody_there_is_an_error_in_the_log(service: Service) -> None:
     with service.sending():
         webhook = service.subscribe(receiver.url)
         service.run_job()
-        assert service.wait_for_tries(webhook, 1).attempts[0].error == "The receiver could not be reached (ConnectError)."
+        assert (
+            service.wait_for_tries(webhook, 1).attempts[0].error == "The receiver could not be reached (ConnectError)."
+        )
 
 
 @pytest.mark.attack("webhooks", "a name that leads inside once it is checked")
@@ -221,7 +236,10 @@ def test_a_certificate_must_prove_the_name_though_the_address_is_connected_to(se
             webhook = service.subscribe(url)
             with service.sending(tls=tls):
                 service.run_job()
-                assert service.wait_for_tries(webhook, 1).attempts[0].error == "The receiver could not be reached (ConnectError)."
+                assert (
+                    service.wait_for_tries(webhook, 1).attempts[0].error
+                    == "The receiver could not be reached (ConnectError)."
+                )
             service.webhooks.delete(webhook.id)
         assert len(receiver.received) == 1
 
@@ -257,7 +275,9 @@ def test_what_happened_to_a_job_is_told_though_it_was_deleted_before_the_events_
     service.repository.apply(job, Trigger.DELETE)
     service.repository.forget(job, 0, 0, "abc")
     assert service.deliveries.collect(service.now_s) == 0
-    assert [(delivery.payload["data"]["job"], delivery.payload["data"]["state"]) for delivery in service.log(webhook)] == [
+    assert [
+        (delivery.payload["data"]["job"], delivery.payload["data"]["state"]) for delivery in service.log(webhook)
+    ] == [
         (job, "SUCCEEDED"),
         (job, "DELETING"),
     ]
@@ -278,7 +298,9 @@ def test_restarts_at_random_moments_lose_nothing_and_repeat_only_under_the_same_
     assert sorted(told.values()) == sorted(jobs)
 
 
-def test_after_a_day_it_is_given_up_and_after_five_the_webhook_is_switched_off(service: Service, caplog: pytest.LogCaptureFixture) -> None:
+def test_after_a_day_it_is_given_up_and_after_five_the_webhook_is_switched_off(
+    service: Service, caplog: pytest.LogCaptureFixture
+) -> None:
     webhook = service.subscribe("https://example.org/hook")
     started_s = service.now_s
     while service.webhooks.get(webhook.id).active:
@@ -309,7 +331,9 @@ def test_one_success_forgets_earlier_failures(service: Service) -> None:
     service.deliveries.collect(service.now_s)
     for status, error in ((500, "The receiver answered 500."), (204, None)):
         (claim,) = service.deliveries.claim(service.now_s, (), 16)
-        service.deliveries.settle(claim, Attempt(time_s=service.now_s, duration_s=0.0, status=status, error=error), retry_s(1, 0.5))
+        service.deliveries.settle(
+            claim, Attempt(time_s=service.now_s, duration_s=0.0, status=status, error=error), retry_s(1, 0.5)
+        )
         assert (service.webhooks.get(webhook.id).failing_since_s is None) is (error is None)
         service.now_s += DAY_S / 2
     assert [delivery.state for delivery in service.log(webhook)] == ["delivered"]
@@ -321,7 +345,9 @@ def test_the_log_forgets_what_was_settled_long_ago(service: Service) -> None:
         service.run_job()
         service.deliveries.collect(service.now_s - age_s)
         for claim in service.deliveries.claim(service.now_s, (), 16):
-            service.deliveries.settle(claim, Attempt(time_s=service.now_s, duration_s=0.0, status=204, error=None), 10.0)
+            service.deliveries.settle(
+                claim, Attempt(time_s=service.now_s, duration_s=0.0, status=204, error=None), 10.0
+            )
     assert len(service.log(webhook)) == 1
 
 
@@ -356,7 +382,9 @@ def test_a_secret_is_in_no_representation(service: Service) -> None:
     service.deliveries.test(webhook.id, service.now_s)
     (claim,) = service.deliveries.claim(service.now_s, (), 16)
     assert claim.secret == webhook.secret
-    assert webhook.secret not in repr(webhook) + repr(claim) + repr(service.webhooks.list()) + repr(service.log(webhook))
+    assert webhook.secret not in repr(webhook) + repr(claim) + repr(service.webhooks.list()) + repr(
+        service.log(webhook)
+    )
 
 
 def test_webhooks_over_rest(tmp_path: Path) -> None:
@@ -375,14 +403,22 @@ def test_webhooks_over_rest(tmp_path: Path) -> None:
         log = f"{path}/deliveries"
         wait_until(lambda: bool(client.get(log).json()["deliveries"][0]["attempts"]))
         (delivery,) = client.get(log).json()["deliveries"]
-        assert (delivery["payload"]["type"], delivery["state"], delivery["attempts"][0]["status"]) == ("webhook.test", "pending", 500)
+        assert (delivery["payload"]["type"], delivery["state"], delivery["attempts"][0]["status"]) == (
+            "webhook.test",
+            "pending",
+            500,
+        )
         again = client.post(f"{log}/{delivery['id']}/redeliver")
         assert (again.status_code, again.json()["message"]) == (202, delivery["message"])
         wait_until(lambda: client.get(f"{log}/{delivery['id']}").json()["state"] == "delivered")
 
         job = client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
         headers, body = receiver.wait(3)[2]
-        assert Verifier(secret).verify(body, headers)["data"] == {"job": job, "state": "SUCCEEDED", "failure_code": None}
+        assert Verifier(secret).verify(body, headers)["data"] == {
+            "job": job,
+            "state": "SUCCEEDED",
+            "failure_code": None,
+        }
         page = client.get(log, params={"limit": 1}).json()
         older = client.get(log, params={"limit": 1, "before": page["next_before"]}).json()
         assert (older["deliveries"][0]["id"], older["next_before"]) == (delivery["id"], None)

@@ -35,7 +35,9 @@ def environment(folder: Path, *, broken: str | None = None) -> dict[str, str]:
     paths = [str(ROOT)]
     if broken is not None:
         (folder / "shadow" / broken).mkdir(parents=True)
-        (folder / "shadow" / broken / "__init__.py").write_text("raise ModuleNotFoundError(\"No module named 'x'\", name='x')")
+        (folder / "shadow" / broken / "__init__.py").write_text(
+            "raise ModuleNotFoundError(\"No module named 'x'\", name='x')"
+        )
         paths.insert(0, str(folder / "shadow"))
     (folder / "tmp").mkdir(parents=True, exist_ok=True)
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(folder / "tmp")}
@@ -59,7 +61,9 @@ def worker_health(env: dict[str, str]) -> subprocess.CompletedProcess[str]:
 
 def workers_check(client: httpx.Client) -> tuple[int, str]:
     answer = client.get("/v1/health/ready")
-    return answer.status_code, next(check["sentence"] for check in answer.json()["checks"] if check["name"] == "workers")
+    return answer.status_code, next(
+        check["sentence"] for check in answer.json()["checks"] if check["name"] == "workers"
+    )
 
 
 def until(client: httpx.Client, status: int, text: str) -> str:
@@ -76,7 +80,10 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
     folder, port = tmp_path_factory.mktemp("system"), str(free_port())
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
-    with process(folder / "scheduler.log", environment(folder), *scheduler), toy_server(folder / "data", scheduler=address) as (client, _):
+    with (
+        process(folder / "scheduler.log", environment(folder), *scheduler),
+        toy_server(folder / "data", scheduler=address) as (client, _),
+    ):
         yield client, address, folder
 
 
@@ -109,7 +116,9 @@ def test_ready_counts_only_workers_that_can_work(system: tuple[httpx.Client, str
         assert until(client, 200, "can run") == "1 worker can run stages, 1 can capture."
         listed = {one["has_dome"]: one for one in client.get("/v1/workers").json()["workers"]}
         assert set(listed) == {True, False}
-        faults = {one["fault"]: (one["runs_stages"], one["has_dome"]) for one in client.get("/v1/workers").json()["workers"]}
+        faults = {
+            one["fault"]: (one["runs_stages"], one["has_dome"]) for one in client.get("/v1/workers").json()["workers"]
+        }
         assert faults[sentence] == (False, False)
         client.get(f"/v1/jobs/{job}/events", timeout=PATIENCE_S)
         assert client.get(f"/v1/jobs/{job}").json()["state"] == "SUCCEEDED"
@@ -157,7 +166,13 @@ def test_every_package_of_an_extra_is_tried() -> None:
     ],
 )
 def test_what_a_worker_claims_is_added_to_its_own_resources(given: list[str], claimed: str) -> None:
-    assert _claiming(["tcp://s:1", *given, "--nthreads", "1"], {STAGES: 7}) == ["tcp://s:1", "--nthreads", "1", "--resources", claimed]
+    assert _claiming(["tcp://s:1", *given, "--nthreads", "1"], {STAGES: 7}) == [
+        "tcp://s:1",
+        "--nthreads",
+        "1",
+        "--resources",
+        claimed,
+    ]
 
 
 def test_a_rig_needs_no_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

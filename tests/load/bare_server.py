@@ -20,7 +20,9 @@ def build(database: str) -> FastAPI:
     def read(job_id: str) -> dict[str, Any]:
         if not hasattr(local, "connection"):
             local.connection = sqlite3.connect(database)
-        row = local.connection.execute("SELECT id, number, state, created_s, changed_s FROM job WHERE id = ?", (job_id,)).fetchone()
+        row = local.connection.execute(
+            "SELECT id, number, state, created_s, changed_s FROM job WHERE id = ?", (job_id,)
+        ).fetchone()
         return dict(zip(("id", "number", "state", "created_s", "changed_s"), row, strict=True))
 
     return app
@@ -32,7 +34,9 @@ def main(database: str) -> None:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
         print(f"http://127.0.0.1:{listener.getsockname()[1]}", flush=True)
-        config = uvicorn.Config(build(database), log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+        config = uvicorn.Config(
+            build(database), log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1
+        )
         uvicorn.Server(config).run(sockets=[listener])
 
 

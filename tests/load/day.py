@@ -51,7 +51,10 @@ def measure(work: Path, quarters: int, seed: int) -> Iterator[Row]:
 def growth(curve: Sequence[Row]) -> Row:
     """Least squares after the warm-up. Neighbouring points are alike, so the interval comes from resampling whole blocks of residuals."""
     judged = curve[int(WARM_UP * len(curve)) :]
-    days, size = np.array([row["hours"] / 24 for row in judged]), np.array([row["rss_bytes"] for row in judged], dtype=float)
+    days, size = (
+        np.array([row["hours"] / 24 for row in judged]),
+        np.array([row["rss_bytes"] for row in judged], dtype=float),
+    )
     slope, start = np.polyfit(days, size, 1)
     fitted = start + slope * days
     rng, block = np.random.default_rng(1), max(2, round(len(judged) ** 0.5))

@@ -60,14 +60,34 @@ def _fit(repository: Repository, job: str, folder: Path) -> None:
     with writing(repository.engine) as connection:
         insert_event(connection, job, 1, StageEvent(stage="fit", kind="started"))
         for step in range(1, STEPS + 1):
-            curve = {"loss": 0.99**step, "fit_error": 0.9, "held_out_error": 0.99**step, "held_out_se": 0.01, "samples": 64}
-            parameters = {f"{part}.{name}": 0.1 * step for part in ("enamel", "dentin") for name in ("sigma", "albedo", "g")}
+            curve = {
+                "loss": 0.99**step,
+                "fit_error": 0.9,
+                "held_out_error": 0.99**step,
+                "held_out_se": 0.01,
+                "samples": 64,
+            }
+            parameters = {
+                f"{part}.{name}": 0.1 * step for part in ("enamel", "dentin") for name in ("sigma", "albedo", "g")
+            }
             data = {"channel": "green", "step": step, "stage": "media", "parameters": parameters} | curve
-            insert_event(connection, job, 1, StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=step / STEPS, data=data))
+            insert_event(
+                connection,
+                job,
+                1,
+                StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=step / STEPS, data=data),
+            )
             if step % PICTURE_EVERY == 0:
                 path = f"previews/green-{step:03d}-c0-l1-render.png"
                 (folder / path).write_bytes(secrets.token_bytes(PICTURE_BYTES))
-                picture = {"camera": "c0", "light": "l1", "held_out": False, "channel": "green", "step": step, "render": path}
+                picture = {
+                    "camera": "c0",
+                    "light": "l1",
+                    "held_out": False,
+                    "channel": "green",
+                    "step": step,
+                    "render": path,
+                }
                 insert_event(connection, job, 1, StageEvent(stage="fit", kind="preview", data=picture))
                 insert_event(connection, job, 1, StageEvent(stage="fit", kind="log", message=f"Step {step} is done."))
         insert_event(connection, job, 1, StageEvent(stage="fit", kind="finished", done=1.0))

@@ -53,7 +53,11 @@ def measure(work: Path, rounds: int, round_s: float, jobs: int, fitted: int, see
                 after = _Clocks.now(served)
                 answers[name].append(found)
                 cpu_s[name] += after.server_s - before.server_s
-                yield {"benchmark": "load-mixed", "peer": name, "round": number} | before.until(after, len(found)) | _figures(found)
+                yield (
+                    {"benchmark": "load-mixed", "peer": name, "round": number}
+                    | before.until(after, len(found))
+                    | _figures(found)
+                )
                 run(_drain(served))
     yield from _summary(answers, {name: cpu_s[name] / sum(map(len, rounds)) for name, rounds in answers.items()})
     yield from _kinds(answers)
@@ -76,7 +80,10 @@ class _Clocks:
     def until(self, later: _Clocks, requests: int) -> Row:
         """Of the server by request, and how many cores others kept busy: where those are about as many as there are, latencies say little."""
         wall_s, server_s = later.wall_s - self.wall_s, later.server_s - self.server_s
-        return {"cpu_s_per_request": round(server_s / requests, 6), "others_cores": round((later.others_s - self.others_s) / wall_s, 2)}
+        return {
+            "cpu_s_per_request": round(server_s / requests, 6),
+            "others_cores": round((later.others_s - self.others_s) / wall_s, 2),
+        }
 
 
 def _turns(peers: Mapping[str, Any], number: int) -> list[tuple[str, Any]]:
@@ -85,13 +92,20 @@ def _turns(peers: Mapping[str, Any], number: int) -> list[tuple[str, Any]]:
     return turns[number % len(turns) :] + turns[: number % len(turns)]
 
 
-async def _round(name: str, served: Served, library: Library, seconds: float, rng: random.Random, prefix: str) -> list[Answer]:
+async def _round(
+    name: str, served: Served, library: Library, seconds: float, rng: random.Random, prefix: str
+) -> list[Answer]:
     times = list(poisson(RATE_PER_S, seconds, rng))
     if name == BARE:
-        return await offer(served, [(due_s, Ask("read", "GET", f"/jobs/{rng.choice(library.jobs)}")) for due_s in times])
+        return await offer(
+            served, [(due_s, Ask("read", "GET", f"/jobs/{rng.choice(library.jobs)}")) for due_s in times]
+        )
     mix = RequestMix(library, rng, prefix)
     plan = [(due_s, mix.draw()) for due_s in times]
-    plan += [*periodic(seconds), *((due_s, mix.submit()) for due_s in np.arange(SUBMIT_PERIOD_S / 2, seconds, SUBMIT_PERIOD_S).tolist())]
+    plan += [
+        *periodic(seconds),
+        *((due_s, mix.submit()) for due_s in np.arange(SUBMIT_PERIOD_S / 2, seconds, SUBMIT_PERIOD_S).tolist()),
+    ]
     is_odd = False
 
     def cancel_every_second(answer: Answer) -> tuple[float, Ask] | None:
@@ -122,7 +136,9 @@ def _figures(answers: Sequence[Answer]) -> Row:
     named = {f"p{100 * q:g}_s": round(float(np.quantile(latencies, q)), 6) for q in QUANTILES}
     wrong = sorted({f"{answer.kind}: {answer.status}" for answer in answers if not answer.is_right})
     return (
-        {"requests": len(answers), "wrong": sum(not answer.is_right for answer in answers), "wrong_kinds": wrong} | named | {"max_s": round(max(latencies), 6)}
+        {"requests": len(answers), "wrong": sum(not answer.is_right for answer in answers), "wrong_kinds": wrong}
+        | named
+        | {"max_s": round(max(latencies), 6)}
     )
 
 
@@ -135,8 +151,13 @@ def _summary(answers: Mapping[str, list[list[Answer]]], cpu_s_per_request: Mappi
     rng = np.random.default_rng(1)
     bare = answers[BARE]
     draws = rng.integers(0, len(bare), (RESAMPLES, len(bare)))
-    by_round = {name: [np.array([answer.latency_s for answer in one]) for one in rounds] for name, rounds in answers.items()}
-    resampled = {name: np.array([np.quantile(np.concatenate([rounds[k] for k in draw]), 0.99) for draw in draws]) for name, rounds in by_round.items()}
+    by_round = {
+        name: [np.array([answer.latency_s for answer in one]) for one in rounds] for name, rounds in answers.items()
+    }
+    resampled = {
+        name: np.array([np.quantile(np.concatenate([rounds[k] for k in draw]), 0.99) for draw in draws])
+        for name, rounds in by_round.items()
+    }
     for name, rounds in answers.items():
         single = [_p99([ours]) / _p99([theirs]) for ours, theirs in zip(rounds, bare, strict=True)]
         low, high = np.quantile(resampled[name] / resampled[BARE], (0.025, 0.975))

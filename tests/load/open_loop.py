@@ -38,7 +38,12 @@ class Answer:
 def session(served: Served, connections: int = 256) -> aiohttp.ClientSession:
     """At most so many kept connections, 0 for any number; a request that finds all of them busy waits, which counts."""
     connector = aiohttp.TCPConnector(limit=connections, keepalive_timeout=KEPT_S)
-    return aiohttp.ClientSession(served.address, connector=connector, headers=served.headers, timeout=aiohttp.ClientTimeout(total=None, sock_read=PATIENCE_S))
+    return aiohttp.ClientSession(
+        served.address,
+        connector=connector,
+        headers=served.headers,
+        timeout=aiohttp.ClientTimeout(total=None, sock_read=PATIENCE_S),
+    )
 
 
 def run(work: Coroutine[Any, Any, T]) -> T:
@@ -55,7 +60,11 @@ def poisson(rate_per_s: float, seconds: float, rng: random.Random) -> Iterator[f
         due_s += rng.expovariate(rate_per_s)
 
 
-async def offer(served: Served, plan: Sequence[tuple[float, Ask]], follow_up: Callable[[Answer], tuple[float, Ask] | None] = lambda _: None) -> list[Answer]:
+async def offer(
+    served: Served,
+    plan: Sequence[tuple[float, Ask]],
+    follow_up: Callable[[Answer], tuple[float, Ask] | None] = lambda _: None,
+) -> list[Answer]:
     """Send the plan, times in seconds from now and in order, and what ``follow_up`` makes of each answer, so many seconds later."""
     answers: list[Answer] = []
     loop = asyncio.get_running_loop()

@@ -50,7 +50,12 @@ class Served:
 def serving(data: Path, token: str | None = None, **settings: Any) -> Iterator[Served]:
     """The shipped server with toy stages on a data folder; ``token`` is sent with every request."""
     access = {} if token is None else {"access": "tokens", "job_roots": "/"}
-    command = [sys.executable, "-m", "tests.load.server", json.dumps({"data": str(data), "port": 0} | access | settings)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.load.server",
+        json.dumps({"data": str(data), "port": 0} | access | settings),
+    ]
     with _running(command, data, {} if token is None else {"Authorization": f"Bearer {token}"}) as served:
         yield served
 
@@ -65,7 +70,10 @@ def serving_bare(data: Path, database: Path) -> Iterator[Served]:
 @contextmanager
 def _running(command: list[str], data: Path, headers: dict[str, str]) -> Iterator[Served]:
     data.mkdir(parents=True, exist_ok=True)
-    with (data / "server.log").open("w") as log, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT) as process:
+    with (
+        (data / "server.log").open("w") as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=ROOT) as process,
+    ):
         try:
             assert process.stdout is not None
             yield Served(process.stdout.readline().strip(), psutil.Process(process.pid), data, headers)

@@ -80,7 +80,12 @@ class RequestMix:
 
     def _events(self) -> Ask:
         # A browser that comes back: the last twenty events of a job that has ended.
-        return Ask("events", "GET", f"/v1/jobs/{self._library.fitted[-1]}/events", {"Last-Event-ID": str(self._library.last_event - 20)})
+        return Ask(
+            "events",
+            "GET",
+            f"/v1/jobs/{self._library.fitted[-1]}/events",
+            {"Last-Event-ID": str(self._library.last_event - 20)},
+        )
 
     def _previews(self) -> Ask:
         return Ask("previews", "GET", f"{self._fitted()}/previews")
@@ -113,7 +118,10 @@ class RequestMix:
 
 def periodic(seconds: float) -> Iterator[tuple[float, Ask]]:
     """What a monitor asks meanwhile."""
-    for period_s, ask in ((METRICS_PERIOD_S, Ask("metrics", "GET", "/v1/metrics")), (READY_PERIOD_S, Ask("ready", "GET", "/v1/health/ready"))):
+    for period_s, ask in (
+        (METRICS_PERIOD_S, Ask("metrics", "GET", "/v1/metrics")),
+        (READY_PERIOD_S, Ask("ready", "GET", "/v1/health/ready")),
+    ):
         due_s = period_s / 2
         while due_s < seconds:
             yield due_s, ask

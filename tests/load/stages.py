@@ -22,7 +22,15 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
             context.raise_if_cancelled()
             time.sleep(0.02)
         for step in range(1, spec.adam_steps + 1):
-            data = {"channel": "green", "step": step, "loss": 0.99**step, "held_out_error": 0.99**step, "parameters": {"enamel.sigma": 4.0}}
-            context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=step / spec.adam_steps, data=data))
+            data = {
+                "channel": "green",
+                "step": step,
+                "loss": 0.99**step,
+                "held_out_error": 0.99**step,
+                "parameters": {"enamel.sigma": 4.0},
+            }
+            context.report(
+                StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=step / spec.adam_steps, data=data)
+            )
             time.sleep(spec.adam_rate)
     return toy_stages.fit(spec, context)

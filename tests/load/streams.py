@@ -39,7 +39,14 @@ def measure(work: Path, streams: int, steps: int, period_s: float, seed: int) ->
 
 
 async def _listen(served: Served, capture: str, count: int, steps: int, period_s: float, seed: int) -> Row:
-    body = {"capture": capture, "workers": 1, "seed": seed, "solver": "adam", "adam_steps": steps, "adam_rate": period_s}
+    body = {
+        "capture": capture,
+        "workers": 1,
+        "seed": seed,
+        "solver": "adam",
+        "adam_steps": steps,
+        "adam_rate": period_s,
+    }
     async with session(served, connections=0) as http:
         async with http.post("/v1/jobs", json=body) as answer:
             job = (await answer.json())["id"]

@@ -20,7 +20,8 @@ def test_the_scanned_incisors_images_come_out_again() -> None:
     capture, truth = read_record(root / "capture.json", FolderCapture), json.loads((root / "truth.json").read_text())
     enamel, dentin = truth["enamel"], truth["dentin"]
     tissue = Tissue(
-        Medium(enamel["sigma_t"], enamel["albedo"], enamel["beta"], enamel["g1"], enamel["g2"]), Medium(dentin["sigma_t"], dentin["albedo"], g1=dentin["g"])
+        Medium(enamel["sigma_t"], enamel["albedo"], enamel["beta"], enamel["g1"], enamel["g2"]),
+        Medium(dentin["sigma_t"], dentin["albedo"], g1=dentin["g"]),
     )
     teeth = {"11": (root / "teeth/11/outer.ply", root / "teeth/11/dentin.ply")}
     scores = []
@@ -28,7 +29,9 @@ def test_the_scanned_incisors_images_come_out_again() -> None:
         scene = load_scene(nested_scene(teeth, tissue, capture.cameras, light.position_mm, light.intensity[0]))
         mean, variance = render_batches(scene, number, samples=128, seed=5)
         stem = f"{capture.cameras[number].name}_{light.name}"
-        stored, stored_variance = (np.load(root / f"{name}.npy")[..., 0].astype(float) for name in (stem, f"{stem}_var"))
+        stored, stored_variance = (
+            np.load(root / f"{name}.npy")[..., 0].astype(float) for name in (stem, f"{stem}_var")
+        )
         # Blocks of four rows average heavy-tailed pixels to something near normal.
         for row in range(0, mean.shape[0], 4):
             part = slice(row, row + 4)

@@ -28,7 +28,17 @@ LARGEST_ERROR = 0.05
 """Standard error of score and of extrapolated difference, as a fraction of the derivative."""
 FAMILY_FALSE_ALARM = 1e-3
 """Chance that any t-test of a group fails a correct engine (Bonferroni)."""
-STEPS = {"sigma": 0.3, "alpha": 0.04, "beta": 0.2, "g1": 0.12, "g2": 0.2, "shape": 0.3, "reflectance": 0.2, "gums.sigma": 1.0, "1.enamel.sigma": 0.7}
+STEPS = {
+    "sigma": 0.3,
+    "alpha": 0.04,
+    "beta": 0.2,
+    "g1": 0.12,
+    "g2": 0.2,
+    "shape": 0.3,
+    "reflectance": 0.2,
+    "gums.sigma": 1.0,
+    "1.enamel.sigma": 0.7,
+}
 
 
 @dataclass(frozen=True)
@@ -44,12 +54,20 @@ class Group:
 
 MEDIA = Group(
     Tissue(Medium(1, 0.95, 0.6, 0.6, -0.3), Medium(2, 0.8, 0.5, 0.6, -0.3), (0.5, 0.4)),
-    {f"{part}.{field}": 1536 if part == "enamel" else 3072 for part in ("enamel", "dentin") for field in ("sigma", "g1", "g2")}
+    {
+        f"{part}.{field}": 1536 if part == "enamel" else 3072
+        for part in ("enamel", "dentin")
+        for field in ("sigma", "g1", "g2")
+    }
     | {f"{part}.{field}": 1024 for part in ("enamel", "dentin") for field in ("alpha", "beta")}
     | {"shape.0": 1024},
     2048,
 )
-SHAPE = Group(Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4)), {"shape.0": 1024, "shape.1": 2048}, 4096)
+SHAPE = Group(
+    Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4)),
+    {"shape.0": 1024, "shape.1": 2048},
+    4096,
+)
 """Dentin clearer than enamel: of both modes, Eq. 32 alone is 2.5 times the derivative, and noise stays small."""
 
 GRADUAL = Group(
@@ -61,7 +79,14 @@ GRADUAL = Group(
 """Albedo and phase function differ far more than extinction, so that what they change near the border rules the derivative to its shape."""
 IN_A_MOUTH = Group(
     MOUTH,
-    {"0.dentin.alpha": 384, "1.enamel.alpha": 128, "1.enamel.sigma": 5120, "gums.alpha": 128, "gums.sigma": 2048, "cavity.reflectance": 64},
+    {
+        "0.dentin.alpha": 384,
+        "1.enamel.alpha": 128,
+        "1.enamel.sigma": 5120,
+        "gums.alpha": 128,
+        "gums.sigma": 2048,
+        "cavity.reflectance": 64,
+    },
     3072,
     mouth_recipe,
     14.0,
@@ -70,9 +95,16 @@ IN_A_MOUTH = Group(
 
 def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """By name, over seeds: scores and extrapolated central differences, both relative to the mean score."""
-    engine, view, names = Engine(group.scene(boundary)), whole_view(camera_at((0.2, 1, 0.1), span_mm=group.span_mm), 1), tuple(group.samples)
+    engine, view, names = (
+        Engine(group.scene(boundary)),
+        whole_view(camera_at((0.2, 1, 0.1), span_mm=group.span_mm), 1),
+        tuple(group.samples),
+    )
     pictures = engine.jacobian(group.tissue, view, names, samples=4 * group.score_samples, seed=10_000).jacobian
-    slopes = [engine.jacobian(group.tissue, view, names, samples=group.score_samples, seed=11_000 + seed).jacobian for seed in range(SEEDS)]
+    slopes = [
+        engine.jacobian(group.tissue, view, names, samples=group.score_samples, seed=11_000 + seed).jacobian
+        for seed in range(SEEDS)
+    ]
     compared = {}
     for name, picture, slope in zip(names, pictures, np.stack(slopes, axis=1), strict=True):
         scores = np.einsum("sln,ln->s", slope, picture)
@@ -80,10 +112,15 @@ def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.floa
 
         def value(parameter: float, seed: int, name: str = name, picture: NDArray[np.float64] = picture) -> float:
             tissue = group.tissue.with_values({name: parameter})
-            return float((engine.images(tissue, view, samples=group.samples[name], seed=12_000 + seed).mean * picture).sum())
+            return float(
+                (engine.images(tissue, view, samples=group.samples[name], seed=12_000 + seed).mean * picture).sum()
+            )
 
         # All seeds at one value in turn: a new value may mean new surfaces.
-        up, down = ({h: np.array([value(middle + sign * h, seed) for seed in range(SEEDS)]) for h in (step, step / 2)} for sign in (1, -1))
+        up, down = (
+            {h: np.array([value(middle + sign * h, seed) for seed in range(SEEDS)]) for h in (step, step / 2)}
+            for sign in (1, -1)
+        )
         differences = [(up[h] - down[h]) / (2 * h) for h in (step, step / 2)]
         extrapolated = (4 * differences[1] - differences[0]) / 3
         compared[name] = scores / scores.mean(), extrapolated / scores.mean()
@@ -98,7 +135,9 @@ def standard_error(values: NDArray[np.float64]) -> float:
     ("group", "boundary"),
     [
         pytest.param(MEDIA, "matched", id="media-matched", marks=pytest.mark.slow),
-        pytest.param(replace(MEDIA, samples={"enamel.g1": 1536, "dentin.alpha": 1024}), "matched", id="two-media-matched"),
+        pytest.param(
+            replace(MEDIA, samples={"enamel.g1": 1536, "dentin.alpha": 1024}), "matched", id="two-media-matched"
+        ),
         pytest.param(SHAPE, "matched", id="shape-matched"),
         pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
         pytest.param(SHAPE, "thin", id="shape-thin", marks=pytest.mark.slow),
@@ -129,7 +168,11 @@ def test_what_a_second_lobe_would_bring_is_told_where_there_is_none() -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
     none, hardly = (
         engine.jacobian(
-            Tissue(Medium(2, 0.95, beta, 0.6, -0.3), Medium(3, 0.8, beta, 0.6, -0.3), (0.5, 0.5)), view, ("enamel.beta",), samples=64, seed=1
+            Tissue(Medium(2, 0.95, beta, 0.6, -0.3), Medium(3, 0.8, beta, 0.6, -0.3), (0.5, 0.5)),
+            view,
+            ("enamel.beta",),
+            samples=64,
+            seed=1,
         ).jacobian
         for beta in (1.0, 1 - 1e-6)
     )

@@ -60,7 +60,9 @@ def require_sentence(error: DentineError, *parts: str) -> None:
 
 @pytest.mark.parametrize(("field", "value", "shown"), FORBIDDEN)
 @pytest.mark.parametrize("part", ["enamel", "dentin"])
-def test_a_tissue_out_of_range_is_refused(engine: Engine, no_kernel: None, part: str, field: str, value: float, shown: str) -> None:
+def test_a_tissue_out_of_range_is_refused(
+    engine: Engine, no_kernel: None, part: str, field: str, value: float, shown: str
+) -> None:
     tissue = TISSUE.with_values({f"{part}.{field}": value})
     view = whole_view(camera_at((0, 1, 0)))
     for call in (
@@ -110,7 +112,9 @@ def test_lights_that_do_not_exist_are_refused(engine: Engine, no_kernel: None, l
 
 
 @pytest.mark.parametrize("counts", [{"samples": 0}, {"samples": -4}, {"samples": 8, "batches": 0}])
-def test_counts_of_paths_that_are_not_positive_are_refused(engine: Engine, no_kernel: None, counts: dict[str, int]) -> None:
+def test_counts_of_paths_that_are_not_positive_are_refused(
+    engine: Engine, no_kernel: None, counts: dict[str, int]
+) -> None:
     with pytest.raises(InputError) as caught:
         engine.images(TISSUE, whole_view(camera_at((0, 1, 0))), seed=1, **counts)
     require_sentence(caught.value, *(f"{name} = {value}" for name, value in counts.items()))
@@ -122,7 +126,9 @@ def test_an_unknown_parameter_is_refused(engine: Engine, no_kernel: None) -> Non
     require_sentence(caught.value, "dentin.roughness", "dentin.sigma", "shape.1")
 
 
-def with_light(number: int, *, intensity: float = 1.0, position: tuple[float, float, float] = (0.0, 600.0, 0.0)) -> SceneRecipe:
+def with_light(
+    number: int, *, intensity: float = 1.0, position: tuple[float, float, float] = (0.0, 600.0, 0.0)
+) -> SceneRecipe:
     """The small tooth with one light replaced."""
     positions, intensities = LIGHTS_MM.copy(), np.ones(len(LIGHTS_MM))
     positions[number], intensities[number] = position, intensity
@@ -173,7 +179,13 @@ def test_surfaces_that_bound_nothing_are_refused() -> None:
     in_metres = Mesh(outer.vertices_mm * 1e-3, outer.faces)
     in_micrometres = Mesh(outer.vertices_mm * 1e3, outer.faces)
     broken = Mesh(np.where(outer.vertices_mm == outer.vertices_mm[0], np.nan, outer.vertices_mm), outer.faces)
-    for mesh, part in ((hole, "3 edges"), (flipped, "inside out"), (in_metres, "millimetres"), (in_micrometres, "millimetres"), (broken, "non-finite")):
+    for mesh, part in (
+        (hole, "3 edges"),
+        (flipped, "inside out"),
+        (in_metres, "millimetres"),
+        (in_micrometres, "millimetres"),
+        (broken, "non-finite"),
+    ):
         with pytest.raises(MeshError) as caught:
             Engine(replace(scene, teeth=(ToothSurfaces(mesh, scene.teeth[0].dentin),)))
         require_sentence(caught.value, "outer surface", part)
@@ -184,7 +196,12 @@ def test_surfaces_that_bound_nothing_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("version", "parts"),
-    [((-1, -1, -1), ("No libLLVM",)), ((13, 0, 0), ("13.0", "17")), ((15, 0, 7), ("15.0", "17")), ((16, 0, 6), ("16.0", "17"))],
+    [
+        ((-1, -1, -1), ("No libLLVM",)),
+        ((13, 0, 0), ("13.0", "17")),
+        ((15, 0, 7), ("15.0", "17")),
+        ((16, 0, 6), ("16.0", "17")),
+    ],
 )
 def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], parts: tuple[str, ...]) -> None:
     with pytest.raises(PlatformError) as caught:
@@ -195,7 +212,10 @@ def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], pa
 
 @pytest.mark.parametrize(
     ("before", "sentence"),
-    [("pass", "No libLLVM was found"), ("import drjit; drjit.detail.llvm_version = lambda: (15, 0, 7)", "libLLVM 15.0 would crash the renderer")],
+    [
+        ("pass", "No libLLVM was found"),
+        ("import drjit; drjit.detail.llvm_version = lambda: (15, 0, 7)", "libLLVM 15.0 would crash the renderer"),
+    ],
 )
 def test_an_unusable_libllvm_ends_with_a_sentence(tmp_path: Path, before: str, sentence: str) -> None:
     # The whole way, in a process that cannot load the library, an empty file where it is looked for, and in one that is told it is old.
@@ -233,7 +253,10 @@ def test_a_layer_out_of_range_is_refused(no_kernel: None, field: str, value: flo
 
 def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
     layer = Layer(sigma=1, alpha=0.5, thickness_mm=1)
-    deep, white = layer.model_copy(update={"thickness_mm": math.inf}), layer.model_copy(update={"alpha": 1.0, "thickness_mm": math.inf})
+    deep, white = (
+        layer.model_copy(update={"thickness_mm": math.inf}),
+        layer.model_copy(update={"alpha": 1.0, "thickness_mm": math.inf}),
+    )
     calls: list[tuple[tuple[Layer, ...], dict[str, Any], str]] = [
         ((), {}, "no layer"),
         ((layer.model_copy(update={"thickness_mm": 0.0}),), {}, "thickness_mm = 0"),
@@ -260,7 +283,9 @@ def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("derivative", [False, True])
-def test_a_result_that_is_not_finite_raises_with_its_pixels(engine: Engine, monkeypatch: pytest.MonkeyPatch, wrong: float, derivative: bool) -> None:
+def test_a_result_that_is_not_finite_raises_with_its_pixels(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, wrong: float, derivative: bool
+) -> None:
     from services.fit.transport.paths.tally import Tally
 
     view, broken = whole_view(camera_at((0, 1, 0))), [5, 11, 40, 63]
@@ -297,7 +322,10 @@ def mouth_scene(**changes: Any) -> SceneRecipe:
     [
         ({"teeth": ()}, ("0 teeth", "1 to 15")),
         ({"teeth": (ToothSurfaces(ellipsoid(SEMI_AXES_MM)),) * 16}, ("16 teeth", "1 to 15")),
-        ({"teeth": (ToothSurfaces(ellipsoid(SEMI_AXES_MM)), ToothSurfaces(wall()))}, ("outer surface of tooth 1", "not watertight")),
+        (
+            {"teeth": (ToothSurfaces(ellipsoid(SEMI_AXES_MM)), ToothSurfaces(wall()))},
+            ("outer surface of tooth 1", "not watertight"),
+        ),
         ({"gums": wall()}, ("gums", "not watertight")),
         ({"cavity": Mesh(1e-3 * wall().vertices_mm, wall().faces)}, ("cavity", "0.016 units", "millimetres")),
         ({"cavity": Mesh(wall().vertices_mm, wall().faces[:0])}, ("cavity", "no faces")),
@@ -318,7 +346,10 @@ def test_parts_that_no_mouth_has_are_refused(no_kernel: None, changes: dict[str,
         (replace(MOUTH, gums=Medium(1, 1.5)), ("gums.alpha = 1.5", "0 to 1")),
         (replace(MOUTH, reflectance=None), ("cavity", "no reflectance")),
         (replace(MOUTH, reflectance=1.2), ("cavity.reflectance = 1.2", "0 to 1")),
-        (replace(MOUTH, teeth=(MOUTH.teeth[0], Tissue(Medium(-1, 0.5), Medium(1, 0.5)))), ("1.enamel.sigma = -1", "positive")),
+        (
+            replace(MOUTH, teeth=(MOUTH.teeth[0], Tissue(Medium(-1, 0.5), Medium(1, 0.5)))),
+            ("1.enamel.sigma = -1", "positive"),
+        ),
     ],
 )
 def test_media_that_do_not_belong_to_the_scene_are_refused(mouth: Mouth, facts: tuple[str, ...]) -> None:

@@ -81,7 +81,9 @@ def test_blocks_do_not_change_a_pixel() -> None:
         alone = engine.images(TISSUE, part, samples=32, seed=9)
         np.testing.assert_array_equal(alone.mean, whole.mean[:, block])
         np.testing.assert_array_equal(alone.variance, whole.variance[:, block])
-        np.testing.assert_array_equal(engine.jacobian(TISSUE, part, NAMES, samples=32, seed=9).jacobian, slopes[:, :, block])
+        np.testing.assert_array_equal(
+            engine.jacobian(TISSUE, part, NAMES, samples=32, seed=9).jacobian, slopes[:, :, block]
+        )
 
 
 def test_seeds_and_batches_are_independent() -> None:

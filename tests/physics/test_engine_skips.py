@@ -26,12 +26,18 @@ def engine() -> Engine:
 @pytest.mark.parametrize("seen", [(1, 4), (4, 0)])
 def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, seen: tuple[int, int]) -> None:
     scene, view = recipe(), whole_view(camera_at((0.2, 1, 0.1)))
-    smaller = Engine(replace(scene, light_positions_mm=LIGHTS_MM[list(seen)], light_intensities=scene.light_intensities[list(seen)]))
+    smaller = Engine(
+        replace(scene, light_positions_mm=LIGHTS_MM[list(seen)], light_intensities=scene.light_intensities[list(seen)])
+    )
     some, unseen = replace(view, lights=seen), [k for k in range(len(LIGHTS_MM)) if k not in seen]
     image, alone = (one.images(TISSUE, v, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
-    slope, slope_alone = (one.jacobian(TISSUE, v, NAMES, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
+    slope, slope_alone = (
+        one.jacobian(TISSUE, v, NAMES, samples=32, seed=9) for one, v in ((engine, some), (smaller, view))
+    )
     edges = np.array([0, 3, 40])
-    orders, orders_alone = (one.order_images(TISSUE, v, bin_edges=edges, samples=32, seed=9) for one, v in ((engine, some), (smaller, view)))
+    orders, orders_alone = (
+        one.order_images(TISSUE, v, bin_edges=edges, samples=32, seed=9) for one, v in ((engine, some), (smaller, view))
+    )
     for ours, theirs, axis in (
         (image.mean, alone.mean, 0),
         (image.variance, alone.variance, 0),
@@ -45,7 +51,18 @@ def test_lights_that_are_not_listed_are_zero_and_change_no_bit(engine: Engine, s
         assert theirs.any()
 
 
-FEATURES = ("scores", "shape", "dentin", "second lobe", "phase table", "thin faces", "stains", "order bins", "unseen lights", "masked pixels")
+FEATURES = (
+    "scores",
+    "shape",
+    "dentin",
+    "second lobe",
+    "phase table",
+    "thin faces",
+    "stains",
+    "order bins",
+    "unseen lights",
+    "masked pixels",
+)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +88,11 @@ def test_what_is_off_changes_no_bit(features: dict[str, Case], feature: str) -> 
 
 
 SLAB = Layer(sigma=2, alpha=0.9, g1=0.5, thickness_mm=1)
-SLAB_FEATURES: dict[str, dict[str, Any]] = {"oblique beam": {"mu_incident": 0.5}, "exit cosines": {"exit_cosines": (0.5,)}, "rings": {"ring_edges_mm": (0.5,)}}
+SLAB_FEATURES: dict[str, dict[str, Any]] = {
+    "oblique beam": {"mu_incident": 0.5},
+    "exit cosines": {"exit_cosines": (0.5,)},
+    "rings": {"ring_edges_mm": (0.5,)},
+}
 
 
 def slab_operations(**options: Any) -> int:

@@ -33,7 +33,9 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surf
     lights = uniform_room(200)
     core = sphere(1.2)
     dentin = DentinShape.known(core)
-    scene = single_tooth(sphere(2.0), dentin, FAR_MM * lights, np.full(len(lights), FAR_MM**2 * 4 * np.pi / len(lights)), boundary)
+    scene = single_tooth(
+        sphere(2.0), dentin, FAR_MM * lights, np.full(len(lights), FAR_MM**2 * 4 * np.pi / len(lights)), boundary
+    )
     tissue = Tissue(Medium(2, 1, 0.8, 0.5, -0.2), Medium(4, 1, 1, 0.3))
     view = whole_view(camera_at((0.3, 1, 0.2), size=4, span_mm=0.8))
     estimate = Engine(scene).images(tissue, view, samples=24576, seed=4)
@@ -52,7 +54,9 @@ def test_camera_and_light_may_change_places(boundary: Boundary) -> None:
     values, variances = [], []
     for seed, (towards_camera, towards_light) in enumerate((directions, directions[::-1])):
         unit = np.array(towards_light) / np.linalg.norm(towards_light)
-        scene = replace(recipe(boundary), light_positions_mm=50 * CAMERA_DISTANCE_MM * unit[None], light_intensities=np.array([1e8]))
+        scene = replace(
+            recipe(boundary), light_positions_mm=50 * CAMERA_DISTANCE_MM * unit[None], light_intensities=np.array([1e8])
+        )
         camera = camera_at(towards_camera, size=8, span_mm=9.0, distance_mm=50 * CAMERA_DISTANCE_MM)
         estimate = Engine(scene).images(tissue, whole_view(camera), samples=16384, seed=seed)
         values.append(estimate.mean.sum())

@@ -40,7 +40,9 @@ def report_of(tissue: Tissue) -> FitReport:
     }
     errors = dict.fromkeys(CHANNELS, 0.03)
     parameters = dict.fromkeys(CHANNELS, table)
-    return FitReport(converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0)
+    return FitReport(
+        converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0
+    )
 
 
 class Rig:
@@ -56,12 +58,25 @@ class Rig:
         )  # fmt: skip
 
     def engine_image(
-        self, boundary: Boundary, camera: Camera, light: Light, channel: int, samples: int, stains: ToothStains | None = None
+        self,
+        boundary: Boundary,
+        camera: Camera,
+        light: Light,
+        channel: int,
+        samples: int,
+        stains: ToothStains | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         dentin = self.tooth.dentin
         assert dentin is not None
         shape = DentinShape.known(dentin)
-        recipe = single_tooth(self.tooth.outer, shape, np.array([light.position_mm]), np.array([light.intensity[channel]]), boundary, 1.631)
+        recipe = single_tooth(
+            self.tooth.outer,
+            shape,
+            np.array([light.position_mm]),
+            np.array([light.intensity[channel]]),
+            boundary,
+            1.631,
+        )
         tissue = TISSUE
         if stains is not None:
             recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=stains.corners_uv),))
@@ -84,8 +99,12 @@ def stains(rig: Rig) -> ToothStains:
     return ToothStains(layout.corners_uv, {"green": layout.texture(painted_depth(layout, 3, strength=2.0))})
 
 
-@pytest.mark.parametrize(("boundary", "stained"), [("matched", False), ("thin", False), ("matched", True), ("thin", True)])
-def test_stock_mitsuba_shows_what_the_engine_shows(rig: Rig, stains: ToothStains, boundary: Boundary, stained: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("boundary", "stained"), [("matched", False), ("thin", False), ("matched", True), ("thin", True)]
+)
+def test_stock_mitsuba_shows_what_the_engine_shows(
+    rig: Rig, stains: ToothStains, boundary: Boundary, stained: bool, tmp_path: Path
+) -> None:
     prepare_device()
     shown = stains if stained else None
     rig.write(tmp_path, boundary, shown)
@@ -130,13 +149,27 @@ def test_textures_come_with_their_place_and_as_fitted(rig: Rig, stains: ToothSta
     a_t = stains.textures["green"].transmittance
     np.testing.assert_allclose(np.load(tmp_path / "teeth/11/stain_green.npy"), a_t, rtol=1e-6)
     # 16 bits, rounded.
-    np.testing.assert_allclose(1 - np.asarray(Image.open(tmp_path / "teeth/11/stain_green.png")) / 65535, a_t, atol=0.51 / 65535)
+    np.testing.assert_allclose(
+        1 - np.asarray(Image.open(tmp_path / "teeth/11/stain_green.png")) / 65535, a_t, atol=0.51 / 65535
+    )
     assert "stain" not in (tmp_path / "scene_red.xml").read_text()
 
 
 def test_the_script_runs_alone(rig: Rig, tmp_path: Path) -> None:
     rig.write(tmp_path, "thin")
-    command = [sys.executable, "-I", str(tmp_path / "render.py"), "--camera", "c0", "--light", "l1", "--spp", "4", "--out", str(tmp_path / "tooth.exr")]
+    command = [
+        sys.executable,
+        "-I",
+        str(tmp_path / "render.py"),
+        "--camera",
+        "c0",
+        "--light",
+        "l1",
+        "--spp",
+        "4",
+        "--out",
+        str(tmp_path / "tooth.exr"),
+    ]
     # Isolated mode leaves out the script's folder, as a stranger's own set-up might.
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr

@@ -44,7 +44,9 @@ def test_gradients_agree_with_prbvolpath(tmp_path: Path) -> None:
     for number, light in enumerate(lights):
         scene = load_scene(nested_scene({"11": files}, TISSUE, (camera,), light, INTENSITY, ior=1.0))
         stock = StockGradient(scene, TISSUE, view)
-        theirs.append([stock(reference[number], samples=SAMPLES, seed=50 * (number + 1) + repeat) for repeat in range(REPEATS)])
+        theirs.append(
+            [stock(reference[number], samples=SAMPLES, seed=50 * (number + 1) + repeat) for repeat in range(REPEATS)]
+        )
     peer = of_parts(np.array(theirs).transpose(1, 2, 0), 0.0)
     ours, _ = our_gradient(engine, TISSUE, view, reference, stock.names, np.arange(2), samples=SAMPLES, repeats=REPEATS)
 

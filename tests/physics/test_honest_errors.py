@@ -50,7 +50,9 @@ def engine() -> Engine:
     return Engine(recipe())
 
 
-def intervals(means: Array, variances: Array, truth: Array, truth_variance: Array, batches: int, which: NDArray[np.int64]) -> Intervals:
+def intervals(
+    means: Array, variances: Array, truth: Array, truth_variance: Array, batches: int, which: NDArray[np.int64]
+) -> Intervals:
     """From values (seed, K, N) and truths (K, N), entry ``which`` (seed, N) of the K at each seed and pixel."""
     rows, pixels = np.arange(len(means))[:, None], np.arange(means.shape[-1])
     offset = means[rows, which, pixels] - truth[which, pixels]
@@ -80,7 +82,12 @@ def test_errors_of_derivatives_are_honest(engine: Engine) -> None:
     entries = len(NAMES) * len(LIGHTS_MM)
     means, variances, true_mean, true_variance = (
         np.reshape(table, (*np.shape(table)[:-3], entries, len(VIEW)))
-        for table in ([run.jacobian for run in runs], [run.jacobian_variance for run in runs], truth.jacobian, truth.jacobian_variance)
+        for table in (
+            [run.jacobian for run in runs],
+            [run.jacobian_variance for run in runs],
+            truth.jacobian,
+            truth.jacobian_variance,
+        )
     )
     entry = np.random.default_rng(2).integers(entries, size=(SEEDS, len(VIEW)))
     found = intervals(means, variances, true_mean, true_variance, 4, entry)
@@ -152,11 +159,16 @@ def test_a_dark_image_is_as_sure_as_it_gets(engine: Engine) -> None:
         ({"rel_error": 0.01, "max_samples": 3}, ("max_samples = 3",)),
     ],
 )
-def test_what_cannot_be_reached_is_refused(engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], named: tuple[str, ...]) -> None:
+def test_what_cannot_be_reached_is_refused(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], named: tuple[str, ...]
+) -> None:
     from services.fit.transport.paths.walk import Walk
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel was started"))
-    for call in (lambda: engine.images(TISSUE, VIEW, seed=1, **asked), lambda: engine.jacobian(TISSUE, VIEW, NAMES, seed=1, **asked)):
+    for call in (
+        lambda: engine.images(TISSUE, VIEW, seed=1, **asked),
+        lambda: engine.jacobian(TISSUE, VIEW, NAMES, seed=1, **asked),
+    ):
         with pytest.raises(InputError) as caught:
             call()
         message = caught.value.message

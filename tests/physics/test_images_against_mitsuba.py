@@ -47,12 +47,17 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
         teeth = {"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}
         stock = load_scene(nested_scene(teeth, TISSUE, (camera,), light, INTENSITY, boundary=boundary))
         mean, variance = render_batches(stock, 0, samples=2048, seed=31 + number, batches=BATCHES)
-        scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
+        scores.append(
+            pixel_scores(
+                [ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]
+            )
+        )
     require_same_pictures(np.stack(scores), least=500)
 
 
 @pytest.mark.parametrize(
-    ("samples", "block", "least"), [pytest.param(1024, 4, 250, id="blocks"), pytest.param(8192, 2, 800, id="small-blocks", marks=pytest.mark.slow)]
+    ("samples", "block", "least"),
+    [pytest.param(1024, 4, 250, id="blocks"), pytest.param(8192, 2, 800, id="small-blocks", marks=pytest.mark.slow)],
 )
 def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least: int) -> None:
     # Pixels of few paths are skewed, the truth's 5,120 among them, which no t-distribution corrects; sums over blocks of them are not.
@@ -61,15 +66,20 @@ def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least
     truth = json.loads((root / "truth.json").read_text())
     enamel, inner = truth["enamel"], truth["dentin"]
     tissue = Tissue(
-        Medium(enamel["sigma_t"], enamel["albedo"], enamel["beta"], enamel["g1"], enamel["g2"]), Medium(inner["sigma_t"], inner["albedo"], g1=inner["g"])
+        Medium(enamel["sigma_t"], enamel["albedo"], enamel["beta"], enamel["g1"], enamel["g2"]),
+        Medium(inner["sigma_t"], inner["albedo"], g1=inner["g"]),
     )
     assert tooth.dentin is not None
     dentin = DentinShape.known(tooth.dentin)
     lights = np.array([light.position_mm for light in capture.lights])
-    engine = Engine(single_tooth(tooth.outer, dentin, lights, np.array([light.intensity[0] for light in capture.lights])))
+    engine = Engine(
+        single_tooth(tooth.outer, dentin, lights, np.array([light.intensity[0] for light in capture.lights]))
+    )
     camera = capture.cameras[0]
     ours = engine.images(tissue, whole_view(camera), samples=samples, seed=41, batches=BATCHES)
     stems = [root / f"{camera.name}_{light.name}" for light in capture.lights]
-    stock, variance = (np.stack([np.load(f"{stem}{part}.npy").squeeze() for stem in stems]).astype(np.float64) for part in ("", "_var"))
+    stock, variance = (
+        np.stack([np.load(f"{stem}{part}.npy").squeeze() for stem in stems]).astype(np.float64) for part in ("", "_var")
+    )
     z = pixel_scores([ours.mean.reshape(stock.shape), stock], [ours.variance.reshape(stock.shape), variance], block)
     require_same_pictures(z, least)

@@ -83,13 +83,20 @@ def properties(*tissues: Tissue, **others: Any) -> SceneDict:
     """The integrator, matched unless told otherwise, for tissues of one or three channels."""
     from services.fit.plugin.integrator import medium_properties
 
-    media = {k: v for part in ("enamel", "dentin") for k, v in medium_properties(part, tuple(getattr(t, part) for t in tissues or (TISSUE,))).items()}
+    media = {
+        k: v
+        for part in ("enamel", "dentin")
+        for k, v in medium_properties(part, tuple(getattr(t, part) for t in tissues or (TISSUE,))).items()
+    }
     return {"type": "dentine", "enamel": "outer_11", "dentin": "dentin_11", "boundary": "matched"} | media | others
 
 
 def scene_dict(folder: Path, **shapes: SceneDict) -> SceneDict:
     """The tooth in stock media under a point light, with other shapes: stock integrators and ours render the same scene."""
-    return nested_scene({"11": (folder / "outer.ply", folder / "dentin.ply")}, TISSUE, (CAMERA,), LIGHTS_MM[0], INTENSITY) | shapes
+    return (
+        nested_scene({"11": (folder / "outer.ply", folder / "dentin.ply")}, TISSUE, (CAMERA,), LIGHTS_MM[0], INTENSITY)
+        | shapes
+    )
 
 
 def render(scene: Any, integrator: SceneDict, samples: int, seed: int) -> tuple[Array, Array]:
@@ -97,12 +104,25 @@ def render(scene: Any, integrator: SceneDict, samples: int, seed: int) -> tuple[
     import mitsuba as mi
 
     chosen = mi.load_dict(integrator)
-    stack = np.stack([np.array(mi.render(scene, integrator=chosen, spp=samples // BATCHES, seed=1009 * seed + b), dtype=np.float64) for b in range(BATCHES)])
+    stack = np.stack(
+        [
+            np.array(
+                mi.render(scene, integrator=chosen, spp=samples // BATCHES, seed=1009 * seed + b), dtype=np.float64
+            )
+            for b in range(BATCHES)
+        ]
+    )
     return stack.mean(axis=0).squeeze(), (stack.var(axis=0, ddof=1) / BATCHES).squeeze()
 
 
 def engine_images(
-    tissue: Tissue, light: int, seed: int, boundary: Boundary = "matched", intensity: float = INTENSITY, *, layered: bool = True
+    tissue: Tissue,
+    light: int,
+    seed: int,
+    boundary: Boundary = "matched",
+    intensity: float = INTENSITY,
+    *,
+    layered: bool = True,
 ) -> tuple[Array, Array]:
     """What the project's own engine sees, mean and its variance."""
     dentin = DentinShape.known(CORE) if layered else None
@@ -161,7 +181,11 @@ def test_each_colour_has_its_own_media(tooth: Path) -> None:
     # Each channel against the engine, which knows one channel at a time.
     from services.fit.plugin.integrator import register_integrator
 
-    tissues = (TISSUE, Tissue(Medium(0.8, 0.99, g1=0.3), Medium(6.0, 0.5, g1=0.1)), Tissue(Medium(3.0, 0.6, g1=-0.4), Medium(1.0, 0.99, 0.5, 0.7, -0.2)))
+    tissues = (
+        TISSUE,
+        Tissue(Medium(0.8, 0.99, g1=0.3), Medium(6.0, 0.5, g1=0.1)),
+        Tissue(Medium(3.0, 0.6, g1=-0.4), Medium(1.0, 0.99, 0.5, 0.7, -0.2)),
+    )
     scene = scene_dict(tooth)
     scene["camera_c0"]["film"]["pixel_format"] = "rgb"
     scene["light"]["intensity"] = {"type": "rgb", "value": [INTENSITY, 2 * INTENSITY, 3 * INTENSITY]}
@@ -204,7 +228,14 @@ def test_a_mirror_image_is_that_of_rough_plastic(tooth: Path) -> None:
     scene = scene_dict(tooth, table=table(-4.05, 0.5), lamp=LAMP, sky=SKY)
     dark = properties(Tissue(Medium(50.0, 0.0), Medium(50.0, 0.0)), boundary="thin", roughness=0.3)
     ours = render(load_scene(scene), dark, 256, 11)
-    plastic = {"type": "roughplastic", "distribution": "ggx", "alpha": 0.3, "int_ior": 1.631, "ext_ior": 1.0, "diffuse_reflectance": 0.0}
+    plastic = {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": 0.3,
+        "int_ior": 1.631,
+        "ext_ior": 1.0,
+        "diffuse_reflectance": 0.0,
+    }
     del scene["dentin_11"]
     scene["outer_11"] = {"type": "ply", "filename": str(tooth / "outer.ply"), "face_normals": True, "bsdf": plastic}
     compare(ours, render(load_scene(scene), {"type": "path", "max_depth": -1}, 256, 12), least=200)
@@ -340,7 +371,9 @@ def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> No
     assert core[0] / core[2] > 1.1 * edge[0] / edge[2]
 
 
-def test_the_gallery_renders_a_scene_of_ones_own(tooth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_gallery_renders_a_scene_of_ones_own(
+    tooth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from services.bench.figures.gallery import main
     from services.fit.export.scene_xml import write_scene
 

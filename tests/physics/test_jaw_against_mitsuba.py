@@ -33,7 +33,9 @@ def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, blo
     camera = dome_cameras(3, pixel_mm, tuple(tooth.outer for tooth in jaw.teeth))[0]
     mouth, fdi = known_mouth(jaw, "green", SUBJECT), tuple(tooth.fdi for tooth in jaw.teeth)
     files = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.cavity)
-    stock = render_mitsuba(mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, 0, samples, seed=5)
+    stock = render_mitsuba(
+        mouth_scene(files, fdi, mouth, (camera,), lights[0].position_mm, 1.0), lights, 0, samples, seed=5
+    )
     everything = np.ones(camera.size[::-1], dtype=bool)
     ours = render_engine(Engine(jaw.recipe(lights, 0, "matched")), mouth, camera, everything, samples, seed=6)
     return pixel_scores([ours[0], stock[0]], [ours[1], stock[1]], block)

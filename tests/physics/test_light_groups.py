@@ -28,7 +28,10 @@ def test_a_light_is_chosen_as_often_as_it_is_bright(lights: int) -> None:
     from services.fit.transport.lighting.light_groups import LightGroups
 
     rig = dome_lights(lights, ("green",), seed=1)
-    positions, intensities = np.array([light.position_mm for light in rig]), np.random.default_rng(2).uniform(0.1, 1, lights)
+    positions, intensities = (
+        np.array([light.position_mm for light in rig]),
+        np.random.default_rng(2).uniform(0.1, 1, lights),
+    )
     groups = LightGroups(positions, intensities)
     draw = dr.arange(mi.UInt32, groups.count * DRAWS)
     group, u = draw // DRAWS, (mi.Float(draw % DRAWS) + 0.5) / DRAWS

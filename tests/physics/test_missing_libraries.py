@@ -39,7 +39,9 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_a_missing_library_is_told_as_one_sentence(entry: str, packages: Path, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(packages), str(ROOT)))}
-    told = subprocess.run([sys.executable, *ENTRIES[entry]], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        [sys.executable, *ENTRIES[entry]], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert (told.returncode, told.stdout) == (4, "")
     assert told.stderr.removeprefix("dentine: ") == SENTENCE + "\n"
 
@@ -51,5 +53,7 @@ platform.PACKAGES = {"libatomib.so.1": platform.PACKAGES["libatomic.so.1"]}
 platform.prepare_device()
 """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(packages), str(ROOT)))}
-    told = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert told.stderr.splitlines()[-1].endswith("which this machine lacks; install libatomic1.")

@@ -29,7 +29,16 @@ from services.fit.transport.scene.mixed_border import MixedBorder
 from services.fit.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import MOUTH, mouth_recipe
-from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view
+from tests.support.small_tooth import (
+    INTENSITY,
+    LIGHTS_MM,
+    SEMI_AXES_MM,
+    camera_at,
+    dentin_shape,
+    ellipsoid,
+    recipe,
+    whole_view,
+)
 
 WIDTH_MM = 2.0
 # One pair of lobes, whose weight and albedo differ: stock media mix these by volumes, but not a lobe's g.
@@ -51,12 +60,20 @@ def test_a_gradual_border_looks_as_in_mitsuba(tmp_path: Path) -> None:
     share = share_of_enamel(core)
     scores = []
     for number, light in enumerate(lights):
-        described = nested_scene({"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}, TISSUE, (camera,), light, INTENSITY)
+        described = nested_scene(
+            {"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}, TISSUE, (camera,), light, INTENSITY
+        )
         for name in ("medium_enamel", "medium_dentin"):
             described[name]["albedo"] = volume(share * TISSUE.enamel.alpha + (1 - share) * TISSUE.dentin.alpha)
-            described[name]["phase"]["weight"] = volume(1 - (share * TISSUE.enamel.beta + (1 - share) * TISSUE.dentin.beta))
+            described[name]["phase"]["weight"] = volume(
+                1 - (share * TISSUE.enamel.beta + (1 - share) * TISSUE.dentin.beta)
+            )
         mean, variance = render_batches(load_scene(described), 0, samples=2048, seed=31 + number, batches=BATCHES)
-        scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
+        scores.append(
+            pixel_scores(
+                [ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]
+            )
+        )
     require_same_pictures(np.stack(scores), least=500)
 
 
@@ -136,7 +153,9 @@ def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: py
         monkeypatch.setattr(Scores, "mixed_albedo_motion", lambda *_: mi_zero())
     tissue = Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4))
     engine, view = Engine(replace(recipe(), border_width_mm=1.2)), whole_view(camera_at((0.2, 1, 0.1)), 1)
-    scores = np.array([engine.jacobian(tissue, view, ("shape.0",), samples=1024, seed=seed).jacobian.sum() for seed in range(8)])
+    scores = np.array(
+        [engine.jacobian(tissue, view, ("shape.0",), samples=1024, seed=seed).jacobian.sum() for seed in range(8)]
+    )
 
     def totals(c: float) -> NDArray[np.float64]:
         moved = tissue.with_values({"shape.0": c})

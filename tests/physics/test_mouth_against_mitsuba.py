@@ -32,7 +32,11 @@ def test_the_small_mouth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
     for number in range(len(LIGHTS_MM)):
         stock = load_scene(stock_mouth(tmp_path, camera, number, boundary, samples=128))
         mean, variance = render_batches(stock, 0, samples=2048, seed=71 + number, batches=BATCHES)
-        scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
+        scores.append(
+            pixel_scores(
+                [ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]
+            )
+        )
     require_same_pictures(np.stack(scores), least=500)
 
 

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from services.fit.execution.numerics import NUMERICS, numerics_name
 from tests.support.golden_numerics import STORED, fit_results, renders
 
-REMEDY = "if that is meant, raise services.fit.execution.numerics.NUMERICS and run python -m tests.support.golden_numerics"
+REMEDY = (
+    "if that is meant, raise services.fit.execution.numerics.NUMERICS and run python -m tests.support.golden_numerics"
+)
 RENDER_TOLERANCE = 1e-3
 """Of the largest value. Thread counts alone change an image by 1e-5 and a derivative by 1e-4 of its norm (test_engine_repeats); other random
 numbers change most of them by a tenth."""
@@ -48,4 +50,6 @@ def test_a_fit_records_what_it_recorded(golden: dict[str, NDArray[np.float64]]) 
     assert found.keys() == keys, f"other results: {sorted(found.keys() ^ keys)}; {REMEDY}"
     for key, value in found.items():
         assert value.shape == golden[key].shape, f"{key} has another shape; {REMEDY}"
-        np.testing.assert_allclose(value, golden[key], rtol=FIT_TOLERANCE, atol=FIT_TOLERANCE, err_msg=f"{key}; {REMEDY}")
+        np.testing.assert_allclose(
+            value, golden[key], rtol=FIT_TOLERANCE, atol=FIT_TOLERANCE, err_msg=f"{key}; {REMEDY}"
+        )

@@ -13,7 +13,9 @@ from services.fit.optics.parameters import Medium
 from services.fit.transport.platform import prepare_device
 from tests.support.z_scores import LARGEST_Z
 
-G = np.array([0.0, 1e-7, -1e-6, 1e-3, -0.05, 0.3, -0.3, 0.5, -0.7, 0.9, -0.95, 0.99, -0.999, 0.9999, -0.9999], dtype=np.float32)
+G = np.array(
+    [0.0, 1e-7, -1e-6, 1e-3, -0.05, 0.3, -0.3, 0.5, -0.7, 0.9, -0.95, 0.99, -0.999, 0.9999, -0.9999], dtype=np.float32
+)
 """Mean cosines. In single precision 1 - |g| is exact for |g| >= 0.5, so the corner loses nothing that its input still has."""
 ROUNDING = 6e-8
 """Half a unit in the last place of single precision."""
@@ -29,7 +31,9 @@ def kernel(function: Callable[..., Any], *columns: NDArray[np.float32]) -> NDArr
     import mitsuba as mi
 
     shape = np.broadcast_shapes(*(column.shape for column in columns))
-    arguments = [mi.Float(np.ascontiguousarray(np.broadcast_to(column, shape).ravel(), dtype=np.float32)) for column in columns]
+    arguments = [
+        mi.Float(np.ascontiguousarray(np.broadcast_to(column, shape).ravel(), dtype=np.float32)) for column in columns
+    ]
     return np.array(function(*arguments), dtype=np.float64).reshape(shape)
 
 
@@ -67,7 +71,9 @@ def test_phase_function_derivatives() -> None:
     # The formula itself against differences of log density at fixed angle; its step leaves a relative error of 1e-8.
     inner = np.abs(np.float64(G)) < 0.9995
     step = 1e-4 * (1 - a[inner])
-    up, down = (np.log((1 - h**2) / ((1 - h) ** 2 + 2 * h * m) ** 1.5) * sign[inner] for h in (a[inner] + step, a[inner] - step))
+    up, down = (
+        np.log((1 - h**2) / ((1 - h) ** 2 + 2 * h * m) ** 1.5) * sign[inner] for h in (a[inner] + step, a[inner] - step)
+    )
     assert (np.abs((up - down) / (2 * step) - truth[inner]) <= 1e-7 * (size[inner] + 1)).all()
 
 
@@ -86,7 +92,9 @@ def test_phase_functions_integrate_to_one() -> None:
 def test_sampled_deviations_invert_the_distribution() -> None:
     from services.fit.optics import phase
 
-    u = np.concatenate([np.linspace(0, 1, 401)[:-1], 1 - np.logspace(-7, -2, 60), np.logspace(-9, -2, 60)]).astype(np.float32)
+    u = np.concatenate([np.linspace(0, 1, 401)[:-1], 1 - np.logspace(-7, -2, 60), np.logspace(-9, -2, 60)]).astype(
+        np.float32
+    )
     ours = kernel(phase.sample_deviation, G[:, None], u[None, :])
     a, v = np.abs(np.float64(G))[:, None], np.float64(u)[None, :]
     textbook = (1 + a**2 - ((1 - a**2) / (1 - a + 2 * a * v)) ** 2) / (2 * np.maximum(a, 1e-3))
@@ -107,7 +115,9 @@ def test_sampled_directions_have_the_right_moments() -> None:
     for number, g in enumerate(G):
         rng = mi.PCG32(count, initstate=number)
         omega = dr.normalize(mi.Vector3f(rng.next_float32() - 0.5, rng.next_float32() - 0.5, rng.next_float32() - 0.5))
-        turned = phase.turn(omega, mi.Float(g), phase.sample_deviation(mi.Float(g), rng.next_float32()), rng.next_float32())
+        turned = phase.turn(
+            omega, mi.Float(g), phase.sample_deviation(mi.Float(g), rng.next_float32()), rng.next_float32()
+        )
         before, after = np.array(omega, dtype=np.float64), np.array(turned, dtype=np.float64)
         np.testing.assert_allclose(np.linalg.norm(after, axis=0), 1, atol=1e-6)
         cosine = np.einsum("ij,ij->j", before, after)
@@ -133,7 +143,9 @@ def test_nearly_parallel_directions_stay_apart() -> None:
         assert (np.abs(np.sqrt(2 * ours) - 2 * np.sin(angle / 2)) <= 2e-7).all()
 
 
-def direction_deviation(function: Callable[..., Any], g: float, before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.float64]:
+def direction_deviation(
+    function: Callable[..., Any], g: float, before: NDArray[np.float32], after: NDArray[np.float32]
+) -> NDArray[np.float64]:
     import mitsuba as mi
 
     return np.array(function(mi.Float(g), mi.Vector3f(before), mi.Vector3f(after.T)), dtype=np.float64)
@@ -150,7 +162,9 @@ def test_fresnel_reflectance(eta: float) -> None:
     truth = np.where(1 - c**2 >= n**2, 1.0, 0.5 * (np.abs(s) ** 2 + np.abs(p) ** 2))
     ours = kernel(fresnel.reflectance, cosine, np.float32([eta]))
     # Near the critical angle the transmitted cosine is the root of a rounding error, and enters linearly.
-    transmitted_error = np.minimum(ROUNDING * 4 / n**2 / np.maximum(inside.real, 1e-12), np.sqrt(ROUNDING * 4) / min(n, 1))
+    transmitted_error = np.minimum(
+        ROUNDING * 4 / n**2 / np.maximum(inside.real, 1e-12), np.sqrt(ROUNDING * 4) / min(n, 1)
+    )
     assert (np.abs(ours - truth) <= 20 * ROUNDING + 8 * max(n, 1 / n) * transmitted_error).all()
     assert ((ours >= 0) & (ours <= 1 + 1e-6)).all()
     assert fresnel_at_normal(ours, cosine) == pytest.approx(((eta - 1) / (eta + 1)) ** 2, abs=1e-7)

@@ -23,7 +23,14 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.recipe import single_tooth
 from tests.support.exit_tables import angular_cases
-from tests.support.phase_tables import TENT_SPACING_RAD, cumulative, density, henyey_greenstein, over_equal_angles, over_equal_cosines
+from tests.support.phase_tables import (
+    TENT_SPACING_RAD,
+    cumulative,
+    density,
+    henyey_greenstein,
+    over_equal_angles,
+    over_equal_cosines,
+)
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.slab_tables import simulate, total_cases
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
@@ -51,13 +58,17 @@ def _device() -> None:
 
 
 def directions(angle_rad: NDArray[np.float64], azimuth_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([np.sin(angle_rad) * np.cos(azimuth_rad), np.sin(angle_rad) * np.sin(azimuth_rad), np.cos(angle_rad)])
+    return np.stack(
+        [np.sin(angle_rad) * np.cos(azimuth_rad), np.sin(angle_rad) * np.sin(azimuth_rad), np.cos(angle_rad)]
+    )
 
 
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_are_normalised_and_know_their_mean(name: str) -> None:
     table = TABLES[name]
-    angle = np.unique(np.concatenate([np.linspace(0, math.pi, 20001), np.geomspace(1e-7, 1e-2, 20000), table.angles_rad]))
+    angle = np.unique(
+        np.concatenate([np.linspace(0, math.pi, 20001), np.geomspace(1e-7, 1e-2, 20000), table.angles_rad])
+    )
     assert abs(cumulative(table, np.array([math.pi]))[0] - 1) < 1e-12
     # By parts, the mean cosine is 1 less the integral of (1 - F) sin; the trapezoidal rule leaves 1e-7.
     mean = 1 - np.trapezoid((1 - cumulative(table, angle)) * np.sin(angle), angle)
@@ -73,7 +84,9 @@ def test_a_dictionary_of_tents_adds_up() -> None:
     table = TABLES["peak of thousands on a floor"]
     assert weights @ np.array(table.values) == pytest.approx(1, rel=1e-13)
     tents = [over_equal_angles(200, {n: 1.0}) for n in range(200)]
-    mean = sum(weight * value * tent.mean_cosine for weight, value, tent in zip(weights, table.values, tents, strict=True))
+    mean = sum(
+        weight * value * tent.mean_cosine for weight, value, tent in zip(weights, table.values, tents, strict=True)
+    )
     assert table.mean_cosine == pytest.approx(mean, rel=1e-12)
     assert max(TABLES["forward tent"].values) == pytest.approx(1 / weights[0]) == pytest.approx(2554.4, rel=1e-4)
 
@@ -86,7 +99,9 @@ def test_values_in_a_kernel(name: str) -> None:
 
     table = TABLES[name]
     rng = np.random.default_rng(5)
-    angle = np.concatenate([rng.uniform(0, math.pi, 4000), 10 ** rng.uniform(-6, 0, 2000), math.pi - 10 ** rng.uniform(-6, 0, 2000)])
+    angle = np.concatenate(
+        [rng.uniform(0, math.pi, 4000), 10 ** rng.uniform(-6, 0, 2000), math.pi - 10 ** rng.uniform(-6, 0, 2000)]
+    )
     before = np.broadcast_to(np.array([[0.6], [0.0], [0.8]]), (3, len(angle)))
     turned = directions(angle, rng.uniform(0, 2 * math.pi, len(angle)))
     frame = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
@@ -125,7 +140,9 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
     value = np.array(tables.density(mi.UInt32(1), omega, turned))
     before, after = np.array(omega, dtype=np.float64), np.array(turned, dtype=np.float64)
     half = np.linalg.norm(after - before, axis=0) / 2
-    angle = 2 * np.where(half < 0.7, np.arcsin(np.minimum(half, 1)), np.arccos(np.minimum(np.linalg.norm(after + before, axis=0) / 2, 1)))
+    angle = 2 * np.where(
+        half < 0.7, np.arcsin(np.minimum(half, 1)), np.arccos(np.minimum(np.linalg.norm(after + before, axis=0) / 2, 1))
+    )
 
     # What the table calls empty is hit only by rounding of a direction at its rim.
     assert np.count_nonzero(value == 0) <= 1e-4 * SAMPLES
@@ -143,7 +160,12 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
 def test_tabulated_lobes_reproduce_slab_totals() -> None:
     # Two walks that draw from phase functions of distance d differ in at most d of their scatterings; of (1 - R - T) alpha / (1 - alpha) on
     # average. The tables are so fine that this is below a tenth of a standard error.
-    rows = ("a=0.9 g=0.75 tau=2 n=1 ", "a=0.8 g=-0.9 tau=2 n=1 ", "a=0.9 g=-0.99 tau=5 n=1 ", "a=0.98 g=0.96 tau=6 n=1.631 ")
+    rows = (
+        "a=0.9 g=0.75 tau=2 n=1 ",
+        "a=0.8 g=-0.9 tau=2 n=1 ",
+        "a=0.9 g=-0.99 tau=5 n=1 ",
+        "a=0.98 g=0.96 tau=6 n=1.631 ",
+    )
     cases = [case for case in total_cases() if case.name.startswith(rows) and case.source == "normal"]
     assert len(cases) == len(rows)
     scores = []
@@ -181,8 +203,17 @@ def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     camera, light = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0), LIGHTS_MM[1]
     scene = single_tooth(outer, dentin, light[None], np.array([INTENSITY]))
     ours = Engine(scene).images(tissue, whole_view(camera), samples=2048, seed=931, batches=BATCHES)
-    stock = nested_scene({"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")}, Tissue(Medium(1.5, 0.95), lobes), (camera,), light, INTENSITY)
-    stock["medium_enamel"]["phase"] = {"type": "tabphase", "values": ", ".join(f"{value:.9g}" for value in values[::-1])}
+    stock = nested_scene(
+        {"11": (tmp_path / "outer.ply", tmp_path / "dentin.ply")},
+        Tissue(Medium(1.5, 0.95), lobes),
+        (camera,),
+        light,
+        INTENSITY,
+    )
+    stock["medium_enamel"]["phase"] = {
+        "type": "tabphase",
+        "values": ", ".join(f"{value:.9g}" for value in values[::-1]),
+    }
     mean, variance = render_batches(load_scene(stock), 0, samples=2048, seed=941, batches=BATCHES)
     scores = pixel_scores([ours.mean.reshape(mean.shape), mean], [ours.variance.reshape(mean.shape), variance])
     require_same_pictures(scores, least=250)
@@ -213,7 +244,12 @@ def test_tables_that_make_no_sense_are_refused(angles: tuple[float, ...], values
 
 
 def test_a_layers_table_comes_from_plain_numbers_and_has_no_lobes_to_derive() -> None:
-    plain: dict[str, Any] = {"sigma": 1, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1, 3.14159265], "values": [4, 2, 0]}}
+    plain: dict[str, Any] = {
+        "sigma": 1,
+        "alpha": 0.9,
+        "thickness_mm": 1,
+        "table": {"angles_rad": [0, 1, 3.14159265], "values": [4, 2, 0]},
+    }
     layer = Layer.model_validate(plain)
     assert layer.table == PhaseTable((0.0, 1.0, math.pi), (4.0, 2.0, 0.0))
     result = simulate_slab((layer,), gradient=True, rel_error=0.05, max_seconds=5)
@@ -233,4 +269,6 @@ def test_derivatives_to_lobes_that_a_table_replaces_are_refused() -> None:
 
 def test_a_table_is_refused_where_only_lobes_can_be_written() -> None:
     with pytest.raises(InputError, match=r"An exported scene cannot hold a phase table; fit lobes to it first\."):
-        nested_scene({}, Tissue(Medium(1.5, 0.95, table=TABLES["isotropic"]), Medium(1.0, 0.5)), (), (0.0, 0.0, 1.0), 1.0)
+        nested_scene(
+            {}, Tissue(Medium(1.5, 0.95, table=TABLES["isotropic"]), Medium(1.0, 0.5)), (), (0.0, 0.0, 1.0), 1.0
+        )

@@ -43,10 +43,17 @@ CASES = [
 
 
 @pytest.mark.parametrize(("tissue", "boundary", "paths", "bias"), CASES)
-def test_it_is_the_derivative_of_the_weighted_images(tissue: Tissue, boundary: Boundary, paths: int, bias: float) -> None:
+def test_it_is_the_derivative_of_the_weighted_images(
+    tissue: Tissue, boundary: Boundary, paths: int, bias: float
+) -> None:
     engine, view = Engine(recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1)
     weights = _residual(engine, tissue, view)
-    found = np.array([engine.shape_gradient(tissue, view, weights, seed=seed, samples=1024, photons=16384).gradient for seed in range(SEEDS)])
+    found = np.array(
+        [
+            engine.shape_gradient(tissue, view, weights, seed=seed, samples=1024, photons=16384).gradient
+            for seed in range(SEEDS)
+        ]
+    )
     limit = stats.t.isf(FALSE_ALARM / (2 * 2 * len(CASES)), SEEDS - 1)
     for mode in range(2):
         expected = [_difference(engine, tissue, view, weights, mode, paths, seed) for seed in range(SEEDS)]
@@ -71,7 +78,9 @@ def test_its_errors_are_honest() -> None:
 def test_it_repeats_bit_for_bit_and_seeds_matter() -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
     weights = np.ones((5, len(view)))
-    first, again, other = (engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=16).gradient for seed in (1, 1, 2))
+    first, again, other = (
+        engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=16).gradient for seed in (1, 1, 2)
+    )
     assert (first == again).all()
     assert (first != other).all()
 
@@ -119,7 +128,9 @@ TABULATED = replace(CLEAR, dentin=replace(CLEAR.dentin, table=PhaseTable((0.0, n
 def test_borders_and_media_that_it_does_not_know_are_refused(tissue: Tissue, border_width_mm: float) -> None:
     view = whole_view(camera_at((0.2, 1, 0.1)), 2)
     with pytest.raises(InputError, match="take the Jacobian"):
-        Engine(replace(recipe(), border_width_mm=border_width_mm)).shape_gradient(tissue, view, np.ones((5, len(view))), seed=0, samples=16)
+        Engine(replace(recipe(), border_width_mm=border_width_mm)).shape_gradient(
+            tissue, view, np.ones((5, len(view))), seed=0, samples=16
+        )
 
 
 @pytest.mark.slow
@@ -135,7 +146,12 @@ def test_in_a_mouth_one_tooth_moves() -> None:
     x, y = whole.pixels.T
     view = replace(whole, pixels=whole.pixels[(x >= 1) & (x <= 5) & (y >= 3) & (y <= 11)])
     weights = np.ones((len(LIGHTS_MM), len(view)))
-    found = np.array([engine.shape_gradient(mouth, view, weights, seed=seed, samples=1024, photons=2**18, tooth=1).gradient[0] for seed in range(SEEDS)])
+    found = np.array(
+        [
+            engine.shape_gradient(mouth, view, weights, seed=seed, samples=1024, photons=2**18, tooth=1).gradient[0]
+            for seed in range(SEEDS)
+        ]
+    )
 
     def total(c: float, seed: int) -> float:
         return float(engine.images(mouth.with_values({"1.shape.0": c}), view, samples=8192, seed=seed).mean.sum())
@@ -154,7 +170,9 @@ def _residual(engine: Engine, tissue: Tissue, view: View) -> NDArray[np.float64]
     return images[1] - images[0]
 
 
-def _difference(engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int, seed: int) -> float:
+def _difference(
+    engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int, seed: int
+) -> float:
     """Free of its bias to fourth order by two steps."""
     middle = tissue.shape[mode]
 

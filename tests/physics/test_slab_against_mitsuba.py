@@ -19,7 +19,11 @@ from tests.support.small_slab import small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal
 
 LIGHTS = [{"name": "l0", "side": "front", "angle_deg": 5.0}, {"name": "l1", "side": "back", "angle_deg": 25.0}]
-CAMERAS = [{"name": f"{side}{angle}", "side": side, "angle_deg": float(angle)} for side in ("front", "back") for angle in (-20, 40)]
+CAMERAS = [
+    {"name": f"{side}{angle}", "side": side, "angle_deg": float(angle)}
+    for side in ("front", "back")
+    for angle in (-20, 40)
+]
 HALF_WIDTH_MM = 200.0
 BATCHES = 16
 
@@ -27,7 +31,9 @@ BATCHES = 16
 def direction(side: str, angle_deg: float, *, arriving: bool) -> np.ndarray:
     """Travelling direction of a light that arrives at a face or of light that leaves it."""
     forward = (side == "front") == arriving
-    return np.array([math.sin(math.radians(angle_deg)), 0.0, math.cos(math.radians(angle_deg)) * (1 if forward else -1)])
+    return np.array(
+        [math.sin(math.radians(angle_deg)), 0.0, math.cos(math.radians(angle_deg)) * (1 if forward else -1)]
+    )
 
 
 def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +41,12 @@ def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np
     prepare_device()
     import mitsuba as mi
 
-    medium = {"type": "homogeneous", "sigma_t": sigma_s + sigma_a, "albedo": sigma_s / (sigma_s + sigma_a), "phase": {"type": "hg", "g": g}}
+    medium = {
+        "type": "homogeneous",
+        "sigma_t": sigma_s + sigma_a,
+        "albedo": sigma_s / (sigma_s + sigma_a),
+        "phase": {"type": "hg", "g": g},
+    }
     # The cube reaches from -1 to 1 in its own frame.
     to_world = mi.ScalarTransform4f().translate([0, 0, 0.5]).scale([HALF_WIDTH_MM, HALF_WIDTH_MM, 0.5])
     means, errors = [], []
@@ -43,7 +54,9 @@ def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np
         for camera in CAMERAS:
             leaving = direction(camera["side"], camera["angle_deg"], arriving=False)
             face = np.array([0.0, 0.0, 0.0 if camera["side"] == "front" else 1.0])
-            view = mi.ScalarTransform4f().look_at(origin=(face + 10 * leaving).tolist(), target=face.tolist(), up=[0, 1, 0])
+            view = mi.ScalarTransform4f().look_at(
+                origin=(face + 10 * leaving).tolist(), target=face.tolist(), up=[0, 1, 0]
+            )
             scene = mi.load_dict(
                 {
                     "type": "scene",
@@ -57,7 +70,13 @@ def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np
                     "sensor": {
                         "type": "orthographic",
                         "to_world": view @ mi.ScalarTransform4f().scale([0.01, 0.01, 1]),
-                        "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "luminance"},
+                        "film": {
+                            "type": "hdrfilm",
+                            "width": 1,
+                            "height": 1,
+                            "rfilter": {"type": "box"},
+                            "pixel_format": "luminance",
+                        },
                     },
                 },
                 optimize=False,
@@ -72,8 +91,12 @@ def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np
 @pytest.mark.parametrize(("sigma_s", "g", "sigma_a"), [(1.0, 0.6, 0.1), (3.0, -0.2, 0.05), (0.5, 0.0, 0.5)])
 def test_matched_cells_agree_with_stock_mitsuba(sigma_s: float, g: float, sigma_a: float) -> None:
     pixels = {"x_mm": [-HALF_WIDTH_MM, HALF_WIDTH_MM], "y_mm": [-HALF_WIDTH_MM, HALF_WIDTH_MM], "columns": 2, "rows": 2}
-    rig = small_rig(cell={"width_mm": 1.0, "index": None, "boundary": "matched"}, pixels=pixels, lights=LIGHTS, cameras=CAMERAS)
-    images = render(rig, henyey_greenstein(sigma_s, g, sigma_a), seed=3, step=0, batches=BATCHES, paths=16000, scores=False).images
+    rig = small_rig(
+        cell={"width_mm": 1.0, "index": None, "boundary": "matched"}, pixels=pixels, lights=LIGHTS, cameras=CAMERAS
+    )
+    images = render(
+        rig, henyey_greenstein(sigma_s, g, sigma_a), seed=3, step=0, batches=BATCHES, paths=16000, scores=False
+    ).images
     slants = np.repeat([math.cos(math.radians(light["angle_deg"])) for light in LIGHTS], len(CAMERAS))
     ours = images.sum(axis=-1) * rig.grid.area_mm2 * slants
     truth, truth_error = by_mitsuba(sigma_s, g, sigma_a)

@@ -70,8 +70,12 @@ def is_zero(value: float, error: float) -> bool:
     return abs(value) <= LARGEST_Z * error
 
 
-@pytest.mark.parametrize("case", ["Z1", "Z2", "Z3", "Z4", *(pytest.param(case, marks=pytest.mark.slow) for case in ("Z5", "Z6", "Z7"))])
-def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "case", ["Z1", "Z2", "Z3", "Z4", *(pytest.param(case, marks=pytest.mark.slow) for case in ("Z5", "Z6", "Z7"))]
+)
+def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (slab,) = named(zero_cases(), case)
     seed = 600 + int(case[1])
     sums = simulate(slab, passes(2), seed, border_terms_only=True)

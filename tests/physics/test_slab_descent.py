@@ -72,7 +72,9 @@ def test_the_descent_stays_on_the_simplex_and_repeats() -> None:
     rig, start = small_rig(), henyey_greenstein(0.6, 0.3, 0.1)
     images = single_scattering(rig, henyey_greenstein(1.0, 0.5, 0.1), scores=False)[0]
     measured = Measurements(images, np.ones_like(images), np.zeros(len(images), dtype=bool), ("",) * len(images), False)
-    first, again = (descend(rig, measured, start, 1, DescentOptions(iterations=3, rate=1e-10, paths=50)) for _ in range(2))
+    first, again = (
+        descend(rig, measured, start, 1, DescentOptions(iterations=3, rate=1e-10, paths=50)) for _ in range(2)
+    )
     np.testing.assert_array_equal(first.scattering, again.scattering)
     assert (first.weights() >= 0).all()
     assert first.weights().sum() == pytest.approx(1)

@@ -34,7 +34,9 @@ def test_radiance_at_every_exit_cosine_agrees_with_van_de_hulst() -> None:
 
 
 def test_half_spaces_agree_with_the_h_function() -> None:
-    cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5") + half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.8", "0.9", "0.99")
+    cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5") + half_space_cases(
+        TOLERANCE, RADIANCE_TOLERANCE, "0.8", "0.9", "0.99"
+    )
     assert len(cases) == 12
     require_truth(cases, seed=811)
 
@@ -99,14 +101,18 @@ def test_layers_cut_in_two_look_as_one() -> None:
     for kind in ("radiance", "rings"):
         ours, theirs = getattr(one, kind), getattr(two, kind)
         for side in ("R", "T"):
-            values, errors = (np.array([getattr(part, side + suffix) for part in (ours, theirs)]) for suffix in ("", "_se"))
+            values, errors = (
+                np.array([getattr(part, side + suffix) for part in (ours, theirs)]) for suffix in ("", "_se")
+            )
             assert (np.abs(values[0] - values[1]) <= LARGEST_Z * np.hypot(*errors)).all()
 
 
 def test_rings_and_radiance_leave_unscattered_light_out() -> None:
     # Nothing scatters, so nothing but the beam and its mirror images leaves.
     black = Layer(sigma=1, alpha=0, thickness_mm=1)
-    result = simulate_slab((black,), boundary="smooth", ior=1.5, exit_cosines=(1.0,), ring_edges_mm=(0.1,), rel_error=0.5, max_seconds=1)
+    result = simulate_slab(
+        (black,), boundary="smooth", ior=1.5, exit_cosines=(1.0,), ring_edges_mm=(0.1,), rel_error=0.5, max_seconds=1
+    )
     beam = 0.96**2 * math.exp(-1) / (1 - 0.04**2 * math.exp(-2))
     assert abs(result.T / beam - 1) < 1e-4
     assert result.radiance is not None

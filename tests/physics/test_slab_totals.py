@@ -56,7 +56,10 @@ def test_totals_of_the_deepest_white_slabs_agree(source: str) -> None:
 @pytest.mark.parametrize("source", SOURCES)
 def test_white_slabs_return_all_light(boundary: str, ior: float, source: str) -> None:
     # |R + T - 1| < 1e-3. R and T of a white slab are nearly perfectly anticorrelated, so 2e-4 each leaves their sum far below that.
-    layers = (Layer(sigma=3, alpha=1, g1=0.6, thickness_mm=0.5), Layer(sigma=6, alpha=1, beta=0.8, g1=0.7, g2=-0.2, thickness_mm=0.5))
+    layers = (
+        Layer(sigma=3, alpha=1, g1=0.6, thickness_mm=0.5),
+        Layer(sigma=6, alpha=1, beta=0.8, g1=0.7, g2=-0.2, thickness_mm=0.5),
+    )
     case = SlabCase("white", layers, boundary, ior, source, (), np.zeros((1, 2)))
     mean = simulate_totals(case, 1e-3, seed=7).mean()[0]
     assert abs(mean.sum() - 1) < 1e-3
@@ -69,6 +72,10 @@ def test_energy_never_grows(boundary: str) -> None:
     last = 1.001
     for alpha in (1 - 1e-7, 0.999, 0.9, 0.0):
         layers = (Layer(sigma=4, alpha=alpha, g1=0.7, thickness_mm=1),)
-        total = simulate_totals(SlabCase("grey", layers, boundary, 1.5, "diffuse", (), np.zeros((1, 2))), 3e-3, seed=3).mean().sum()
+        total = (
+            simulate_totals(SlabCase("grey", layers, boundary, 1.5, "diffuse", (), np.zeros((1, 2))), 3e-3, seed=3)
+            .mean()
+            .sum()
+        )
         assert total < last
         last = total

@@ -21,12 +21,22 @@ from tests.support.z_scores import require_unbiased, student_to_normal
 NORMAL_LIGHT = [{"name": "l0", "side": "front", "angle_deg": 0.0}]
 
 
-def totals(material: Material, index: float, *, blocks: int, paths: int, glass: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+def totals(
+    material: Material, index: float, *, blocks: int, paths: int, glass: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """R and T of light at normal incidence, all orders, and their standard errors; index 1 is a matched boundary."""
     walls = None if glass is None else {"index": glass, "thickness_mm": 1.0}
-    cell = {"width_mm": 1.0, "index": index, "index_outside": 1.0, "boundary": "smooth" if index > 1 else "matched", "glass": walls}
+    cell = {
+        "width_mm": 1.0,
+        "index": index,
+        "index_outside": 1.0,
+        "boundary": "smooth" if index > 1 else "matched",
+        "glass": walls,
+    }
     rig = small_rig(lights=NORMAL_LIGHT, cell=cell)
-    sums = np.stack([run_block(Block(rig, 0, material, 7, (0, number), paths, False)).totals for number in range(blocks)])
+    sums = np.stack(
+        [run_block(Block(rig, 0, material, 7, (0, number), paths, False)).totals for number in range(blocks)]
+    )
     assert (sums[:, 2] == 0).all()
     # What was never scattered goes to and fro between the faces.
     reflected = 1 - rig.interface.transmittance(0.0)
@@ -52,7 +62,9 @@ def test_totals_agree_with_adding_doubling() -> None:
         if not (0.01 <= row["tau"] <= 10 and abs(row["g"]) <= 0.9):
             continue
         sigma = row["tau"]
-        got, error = totals(henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=12000)
+        got, error = totals(
+            henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=12000
+        )
         truth = np.array([row["R_normal"], row["T_normal"]])
         # Tolerance 3e-3. HG on straight lines between knots 0.9 degrees apart moves totals by some 1e-5.
         assert (error <= 1e-3).all(), row
@@ -113,7 +125,10 @@ def test_blocks_repeat_and_may_run_in_any_order() -> None:
     def backwards(task, blocks):  # type: ignore[no-untyped-def]
         return [task(block) for block in reversed(blocks)][::-1]
 
-    first, second = (render(rig, material, seed=3, step=1, batches=2, paths=300, scores=True, blocks=blocks) for blocks in (map, backwards))
+    first, second = (
+        render(rig, material, seed=3, step=1, batches=2, paths=300, scores=True, blocks=blocks)
+        for blocks in (map, backwards)
+    )
     np.testing.assert_array_equal(first.images, second.images)
     np.testing.assert_array_equal(first.rows, second.rows)
     other = render(rig, material, seed=3, step=2, batches=2, paths=300, scores=False)
@@ -125,7 +140,8 @@ def test_glass_of_no_thickness_and_the_samples_index_changes_nothing() -> None:
     material = henyey_greenstein(1.0, 0.7, 0.1)
     cell = {"width_mm": 1.0, "index": 1.33, "boundary": "smooth"}
     plain, walled = (
-        single_scattering(small_rig(cell=cell | extra), material, scores=False)[0] for extra in ({}, {"glass": {"index": 1.33, "thickness_mm": 1e-9}})
+        single_scattering(small_rig(cell=cell | extra), material, scores=False)[0]
+        for extra in ({}, {"glass": {"index": 1.33, "thickness_mm": 1e-9}})
     )
     np.testing.assert_allclose(walled, plain, rtol=1e-6)
 
@@ -155,7 +171,9 @@ def test_scores_agree_with_differences(thickness: float) -> None:
         for sign in (1, -1):
             change = sign * size * direction
             other = Material(material.scattering * (1 + change[:KNOTS]), material.absorption_per_mm + float(change[-1]))
-            sides.append(render(rig, other, seed=13 + number, step=0, batches=batches, paths=paths, scores=False).images)
+            sides.append(
+                render(rig, other, seed=13 + number, step=0, batches=batches, paths=paths, scores=False).images
+            )
         slopes = np.einsum("ip,bip->b", weights, (sides[0] - sides[1]) / (2 * size))
         claimed = gradients @ direction
         error = math.hypot(slopes.std(ddof=1), claimed.std(ddof=1)) / math.sqrt(batches)

@@ -38,7 +38,9 @@ def four(totals: Totals) -> tuple[float, float, float, float]:
 
 
 @pytest.mark.parametrize(("albedo", "g", "depth", "index", "values"), TABLE)
-def test_totals_agree_with_adding_doubling(albedo: float, g: float, depth: float, index: float, values: tuple[float, float, float, float]) -> None:
+def test_totals_agree_with_adding_doubling(
+    albedo: float, g: float, depth: float, index: float, values: tuple[float, float, float, float]
+) -> None:
     totals = slab_totals(Optics(1 - albedo, albedo, g), depth, Interface(index))
     # 4e-5 is what 32 nodes leave of g = 0.9 behind a refracting face; the other rows are nearer.
     assert four(totals) == pytest.approx(values, abs=5e-5)
@@ -47,7 +49,9 @@ def test_totals_agree_with_adding_doubling(albedo: float, g: float, depth: float
 def test_totals_converge() -> None:
     # The table's own error is 6e-8, its printed digits leave 5e-9.
     for albedo, g, depth, index, values in TABLE:
-        assert four(slab_totals(Optics(1 - albedo, albedo, g), depth, Interface(index), nodes=96)) == pytest.approx(values, abs=1e-7)
+        assert four(slab_totals(Optics(1 - albedo, albedo, g), depth, Interface(index), nodes=96)) == pytest.approx(
+            values, abs=1e-7
+        )
 
 
 def test_totals_agree_with_the_whole_table() -> None:

@@ -72,7 +72,12 @@ def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, bound
     from services.fit.transport.scene.media import Media
 
     lanes = trace(corners, paths=4, most_steps=STEPS, seed=5)
-    brightest = lanes.totals[:, :2].min(axis=1) * corners.diffuse * (corners.boundary == boundary) * (corners.beta < 1).any(axis=0)
+    brightest = (
+        lanes.totals[:, :2].min(axis=1)
+        * corners.diffuse
+        * (corners.boundary == boundary)
+        * (corners.beta < 1).any(axis=0)
+    )
     number = int(brightest.argmax())
     assert brightest[number] > 0.01
     ior = float(corners.ior[number])
@@ -83,13 +88,18 @@ def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, bound
     totals, derivatives = Walk(geometry, media, None, start, plan, None if boundary == MATCHED else ior).run(4).arrays()
     # The same random numbers take the same path; the two kernels round some sums differently.
     np.testing.assert_allclose(lanes.totals[number], totals[number] / 4, rtol=1e-5)
-    np.testing.assert_allclose(lanes.derivatives[:, number], np.stack(derivatives)[:, number, :2] / 4, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        lanes.derivatives[:, number], np.stack(derivatives)[:, number, :2] / 4, rtol=1e-4, atol=1e-6
+    )
 
 
 def test_slab_tables_as_lanes_of_one_kernel() -> None:
     copies, cases = 128, total_cases()
     slabs = [case.layers[0] for case in cases]
-    table = [(m.alpha, m.g1, m.thickness_mm, case.ior, case.boundary == "smooth", case.source == "diffuse") for m, case in zip(slabs, cases, strict=True)]
+    table = [
+        (m.alpha, m.g1, m.thickness_mm, case.ior, case.boundary == "smooth", case.source == "diffuse")
+        for m, case in zip(slabs, cases, strict=True)
+    ]
     alpha, g, thickness, ior, smooth, diffuse = np.repeat(np.array(table), copies, axis=0).T
 
     def both(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,10 +170,15 @@ def test_black_layers_end_and_tell_what_albedo_would_bring() -> None:
 
     crossing = no_crossing(1)
     crossing.before, crossing.after = mi.UInt32(1), mi.UInt32(2)
-    black = BorderScattering(SlabGeometry((1.0, 1.0), moving_border=True), Media([Medium(1, 0), Medium(2, 0)]), crossing)
+    black = BorderScattering(
+        SlabGeometry((1.0, 1.0), moving_border=True), Media([Medium(1, 0), Medium(2, 0)]), crossing
+    )
     assert float(black.balance(mi.Vector3f(0, 0, 1))[0]) == 0
     layer = Layer(sigma=1, alpha=0, thickness_mm=0.5)
-    assert simulate_slab((layer, layer.model_copy(update={"sigma": 2.0})), gradient=True, rel_error=0.1, max_seconds=1).R < 1e-20
+    assert (
+        simulate_slab((layer, layer.model_copy(update={"sigma": 2.0})), gradient=True, rel_error=0.1, max_seconds=1).R
+        < 1e-20
+    )
 
     # Single scattering, integrated over depth and direction: dR/dalpha at albedo 0, which used to be 0 with error 0.
     nodes, weights = np.polynomial.legendre.leggauss(100)
@@ -203,7 +218,11 @@ def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.Mo
     known = DentinShape.known(outer)
     enamel, dentin, view = Medium(3, 0.99, g1=0.8), Medium(8, 0.98, g1=0.7), whole_view(camera_at((0, 1, 0)))
     intensities = np.full(5, 1e5)
-    coincident = Engine(single_tooth(outer, known, LIGHTS_MM, intensities)).images(Tissue(enamel, dentin), view, samples=64, seed=1).mean.sum()
+    coincident = (
+        Engine(single_tooth(outer, known, LIGHTS_MM, intensities))
+        .images(Tissue(enamel, dentin), view, samples=64, seed=1)
+        .mean.sum()
+    )
     alone = Engine(single_tooth(outer, None, LIGHTS_MM, intensities))
     either = [alone.images(Tissue(medium, medium), view, samples=64, seed=2).mean.sum() for medium in (enamel, dentin)]
     assert 0.5 * min(either) < coincident < 1.5 * max(either)
@@ -211,6 +230,10 @@ def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.Mo
 
 def test_lights_beyond_single_precision_are_refused() -> None:
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
-    for positions, intensity, part in ((LIGHTS_MM * 1e18, 1.0, "mm away"), (LIGHTS_MM, 1e-40, "intensity = 1e-40"), (LIGHTS_MM, 1e35, "intensity = 1e\\+35")):
+    for positions, intensity, part in (
+        (LIGHTS_MM * 1e18, 1.0, "mm away"),
+        (LIGHTS_MM, 1e-40, "intensity = 1e-40"),
+        (LIGHTS_MM, 1e35, "intensity = 1e\\+35"),
+    ):
         with pytest.raises(InputError, match=part):
             Engine(single_tooth(outer, None, positions, np.full(5, intensity)))

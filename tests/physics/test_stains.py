@@ -41,7 +41,10 @@ def test_a_stained_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     core = tooth.dentin.vertices_mm(TISSUE.shape)
     known = DentinShape.known(type(tooth.outer)(core, tooth.outer.faces))
     scene = replace(
-        stained_recipe("matched"), teeth=(replace(tooth, dentin=known),), light_positions_mm=LIGHTS_MM[[1, 3]], light_intensities=np.full(2, INTENSITY)
+        stained_recipe("matched"),
+        teeth=(replace(tooth, dentin=known),),
+        light_positions_mm=LIGHTS_MM[[1, 3]],
+        light_intensities=np.full(2, INTENSITY),
     )
     camera = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0)
     ours = Engine(scene).images(replace(TISSUE, shape=()), whole_view(camera), samples=2048, seed=21, batches=BATCHES)
@@ -51,20 +54,32 @@ def test_a_stained_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     assert TISSUE.stain is not None
     opacity = mi.Bitmap((1 - TISSUE.stain.transmittance[:, :, None]).astype(np.float32))
     texture = {"type": "bitmap", "bitmap": opacity, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
-    mask = {"type": "mask", "opacity": texture, "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
+    mask = {
+        "type": "mask",
+        "opacity": texture,
+        "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+    }
     scores = []
     for number, light in enumerate(scene.light_positions_mm):
-        described = nested_scene({"11": (tmp_path / "outer.obj", tmp_path / "dentin.ply")}, TISSUE, (camera,), light, INTENSITY)
+        described = nested_scene(
+            {"11": (tmp_path / "outer.obj", tmp_path / "dentin.ply")}, TISSUE, (camera,), light, INTENSITY
+        )
         described["outer_11"] |= {"type": "obj", "bsdf": mask, "flip_tex_coords": False}
         stock = load_scene(described)
         mean, variance = render_batches(stock, 0, samples=2048, seed=31 + number, batches=BATCHES)
-        scores.append(pixel_scores([ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]))
+        scores.append(
+            pixel_scores(
+                [ours.mean[number].reshape(mean.shape), mean], [ours.variance[number].reshape(mean.shape), variance]
+            )
+        )
     require_same_pictures(np.stack(scores), least=500)
 
 
 def write_textured(path: Path, mesh: Mesh, uv: NDArray[np.float64]) -> None:
     """A Wavefront file with texture coordinates of vertices."""
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in mesh.vertices_mm] + ["vt {:.9g} {:.9g}".format(*place) for place in uv]
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in mesh.vertices_mm] + [
+        "vt {:.9g} {:.9g}".format(*place) for place in uv
+    ]
     path.write_text("\n".join(lines + ["f " + " ".join(f"{k}/{k}" for k in face) for face in mesh.faces + 1]) + "\n")
 
 
@@ -72,7 +87,12 @@ def write_textured(path: Path, mesh: Mesh, uv: NDArray[np.float64]) -> None:
 def test_texels_derivatives_are_those_of_the_images(boundary: Boundary) -> None:
     engine, view = Engine(stained_recipe(boundary)), whole_view(camera_at((0.2, 1, 0.1)), 1)
     cotangent = np.random.default_rng(5).uniform(-0.5, 1, (len(LIGHTS_MM), len(view)))
-    gradients = np.stack([texels(engine.stain_gradient(TISSUE, view, cotangent, seed=100 + seed, samples=1024).gradient) for seed in range(SEEDS)])
+    gradients = np.stack(
+        [
+            texels(engine.stain_gradient(TISSUE, view, cotangent, seed=100 + seed, samples=1024).gradient)
+            for seed in range(SEEDS)
+        ]
+    )
     assert TISSUE.stain is not None
     middle = TISSUE.stain.transmittance
     strongest = np.argsort(-np.abs(gradients.mean(axis=0)).ravel())[:6]
@@ -105,7 +125,10 @@ def test_errors_of_the_gradient_are_honest() -> None:
     engine, view = Engine(stained_recipe("matched")), whole_view(camera_at((0.2, 1, 0.1)), 1)
     cotangent = np.ones((len(LIGHTS_MM), len(view)))
     estimates = [engine.stain_gradient(TISSUE, view, cotangent, seed=seed, samples=512) for seed in range(24)]
-    values, variances = (np.stack([texels(pair) for pair in parts]) for parts in zip(*((e.gradient, e.variance) for e in estimates), strict=True))
+    values, variances = (
+        np.stack([texels(pair) for pair in parts])
+        for parts in zip(*((e.gradient, e.variance) for e in estimates), strict=True)
+    )
     strong = values.mean(axis=0) > 0.2 * values.mean(axis=0).max()
     ratio = values.var(axis=0, ddof=1)[strong] / variances.mean(axis=0)[strong]
     low, high = stats.chi2.ppf([5e-4 / strong.sum(), 1 - 5e-4 / strong.sum()], 23) / 23
@@ -116,9 +139,14 @@ def test_errors_of_the_gradient_are_honest() -> None:
 def test_an_image_dims_with_the_square_of_a_common_stain() -> None:
     # Every path goes in once and out once here, so a_t = 0.6 everywhere dims the same paths by 0.36.
     engine, view = Engine(stained_recipe("matched")), whole_view(camera_at((0.2, 1, 0.1)), 1)
-    clean, dim = (engine.images(replace(TISSUE, stain=given), view, samples=1024, seed=3) for given in (Stain(np.ones((2, 3))), Stain(np.full((2, 3), 0.6))))
+    clean, dim = (
+        engine.images(replace(TISSUE, stain=given), view, samples=1024, seed=3)
+        for given in (Stain(np.ones((2, 3))), Stain(np.full((2, 3), 0.6)))
+    )
     # Pixels are independent, the lights of one are not; four standard errors of the two as if they had nothing in common.
-    spread = np.sqrt(sum(scale**2 * (np.sqrt(image.variance).sum(axis=0) ** 2).sum() for scale, image in ((0.36, clean), (1, dim))))
+    spread = np.sqrt(
+        sum(scale**2 * (np.sqrt(image.variance).sum(axis=0) ** 2).sum() for scale, image in ((0.36, clean), (1, dim)))
+    )
     assert spread <= 0.02 * dim.mean.sum()
     assert abs(dim.mean.sum() - 0.36 * clean.mean.sum()) <= 4 * spread
 
@@ -134,7 +162,9 @@ def test_an_image_dims_with_the_square_of_a_common_stain() -> None:
 )
 def test_stains_that_dim_nothing_or_everything_are_refused(given: Stain, facts: tuple[str, ...]) -> None:
     with pytest.raises(InputError) as caught:
-        Engine(stained_recipe("matched")).images(replace(TISSUE, stain=given), whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
+        Engine(stained_recipe("matched")).images(
+            replace(TISSUE, stain=given), whole_view(camera_at((0, 1, 0))), samples=1, seed=1
+        )
     assert all(fact in caught.value.message for fact in facts), caught.value.message
 
 
@@ -148,4 +178,6 @@ def test_stains_without_a_place_and_gradients_without_stains_are_refused() -> No
     with pytest.raises(InputError, match=r"cotangent has shape \(5, 3\)"):
         engine.stain_gradient(TISSUE, view, ones[:, :3], samples=1, seed=1)
     with pytest.raises(InputError, match="inf at light 0 and pixel 6"):
-        engine.stain_gradient(TISSUE, view, np.where(ones.cumsum().reshape(ones.shape) == 7, np.inf, 1), samples=1, seed=1)
+        engine.stain_gradient(
+            TISSUE, view, np.where(ones.cumsum().reshape(ones.shape) == 7, np.inf, 1), samples=1, seed=1
+        )

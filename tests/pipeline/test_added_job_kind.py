@@ -66,7 +66,15 @@ def test_without_its_package_the_kind_is_refused_with_those_that_there_are(tmp_p
 
 
 def test_an_option_of_another_kind_is_refused(tmp_path: Path, environment: dict[str, str]) -> None:
-    command = [sys.executable, "-m", "services", "run", str(job_file(tmp_path, extra="lobes = 2")), "--out", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-m",
+        "services",
+        "run",
+        str(job_file(tmp_path, extra="lobes = 2")),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     answer = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert answer.returncode != 0
     assert "a job of kind weight has no option 'lobes'" in answer.stderr
@@ -74,7 +82,18 @@ def test_an_option_of_another_kind_is_refused(tmp_path: Path, environment: dict[
 
 @pytest.mark.slow
 def test_an_added_kind_runs_on_two_workers(tmp_path: Path, environment: dict[str, str]) -> None:
-    command = [sys.executable, "-m", "services", "run", str(job_file(tmp_path)), "--out", str(tmp_path / "out"), "--workers", "2", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "services",
+        "run",
+        str(job_file(tmp_path)),
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "2",
+        "--json",
+    ]
     answer = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert answer.returncode == 0, answer.stderr
     assert json.loads(answer.stdout)["files"] == ["weight.txt"]

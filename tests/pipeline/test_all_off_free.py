@@ -85,12 +85,16 @@ def occupy(address: str, job: str) -> ExitStack:
     with ExitStack() as connections:
         for number in range(EACH):
             for kind in kinds:
-                connections.enter_context(socket.create_connection((host, int(port)))).sendall(kind.replace("NUMBER", str(number)).encode())
+                connections.enter_context(socket.create_connection((host, int(port)))).sendall(
+                    kind.replace("NUMBER", str(number)).encode()
+                )
         return connections.pop_all()
 
 
 @pytest.mark.attack("exhaustion", "every thread of the server hanging")
-def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hanging: Hanging) -> None:
+def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hanging: Hanging
+) -> None:
     begun, go = threading.Event(), threading.Event()
     with simulated_dome(LIGHTS, 10.0) as (host, port):
         settings = ServerSettings(data=tmp_path / "data", dome=DomeSettings(address=f"{host}:{port}", watchdog_s=10.0))
@@ -106,7 +110,12 @@ def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(tmp_path: 
             client.put("/v1/dome/light", json={"light": 3, "level": 0.1, "on_s": 30}).raise_for_status()
             for owner, name in ((Repository, "page"), (Jobs, "delete")):
                 monkeypatch.setattr(owner, name, hanging)
-            for place in ("routes.list_artifacts", "observe_routes.list_artifacts", "uploads.Uploads.begin", "captures.Captures.commit"):
+            for place in (
+                "routes.list_artifacts",
+                "observe_routes.list_artifacts",
+                "uploads.Uploads.begin",
+                "captures.Captures.commit",
+            ):
                 monkeypatch.setattr(f"services.api.{place}", hanging)
             monkeypatch.setattr("services.api.jobs.jobs.Jobs.capturing", lambda _: [])
             with occupy(str(client.base_url), job):
@@ -189,7 +198,9 @@ def many(item: object) -> str:
     ],
 )
 @pytest.mark.attack("exhaustion", "a body of hundreds of thousands of faults")
-def test_a_body_of_many_faults_is_refused_at_its_first_ones(loop_server: Looped, method: str, path: str, body: str) -> None:
+def test_a_body_of_many_faults_is_refused_at_its_first_ones(
+    loop_server: Looped, method: str, path: str, body: str
+) -> None:
     listed = loop_server.listed
     answer = loop_server.client.request(method, path, content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422, answer.text
@@ -203,10 +214,25 @@ MANIFEST = {"files": [{"path": f"{number}.png", "bytes": 1, "sha256": "0" * 64} 
 WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
     ("bodies.parse", "POST", "/v1/captures", {"json": MANIFEST}),
     ("captures.Captures.commit", "POST", "/v1/captures/absent/commit", {}),
-    ("captures.Captures.create", "POST", "/v1/captures", {"json": {"files": [{"path": "capture.json", "bytes": 1, "sha256": "0" * 64}]}}),
-    ("uploads.Uploads.begin", "PATCH", "/v1/uploads/absent/0", {"content": b"x", "headers": dict(line.split(": ") for line in TUS.splitlines())}),
+    (
+        "captures.Captures.create",
+        "POST",
+        "/v1/captures",
+        {"json": {"files": [{"path": "capture.json", "bytes": 1, "sha256": "0" * 64}]}},
+    ),
+    (
+        "uploads.Uploads.begin",
+        "PATCH",
+        "/v1/uploads/absent/0",
+        {"content": b"x", "headers": dict(line.split(": ") for line in TUS.splitlines())},
+    ),
     ("masks.Masks.put", "PUT", "/v1/jobs/{job}/masks/a/all", {"content": b"x"}),
-    ("calibrations.Calibrations.put", "PUT", "/v1/calibrations/x", {"json": {"units": "mm", "channels": [], "lights": [], "cameras": []}}),
+    (
+        "calibrations.Calibrations.put",
+        "PUT",
+        "/v1/calibrations/x",
+        {"json": {"units": "mm", "channels": [], "lights": [], "cameras": []}},
+    ),
     ("routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts", {}),
     ("routes.open_artifact", "GET", "/v1/jobs/{job}/artifacts/report.html", {}),
     ("observe_routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts.zip", {}),
@@ -218,7 +244,9 @@ WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
 """Functions that parse, read or write, and requests that end in them."""
 
 
-@pytest.mark.parametrize(("place", "method", "path", "sent"), WAITS_FOR_THE_LOOP, ids=[place for place, *_ in WAITS_FOR_THE_LOOP])
+@pytest.mark.parametrize(
+    ("place", "method", "path", "sent"), WAITS_FOR_THE_LOOP, ids=[place for place, *_ in WAITS_FOR_THE_LOOP]
+)
 @pytest.mark.attack("exhaustion", "the event loop held up by a parser")
 def test_the_loop_goes_on_while_something_is_parsed_read_or_written(
     loop_server: Looped, monkeypatch: pytest.MonkeyPatch, place: str, method: str, path: str, sent: dict[str, Any]

@@ -37,7 +37,9 @@ def write_results(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Callable[..., Client]]:
     with ExitStack() as stack:
-        yield lambda run=write_results: stack.enter_context(serving(create_app(ServerSettings(data=tmp_path / "data"), run)))
+        yield lambda run=write_results: stack.enter_context(
+            serving(create_app(ServerSettings(data=tmp_path / "data"), run))
+        )
 
 
 @pytest.fixture
@@ -48,7 +50,9 @@ def capture_folder(tmp_path: Path) -> str:
 
 
 def submit(client: Client, capture: str, key: str | None = None, **options: Any) -> Any:
-    return client.post("/v1/jobs", json={"capture": capture, **options}, headers={"Idempotency-Key": key} if key else {})
+    return client.post(
+        "/v1/jobs", json={"capture": capture, **options}, headers={"Idempotency-Key": key} if key else {}
+    )
 
 
 def finish(client: Client, job_id: str) -> str:
@@ -121,8 +125,13 @@ def test_what_is_not_there_is_a_problem_document(serve: Any, path: str) -> None:
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-@pytest.mark.parametrize(("problem", "code"), [(CaptureInputError("Frame 3 is missing; copy it."), "bad-capture"), (ZeroDivisionError("x"), "internal-error")])
-def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: str, problem: Exception, code: str) -> None:
+@pytest.mark.parametrize(
+    ("problem", "code"),
+    [(CaptureInputError("Frame 3 is missing; copy it."), "bad-capture"), (ZeroDivisionError("x"), "internal-error")],
+)
+def test_a_failure_is_data_and_a_retry_runs_again(
+    serve: Any, capture_folder: str, problem: Exception, code: str
+) -> None:
     problems = [problem]
 
     def run(*_: object) -> None:
@@ -143,7 +152,9 @@ def test_a_failure_is_data_and_a_retry_runs_again(serve: Any, capture_folder: st
 
 
 @pytest.mark.parametrize("at_once", [1000, 5], ids=["at once", "block by block"])
-def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_artifacts_are_listed_and_read_in_ranges(
+    serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.api.http.artifacts.MAX_BYTES_AT_ONCE", at_once)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
@@ -153,12 +164,20 @@ def test_artifacts_are_listed_and_read_in_ranges(serve: Any, capture_folder: str
     whole = client.get(f"{base}/asset/scene.xml")
     assert whole.content == bytes(range(100))
     part = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=10-19"})
-    assert (part.status_code, part.content, part.headers["content-range"]) == (206, bytes(range(10, 20)), "bytes 10-19/100")
+    assert (part.status_code, part.content, part.headers["content-range"]) == (
+        206,
+        bytes(range(10, 20)),
+        "bytes 10-19/100",
+    )
     assert client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=-5"}).content == bytes(range(95, 100))
     several = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=0-1,90-"})
     assert (several.status_code, several.headers["content-type"].partition(";")[0]) == (206, "multipart/byteranges")
     beyond = client.get(f"{base}/asset/scene.xml", headers={"Range": "bytes=200-"})
-    assert (beyond.status_code, beyond.json()["code"], beyond.headers["content-range"]) == (416, "range-unsatisfiable", "bytes */100")
+    assert (beyond.status_code, beyond.json()["code"], beyond.headers["content-range"]) == (
+        416,
+        "range-unsatisfiable",
+        "bytes */100",
+    )
     for unreadable in ("lines=1", "bytes", "bytes=", "bytes=9-1", "bytes=0-1,x", "bytes=--1", "bytes=-"):
         assert client.get(f"{base}/asset/scene.xml", headers={"Range": unreadable}).content == whole.content
     assert client.get(f"{base}/asset/scene.xml", headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
@@ -197,7 +216,12 @@ def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str
     client = serve()
     foreign = client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": "http://elsewhere.example"})
     assert (foreign.status_code, foreign.json()["code"]) == (403, "foreign-origin")
-    assert client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": str(client.base_url).rstrip("/")}).status_code == 201
+    assert (
+        client.post(
+            "/v1/jobs", json={"capture": capture_folder}, headers={"Origin": str(client.base_url).rstrip("/")}
+        ).status_code
+        == 201
+    )
     assert client.get("/v1/jobs", headers={"Host": "elsewhere.example"}).status_code == 400
 
 
@@ -246,7 +270,9 @@ def test_a_deleted_job_is_gone_and_its_receipt_stays(serve: Any, capture_folder:
     with engine.connect() as connection:
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
     engine.dispose()
-    assert not [path for path in (tmp_path / "data").glob("dentine.sqlite*") if capture_folder.encode() in path.read_bytes()]
+    assert not [
+        path for path in (tmp_path / "data").glob("dentine.sqlite*") if capture_folder.encode() in path.read_bytes()
+    ]
 
 
 def test_a_job_under_way_is_not_deleted(serve: Any, capture_folder: str) -> None:
@@ -267,7 +293,9 @@ def test_what_the_machine_could_never_run_is_refused_with_507(serve: Any, captur
     assert "fewer workers" in answer.json()["detail"]
 
 
-def test_a_full_disk_pauses_a_job_and_it_goes_on(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_pauses_a_job_and_it_goes_on(
+    serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.api.jobs.admission.RETRY_S", 0.5)
     monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.1)
     tries: list[int] = []
@@ -292,10 +320,15 @@ def test_failures_say_what_was_measured(serve: Any, capture_folder: str) -> None
     job_id = submit(client, capture_folder).json()["id"]
     finish(client, job_id)
     failure = client.get(f"/v1/jobs/{job_id}").json()["failure"]
-    assert (failure["code"], failure["evidence"]) == ("memory-killed", {"peak_memory_bytes": 5, "memory_limit_bytes": 4})
+    assert (failure["code"], failure["evidence"]) == (
+        "memory-killed",
+        {"peak_memory_bytes": 5, "memory_limit_bytes": 4},
+    )
 
 
-def test_a_runner_that_broke_off_loses_the_job_and_runs_it_again(serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_runner_that_broke_off_loses_the_job_and_runs_it_again(
+    serve: Any, capture_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.api.jobs.runner.LEASE_S", 0.3)
     monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 0.1)
     broken = [OSError("The data folder is away.")]
@@ -307,5 +340,9 @@ def test_a_runner_that_broke_off_loses_the_job_and_runs_it_again(serve: Any, cap
     monkeypatch.setattr("services.api.jobs.runner.withdraw_cancel", withdraw)
     client = serve()
     job_id = submit(client, capture_folder).json()["id"]
-    states = [json.loads(line.removeprefix("data: "))["data"]["state"] for line in finish(client, job_id).splitlines() if '"kind":"state"' in line]
+    states = [
+        json.loads(line.removeprefix("data: "))["data"]["state"]
+        for line in finish(client, job_id).splitlines()
+        if '"kind":"state"' in line
+    ]
     assert states == ["SUBMITTED", "QUEUED", "RUNNING", "QUEUED", "RUNNING", "SUCCEEDED"]

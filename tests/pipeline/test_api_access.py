@@ -72,7 +72,10 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
 
 @pytest.mark.attack("routes × scopes", "a route that declares no scope")
 def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
-    declared = {f"{method} {template}": scope for method, template, scope in operations(create_app(ServerSettings(data=tmp_path)))}
+    declared = {
+        f"{method} {template}": scope
+        for method, template, scope in operations(create_app(ServerSettings(data=tmp_path)))
+    }
     assert len(declared) > len(KNOWN_SCOPES)
     assert {name: declared.get(name) for name in KNOWN_SCOPES} == KNOWN_SCOPES
 
@@ -80,7 +83,10 @@ def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
 def test_the_walk_sees_every_route_that_is_described(tmp_path: Path) -> None:
     app = create_app(ServerSettings(data=tmp_path))
     described = {f"{method.upper()} {path}" for path, methods in app.openapi()["paths"].items() for method in methods}
-    assert {f"{method} {template}" for method, template, _ in operations(app)} == described - {f"GET {LIVENESS}", f"POST {SETUP}"} | {"GET /v1/openapi.json"}
+    assert {f"{method} {template}" for method, template, _ in operations(app)} == described - {
+        f"GET {LIVENESS}",
+        f"POST {SETUP}",
+    } | {"GET /v1/openapi.json"}
     for path, methods in app.openapi()["paths"].items():
         for operation in methods.values():
             assert bool(operation.get("security")) is (path not in {LIVENESS, SETUP})
@@ -113,13 +119,17 @@ def test_liveness_and_the_page_need_no_token(server: Guarded) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("GET", "/v1/jobs/", 404), ("PUT", "/v1/jobs", 405), ("OPTIONS", "/v1/jobs", 405)]
+    ("method", "path", "status"),
+    [("GET", "/v1/nothing", 404), ("GET", "/v1/jobs/", 404), ("PUT", "/v1/jobs", 405), ("OPTIONS", "/v1/jobs", 405)],
 )
 @pytest.mark.attack("routes × scopes", "looking for routes without a token")
 def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str, path: str, status: int) -> None:
     assert server.ask(method, path).status_code == 401
     answer = server.ask(method, path, Scope.READ)
-    assert (answer.status_code, answer.json()["code"]) == (status, {404: "not-found", 405: "method-not-allowed"}[status])
+    assert (answer.status_code, answer.json()["code"]) == (
+        status,
+        {404: "not-found", 405: "method-not-allowed"}[status],
+    )
     assert answer.headers.get("allow") == {404: None, 405: "GET, POST"}[status]
 
 
@@ -174,7 +184,9 @@ class _As:
         await self.app(scope | {"caller": self.caller}, receive, send)
 
 
-@pytest.mark.parametrize("header", ["Bearer", "Basic eDp5", "Bearer dentine_0123456789ab_guess", "bearer \xff", "x" * 5000])
+@pytest.mark.parametrize(
+    "header", ["Bearer", "Basic eDp5", "Bearer dentine_0123456789ab_guess", "bearer \xff", "x" * 5000]
+)
 @pytest.mark.attack("tokens", "a malformed, unknown or foreign credential")
 def test_a_wrong_credential_is_refused(server: Guarded, header: str) -> None:
     answer = server.client.get("/v1/jobs", headers={"Authorization": header.encode("latin-1")})
@@ -182,7 +194,9 @@ def test_a_wrong_credential_is_refused(server: Guarded, header: str) -> None:
 
 
 def test_tokens_are_made_used_listed_and_revoked_over_the_api(server: Guarded) -> None:
-    made = server.ask("POST", "/v1/tokens", Scope.ADMIN, json={"name": "rig-7", "scopes": ["submit"], "expires_days": 1})
+    made = server.ask(
+        "POST", "/v1/tokens", Scope.ADMIN, json={"name": "rig-7", "scopes": ["submit"], "expires_days": 1}
+    )
     assert made.status_code == 201
     assert made.headers["location"] == f"/v1/tokens/{made.json()['id']}"
     token = {"Authorization": f"Bearer {made.json()['token']}"}
@@ -209,7 +223,11 @@ def sign_in(server: Guarded, scope: Scope = Scope.SUBMIT) -> dict[str, str]:
 
 def test_a_session_carries_the_rights_of_its_token(server: Guarded) -> None:
     cookie = sign_in(server)
-    assert server.client.get("/v1/session", headers=cookie).json() == {"name": "of-submit", "scopes": ["read", "submit"], "is_open": False}
+    assert server.client.get("/v1/session", headers=cookie).json() == {
+        "name": "of-submit",
+        "scopes": ["read", "submit"],
+        "is_open": False,
+    }
     assert server.client.get("/v1/tokens", headers=cookie).status_code == 403
     here = cookie | {"Origin": str(server.client.base_url).rstrip("/")}
     assert server.client.post("/v1/jobs", json={"capture": "/"}, headers=here).status_code == 201
@@ -217,7 +235,10 @@ def test_a_session_carries_the_rights_of_its_token(server: Guarded) -> None:
     out = server.client.delete("/v1/session", headers=here)
     assert out.status_code == 204
     assert f'{COOKIE}=""' in out.headers["set-cookie"]
-    assert server.client.get("/v1/session", headers={"Cookie": f"{COOKIE}=dentine_0123456789ab_9999999999.00"}).status_code == 401
+    assert (
+        server.client.get("/v1/session", headers={"Cookie": f"{COOKIE}=dentine_0123456789ab_9999999999.00"}).status_code
+        == 401
+    )
 
 
 @pytest.mark.parametrize(
@@ -328,7 +349,9 @@ def test_the_audit_log_is_paged(server: Guarded) -> None:
     whole = audit(server, limit=500)
     seen, before = [], None
     while len(seen) < len(whole):
-        page = server.ask("GET", "/v1/audit", Scope.ADMIN, params={"limit": 7} | ({"before": before} if before else {})).json()
+        page = server.ask(
+            "GET", "/v1/audit", Scope.ADMIN, params={"limit": 7} | ({"before": before} if before else {})
+        ).json()
         seen += page["entries"]
         before = page["next_before"]
     assert seen == whole
@@ -418,7 +441,17 @@ def raw_exchange(server: Guarded, head: str, chunks: list[bytes]) -> bytes:
 
 def head(server: Guarded, path: str, *more: str, scope: Scope | None = Scope.SUBMIT) -> str:
     who = [f"Authorization: Bearer {server.tokens[scope]}"] if scope else []
-    return "\n".join([f"POST {path} HTTP/1.1", f"Host: 127.0.0.1:{server.client.base_url.port}", "Content-Type: application/json", *who, *more, "", ""])
+    return "\n".join(
+        [
+            f"POST {path} HTTP/1.1",
+            f"Host: 127.0.0.1:{server.client.base_url.port}",
+            "Content-Type: application/json",
+            *who,
+            *more,
+            "",
+            "",
+        ]
+    )
 
 
 def test_an_announced_length_is_refused_before_a_byte_is_sent(small: Guarded) -> None:
@@ -436,7 +469,9 @@ def test_a_stream_without_end_is_refused_when_it_passes_the_limit(small: Guarded
 
 @pytest.mark.attack("exhaustion", "a body that comes a byte at a time, a stranger's with a setup link among them")
 @pytest.mark.parametrize(("path", "scope"), [("/v1/jobs", Scope.SUBMIT), ("/v1/setup", None)])
-def test_a_body_that_does_not_end_is_given_up(small: Guarded, monkeypatch: pytest.MonkeyPatch, path: str, scope: Scope | None) -> None:
+def test_a_body_that_does_not_end_is_given_up(
+    small: Guarded, monkeypatch: pytest.MonkeyPatch, path: str, scope: Scope | None
+) -> None:
     monkeypatch.setattr(body_limit, "MAX_BODY_S", 0.3)
     answer = raw_exchange(small, head(small, path, "Content-Length: 1000", scope=scope), [b"{"])
     assert answer.startswith(b"HTTP/1.1 408")
@@ -451,7 +486,12 @@ def test_a_stranger_is_refused_before_the_body_is_read(small: Guarded) -> None:
 
 def test_a_route_without_body_refuses_a_long_one_before_it_acts(small: Guarded) -> None:
     before = len(audit(small, limit=500))
-    answer = small.ask("DELETE", f"/v1/tokens/{small.tokens[Scope.OPERATE_DOME].split('_')[1]}", Scope.ADMIN, content=b" " * (LIMIT + 1))
+    answer = small.ask(
+        "DELETE",
+        f"/v1/tokens/{small.tokens[Scope.OPERATE_DOME].split('_')[1]}",
+        Scope.ADMIN,
+        content=b" " * (LIMIT + 1),
+    )
     assert answer.status_code == 413
     newest = audit(small, limit=500)
     assert (len(newest), newest[0]["outcome"]) == (before + 1, 413)
@@ -478,7 +518,10 @@ def _status(app: Any, path: str, body: bytes) -> int:
     import asyncio
 
     sent: list[dict[str, Any]] = []
-    pieces = [{"type": "http.request", "body": body[:6], "more_body": True}, {"type": "http.request", "body": body[6:], "more_body": False}]
+    pieces = [
+        {"type": "http.request", "body": body[:6], "more_body": True},
+        {"type": "http.request", "body": body[6:], "more_body": False},
+    ]
 
     async def receive() -> Any:
         return pieces.pop(0)
@@ -486,14 +529,23 @@ def _status(app: Any, path: str, body: bytes) -> int:
     async def send(message: Any) -> None:
         sent.append(message)
 
-    asyncio.run(app({"type": "http", "method": "POST", "path": path, "headers": [(b"content-length", b"1")]}, receive, send))
+    asyncio.run(
+        app({"type": "http", "method": "POST", "path": path, "headers": [(b"content-length", b"1")]}, receive, send)
+    )
     return int(sent[0]["status"])
 
 
 @pytest.mark.attack("cross-site", "an answer in a cache or a frame")
 def test_every_answer_of_the_api_is_kept_out_of_caches_and_frames(server: Guarded) -> None:
     job = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/"}).json()["id"]
-    for path in ("/v1/jobs", f"/v1/jobs/{job}", f"/v1/jobs/{job}/events", f"/v1/jobs/{job}/artifacts/report.html", "/v1/nothing", "/v1/tokens"):
+    for path in (
+        "/v1/jobs",
+        f"/v1/jobs/{job}",
+        f"/v1/jobs/{job}/events",
+        f"/v1/jobs/{job}/artifacts/report.html",
+        "/v1/nothing",
+        "/v1/tokens",
+    ):
         headers = server.ask("GET", path, Scope.READ).headers
         assert headers["cache-control"] == "no-store", path
         assert headers["x-content-type-options"] == "nosniff"

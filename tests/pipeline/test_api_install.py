@@ -19,7 +19,19 @@ from tests.support.small_system import free_port
 from tests.support.uploading import write_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
-ABSENT = ("mitsuba", "drjit", "cv2", "pymodbus", "scipy", "rtree", "manifold3d", "xatlas", "PIL", "matplotlib", "psycopg")
+ABSENT = (
+    "mitsuba",
+    "drjit",
+    "cv2",
+    "pymodbus",
+    "scipy",
+    "rtree",
+    "manifold3d",
+    "xatlas",
+    "PIL",
+    "matplotlib",
+    "psycopg",
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +51,9 @@ def served(environment: Path, data: Path, **settings: str) -> Iterator[httpx.Cli
 
 def test_what_renders_captures_and_speaks_to_domes_is_absent(environment: Path) -> None:
     code = f"import importlib.util, json; print(json.dumps([name for name in {ABSENT!r} if importlib.util.find_spec(name)]))"
-    answer = subprocess.run([str(environment / "bin/python"), "-I", "-c", code], check=True, capture_output=True, text=True)
+    answer = subprocess.run(
+        [str(environment / "bin/python"), "-I", "-c", code], check=True, capture_output=True, text=True
+    )
     assert json.loads(answer.stdout) == []
 
 
@@ -58,17 +72,23 @@ def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path
 
 def test_a_stage_whose_packages_are_absent_says_so(environment: Path, tmp_path: Path) -> None:
     with served(environment, tmp_path / "data") as client:
-        job = client.post("/v1/jobs", json={"rig": {"mouth": str(write_capture(tmp_path / "mine"))}, "workers": 1}).json()["id"]
+        job = client.post(
+            "/v1/jobs", json={"rig": {"mouth": str(write_capture(tmp_path / "mine"))}, "workers": 1}
+        ).json()["id"]
         client.get(f"/v1/jobs/{job}/events", timeout=300)
         detail = client.get(f"/v1/jobs/{job}").json()
     assert (detail["state"], detail["failure"]["code"]) == ("FAILED", "platform-missing")
-    assert detail["failure"]["message"].startswith("Stage capture needs pymodbus, which its workers do not have; install dentine[capture] ")
+    assert detail["failure"]["message"].startswith(
+        "Stage capture needs pymodbus, which its workers do not have; install dentine[capture] "
+    )
 
 
 def test_a_job_waits_for_a_scheduler_elsewhere(environment: Path, tmp_path: Path) -> None:
     scheduler = f"tcp://127.0.0.1:{free_port()}"
     with served(environment, tmp_path / "data", DENTINE__SERVER__SCHEDULER=scheduler) as client:
-        job = client.post("/v1/jobs", json={"capture": str(write_capture(tmp_path / "mine")), "workers": 1}).json()["id"]
+        job = client.post("/v1/jobs", json={"capture": str(write_capture(tmp_path / "mine")), "workers": 1}).json()[
+            "id"
+        ]
         while (detail := client.get(f"/v1/jobs/{job}").json())["waits_for"] is None:
             assert detail["state"] in {"QUEUED", "RUNNING"}
             time.sleep(0.2)

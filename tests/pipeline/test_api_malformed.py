@@ -56,7 +56,10 @@ def test_queries_beyond_the_description_are_refused(client: httpx.Client, query:
     assert_refused(client.get(f"/v1/{query}"), 422, "bad-settings")
 
 
-@pytest.mark.parametrize("asked", ["jobs/{job}/logs?after={large}", "jobs/{job}/previews?after={large}", "jobs/{job}/previews/{large}/render"])
+@pytest.mark.parametrize(
+    "asked",
+    ["jobs/{job}/logs?after={large}", "jobs/{job}/previews?after={large}", "jobs/{job}/previews/{large}/render"],
+)
 def test_numbers_that_no_row_has_are_refused(client: httpx.Client, asked: str) -> None:
     job = client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
     assert_refused(client.get(f"/v1/{asked.format(job=job, large=LARGE)}"), 422, "bad-settings")
@@ -72,14 +75,25 @@ def test_text_that_the_database_does_not_take_is_no_loss_of_it(client: httpx.Cli
 
 
 @pytest.mark.parametrize(
-    "raw", [b"", b"{", b"\xff", b'"\\ud800"', b"[" * 100_000, b'{"capture":"/","seed":' + b"9" * 5000 + b"}", b'{"capture":"/","ior":NaN}']
+    "raw",
+    [
+        b"",
+        b"{",
+        b"\xff",
+        b'"\\ud800"',
+        b"[" * 100_000,
+        b'{"capture":"/","seed":' + b"9" * 5000 + b"}",
+        b'{"capture":"/","ior":NaN}',
+    ],
 )
 def test_bodies_that_cannot_be_read_are_refused(client: httpx.Client, raw: bytes) -> None:
     assert_refused(client.post("/v1/jobs", content=raw, headers=JSON), 422, "bad-settings")
 
 
 def test_a_form_is_not_a_job(client: httpx.Client) -> None:
-    assert_refused(client.post("/v1/jobs", content='{"capture": "/"}', headers={"Content-Type": "text/plain"}), 422, "bad-settings")
+    assert_refused(
+        client.post("/v1/jobs", content='{"capture": "/"}', headers={"Content-Type": "text/plain"}), 422, "bad-settings"
+    )
 
 
 @pytest.mark.parametrize("capture", ["relative", "/\0", "/\ud800", "/" + "x" * 300, "/" + "x/" * 3000, "/dev/null/x"])
@@ -102,7 +116,10 @@ def test_malformed_origins_are_foreign(client: httpx.Client, origin: str) -> Non
     assert_refused(client.delete("/v1/session", headers={"Origin": origin}), 403, "foreign-origin")
 
 
-@pytest.mark.parametrize("host", ["elsewhere.example", "[", "127.0.0.1.elsewhere.example", "127.0.0.1@elsewhere.example", "127.0.0.1:8000:1", ""])
+@pytest.mark.parametrize(
+    "host",
+    ["elsewhere.example", "[", "127.0.0.1.elsewhere.example", "127.0.0.1@elsewhere.example", "127.0.0.1:8000:1", ""],
+)
 @pytest.mark.attack("cross-site", "a malformed host")
 def test_other_hosts_are_foreign(client: httpx.Client, host: str) -> None:
     assert_refused(client.get("/v1/jobs", headers={"Host": host}), 400, "foreign-host")

@@ -65,7 +65,11 @@ async def followed(client: AsyncClient, job_id: str, after: int = 0) -> list[Job
 
 def test_both_clients_can_do_the_same() -> None:
     def signatures(kind: type[Any]) -> dict[str, list[str]]:
-        return {name: list(inspect.signature(one).parameters) for name, one in inspect.getmembers(kind, inspect.isfunction) if not name.startswith("_")}
+        return {
+            name: list(inspect.signature(one).parameters)
+            for name, one in inspect.getmembers(kind, inspect.isfunction)
+            if not name.startswith("_")
+        }
 
     assert signatures(AsyncClient) == signatures(Client)
 
@@ -89,7 +93,11 @@ def test_a_job_is_submitted_followed_and_retried(server: httpx.Client, job: Tell
             assert (await client.retry(created["id"]))["id"] == created["id"]
             more = await followed(client, created["id"], events[-1].id)
             assert more[0].id > events[-1].id
-            assert [event.data["state"] for event in more if event.kind == "state"] == ["QUEUED", "RUNNING", "SUCCEEDED"]
+            assert [event.data["state"] for event in more if event.kind == "state"] == [
+                "QUEUED",
+                "RUNNING",
+                "SUCCEEDED",
+            ]
             assert (await client.get(created["id"]))["state"] == "SUCCEEDED"
             with pytest.raises(JobStateError):
                 await client.cancel(created["id"])

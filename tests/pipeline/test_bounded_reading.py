@@ -47,8 +47,12 @@ def test_it_says_what_would_be_said_in_this_process(apart: ReadApart, tmp_path: 
     (folder / "c0_l1.npy").write_bytes(b"no array")
     (folder / "broken.json").write_text("[")
     names = frozenset(contents_of(folder)) - {"c0_l0.npy"}
-    here = {name: content_fault(folder / name, name, LIMITS, names) for name in ("capture.json", "c0_l0.npy", "c0_l1.npy")}
-    assert faults(apart, *((folder / name, name) for name in here), names=names) == {name: told for name, told in here.items() if told}
+    here = {
+        name: content_fault(folder / name, name, LIMITS, names) for name in ("capture.json", "c0_l0.npy", "c0_l1.npy")
+    }
+    assert faults(apart, *((folder / name, name) for name in here), names=names) == {
+        name: told for name, told in here.items() if told
+    }
     assert len(faults(apart, (folder / "c0_l1.npy", "c0_l1.npy"))) == 1
     assert [one.name for one in apart.describe(folder).calibration.lights] == ["l0", "l1"]
     with pytest.raises(CaptureInputError, match="holds neither"):
@@ -74,7 +78,9 @@ def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: R
 
 
 @pytest.mark.attack("uploads", "a file that takes time")
-def test_a_file_that_takes_time_costs_a_process_and_a_sentence(apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_takes_time_costs_a_process_and_a_sentence(
+    apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     os.mkfifo(tmp_path / "hangs.npy")
     monkeypatch.setattr(reading, "MAX_S", 0.3)
     (told,) = faults(apart, (tmp_path / "hangs.npy", "hangs.npy")).values()
@@ -107,7 +113,9 @@ def test_a_raw_capture_of_20_gigabytes_is_looked_at_by_its_headers(apart: ReadAp
     for number in range(FILES):
         path = tmp_path / f"raw_{number}.npy"
         with path.open("wb") as stream:
-            np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": (FILE_BYTES // 2,)})
+            np.lib.format.write_array_header_1_0(
+                stream, {"descr": "<u2", "fortran_order": False, "shape": (FILE_BYTES // 2,)}
+            )
             stream.truncate(stream.tell() + FILE_BYTES)
         files.append((path, path.name))
     assert sum(path.stat().st_size for path, _ in files) > 20 * 10**9
@@ -120,7 +128,12 @@ def test_a_raw_capture_of_20_gigabytes_is_looked_at_by_its_headers(apart: ReadAp
 @pytest.mark.attack("uploads", "the commit of such a description")
 def test_a_commit_tells_of_a_costly_file_and_the_next_one_goes_on(tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
-    worse = contents | {"capture.json": contents["capture.json"][:-1] + b', "more": [' + b"{}," * (MAX_DESCRIPTION_BYTES // 3 - 1000) + b"{}]}"}
+    worse = contents | {
+        "capture.json": contents["capture.json"][:-1]
+        + b', "more": ['
+        + b"{}," * (MAX_DESCRIPTION_BYTES // 3 - 1000)
+        + b"{}]}"
+    }
     with serving(create_app(ServerSettings(data=tmp_path / "data", uploads=LIMITS), lambda *_: None)) as client:
         for files, status in ((worse, 409), (contents, 200)):
             capture = announce(client, files)
@@ -130,4 +143,7 @@ def test_a_commit_tells_of_a_costly_file_and_the_next_one_goes_on(tmp_path: Path
             assert answer.status_code == status, answer.text
             if status == 409:
                 assert [file["path"] for file in answer.json()["files"]] == ["capture.json"]
-        assert json.loads(contents["capture.json"])["lights"][0]["name"] == client.get(f"/v1/captures/{capture['id']}/calibration").json()["lights"][0]["name"]
+        assert (
+            json.loads(contents["capture.json"])["lights"][0]["name"]
+            == client.get(f"/v1/captures/{capture['id']}/calibration").json()["lights"][0]["name"]
+        )

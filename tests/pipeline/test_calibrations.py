@@ -74,12 +74,18 @@ def test_a_name_means_one_content_for_ever(client: httpx.Client, calibration: di
     again = client.put("/v1/calibrations/rig-1.2026", content=otherwise, headers={"Content-Type": "application/json"})
     assert (again.status_code, again.json()) == (200, first.json())
     assert client.put("/v1/calibrations/same", json=calibration).json()["id"] == first.json()["id"]
-    other = client.put("/v1/calibrations/rig-1.2026", json=renamed(calibration, "lights", lambda light: light.update(position_mm=[0, 0, -900])))
+    other = client.put(
+        "/v1/calibrations/rig-1.2026",
+        json=renamed(calibration, "lights", lambda light: light.update(position_mm=[0, 0, -900])),
+    )
     assert (other.status_code, other.json()["code"]) == (409, "calibration-taken")
     assert client.get("/v1/calibrations/rig-1.2026").json() == first.json()
     assert [entry["name"] for entry in client.get("/v1/calibrations").json()] == ["same", "rig-1.2026"]
     shown = client.get("/v1/calibrations/same").json()
-    assert (shown["option"], shown["calibration"]["lights"][1]["position_mm"]) == (f"calibrations/{shown['id']}", [40.0, 0.0, -900.0])
+    assert (shown["option"], shown["calibration"]["lights"][1]["position_mm"]) == (
+        f"calibrations/{shown['id']}",
+        [40.0, 0.0, -900.0],
+    )
 
 
 @pytest.mark.parametrize(
@@ -87,12 +93,18 @@ def test_a_name_means_one_content_for_ever(client: httpx.Client, calibration: di
     [
         ("lights", lambda light: light.update(name="l0"), "lists light l0 twice"),
         ("lights", lambda light: light.update(intensity=[1.0, 1.0]), "light l1 has 2 intensities for 1 channels"),
-        ("cameras", lambda camera: camera.update(camera_from_world=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 100], [0, 0, 0, 1]]), "must be a rotation"),
+        (
+            "cameras",
+            lambda camera: camera.update(camera_from_world=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 100], [0, 0, 0, 1]]),
+            "must be a rotation",
+        ),
         ("cameras", lambda camera: camera.update(size=[0, 10]), "cameras.0.size.0"),
         ("cameras", lambda camera: camera.update(lens="50 mm"), "lens"),
     ],
 )
-def test_what_no_stage_would_take_is_refused_when_it_is_put(client: httpx.Client, calibration: dict[str, Any], part: str, change: Any, named: str) -> None:
+def test_what_no_stage_would_take_is_refused_when_it_is_put(
+    client: httpx.Client, calibration: dict[str, Any], part: str, change: Any, named: str
+) -> None:
     answer = client.put("/v1/calibrations/wrong", json=renamed(calibration, part, change))
     assert answer.status_code == 422
     assert named in answer.json()["detail"]
@@ -104,9 +116,14 @@ def test_a_name_is_no_path(client: httpx.Client, calibration: dict[str, Any], na
     assert client.put(f"/v1/calibrations/{name}", json=calibration).status_code in {404, 405, 422}
 
 
-def test_a_job_is_prepared_with_the_calibration_that_it_names(client: httpx.Client, data: Path, mouth: Path, calibration: dict[str, Any]) -> None:
+def test_a_job_is_prepared_with_the_calibration_that_it_names(
+    client: httpx.Client, data: Path, mouth: Path, calibration: dict[str, Any]
+) -> None:
     # A calibration of the whole rig has lights that this capture does not, in an order of its own.
-    calibration["lights"] = [{"name": "l7", "position_mm": [0, 0, -950], "intensity": [1e6]}, *calibration["lights"][::-1]]
+    calibration["lights"] = [
+        {"name": "l7", "position_mm": [0, 0, -950], "intensity": [1e6]},
+        *calibration["lights"][::-1],
+    ]
     option = client.put("/v1/calibrations/whole-rig", json=calibration).json()["option"]
     job = client.post("/v1/jobs", json={"capture": str(mouth), "calibration": option}).json()["id"]
     assert '"SUCCEEDED"' in client.get(f"/v1/jobs/{job}/events").text
@@ -120,24 +137,43 @@ def test_a_job_is_prepared_with_the_calibration_that_it_names(client: httpx.Clie
     [
         (lambda tree: tree["lights"].pop(), "lacks light l1"),
         (lambda tree: tree["cameras"][0].update(name="c9"), "lacks camera c0"),
-        (lambda tree: tree["cameras"][0].update(size=[18, 24]), "18 x 24 pixels of camera c0, but the capture's are 24 x 18"),
+        (
+            lambda tree: tree["cameras"][0].update(size=[18, 24]),
+            "18 x 24 pixels of camera c0, but the capture's are 24 x 18",
+        ),
         (lambda tree: tree.update(channels=["red"]), "is for channels red, but the capture has green"),
     ],
 )
-def test_a_calibration_of_another_rig_is_refused(tmp_path: Path, mouth: Path, calibration: dict[str, Any], change: Any, named: str) -> None:
+def test_a_calibration_of_another_rig_is_refused(
+    tmp_path: Path, mouth: Path, calibration: dict[str, Any], change: Any, named: str
+) -> None:
     change(calibration)
     (tmp_path / "other.json").write_text(json.dumps(calibration))
     with pytest.raises(CaptureInputError, match=named):
         stage.run(JobSpec(capture=mouth, calibration=tmp_path / "other.json"), LocalContext(tmp_path / "job"))
 
 
-def test_the_command_line_names_a_stored_calibration(client: httpx.Client, tmp_path: Path, mouth: Path, calibration: dict[str, Any]) -> None:
+def test_the_command_line_names_a_stored_calibration(
+    client: httpx.Client, tmp_path: Path, mouth: Path, calibration: dict[str, Any]
+) -> None:
     option = client.put("/v1/calibrations/this-rig", json=calibration).json()["option"]
     (tmp_path / "job.toml").write_text('capture = "mouth"')
-    command = [sys.executable, "-m", "services", "submit", str(tmp_path / "job.toml"), "--server", str(client.base_url), "--calibration"]
+    command = [
+        sys.executable,
+        "-m",
+        "services",
+        "submit",
+        str(tmp_path / "job.toml"),
+        "--server",
+        str(client.base_url),
+        "--calibration",
+    ]
     submitted = subprocess.run([*command, "this-rig"], capture_output=True, text=True, check=True)
     assert client.get(f"/v1/jobs/{submitted.stdout.strip()}").json()["spec"]["calibration"] == option
-    with Client(str(client.base_url)) as typed, pytest.raises(UnknownCalibrationError, match="There is no calibration other-rig"):
+    with (
+        Client(str(client.base_url)) as typed,
+        pytest.raises(UnknownCalibrationError, match="There is no calibration other-rig"),
+    ):
         typed.calibration("other-rig")
 
 

@@ -71,7 +71,13 @@ def mouth(tmp_path: Path) -> Path:
 @pytest.fixture
 def job(mouth: Path, address: Address) -> Callable[..., JobSpec]:
     def make(**options: object) -> JobSpec:
-        rig = {"mouth": mouth, "dome": f"{address[0]}:{address[1]}", "exposure_s": 0.01, "settle_s": 0.0, "simulation": NOISELESS}
+        rig = {
+            "mouth": mouth,
+            "dome": f"{address[0]}:{address[1]}",
+            "exposure_s": 0.01,
+            "settle_s": 0.0,
+            "simulation": NOISELESS,
+        }
         return JobSpec(rig=RigSpec.model_validate(rig | options))
 
     return make
@@ -90,11 +96,17 @@ def frames_of(root: Path) -> NDArray[np.uint16]:
 
 
 def radiance_of(manifest: CaptureManifest, counts: NDArray[np.uint16], frame: FrameRecord) -> NDArray[np.float64]:
-    return (counts.astype(np.float64) - manifest.black_level) * manifest.radiance_per_count / (frame.level * frame.exposure_s)
+    return (
+        (counts.astype(np.float64) - manifest.black_level)
+        * manifest.radiance_per_count
+        / (frame.level * frame.exposure_s)
+    )
 
 
 @pytest.mark.parametrize("cameras", ["simulated", "playback"])
-def test_counts_turn_back_into_the_radiance_of_the_one_light(tmp_path: Path, mouth: Path, job: Callable[..., JobSpec], cameras: str) -> None:
+def test_counts_turn_back_into_the_radiance_of_the_one_light(
+    tmp_path: Path, mouth: Path, job: Callable[..., JobSpec], cameras: str
+) -> None:
     manifest = stage.run(job(cameras=cameras), LocalContext(tmp_path / "job"))
     folder, published = open_stage(tmp_path / "job", "capture", CaptureManifest)
     assert published == manifest
@@ -112,7 +124,10 @@ def test_counts_turn_back_into_the_radiance_of_the_one_light(tmp_path: Path, mou
                 continue
             still = stills.sum(axis=0) if frame.light is None else stills[int(frame.light[1:])]
             # Rounding to counts moves radiance by half a count; float32 sums of the stills by some of their epsilons.
-            tolerance = 0.5 * manifest.radiance_per_count / (frame.level * frame.exposure_s) + 8 * np.finfo(np.float32).eps * still.max()
+            tolerance = (
+                0.5 * manifest.radiance_per_count / (frame.level * frame.exposure_s)
+                + 8 * np.finfo(np.float32).eps * still.max()
+            )
             assert np.abs(radiance_of(manifest, seen, frame) - still).max() <= tolerance
         assert not counts[camera, :, height:].any()
         assert not counts[camera, :, :, width:].any()
@@ -144,7 +159,10 @@ def test_noise_is_as_specified(tmp_path: Path, job: Callable[..., JobSpec]) -> N
 def test_cameras_see_the_registers_and_not_the_plan(mouth: Path, address: Address) -> None:
     rig = RigSpec(mouth=mouth, exposure_s=0.01, simulation=NOISELESS)
     stills = Stills(mouth, read_record(mouth / "capture.json", FolderCapture))
-    with ModbusDome(*address, ExposureBudget(10, 10)) as dome, SimulatedCameras(stills, rig, 0.5, SubjectMotion(0, 0, 1, 0), *address) as cameras:
+    with (
+        ModbusDome(*address, ExposureBudget(10, 10)) as dome,
+        SimulatedCameras(stills, rig, 0.5, SubjectMotion(0, 0, 1, 0), *address) as cameras,
+    ):
 
         def expose() -> NDArray[np.float64]:
             cameras.arm(0.01, 1)
@@ -179,7 +197,9 @@ def test_motion_displaces_frames_by_the_stated_field(tmp_path: Path, job: Callab
     seen = radiance_of(manifest, frames_of(tmp_path / "job")[0, last.index], last)
     inside = np.s_[4:-4, 4:-4]
     # Interpolation error of waves of amplitude 0.225 and wave numbers 1/4 and 1/5, as derived in test_capture_motion.
-    bound = 0.225 * 0.5625 / 6 * ((1 / 4) ** 3 + 1.25 * (1 / 5) ** 3) + manifest.radiance_per_count / (last.level * last.exposure_s)
+    bound = 0.225 * 0.5625 / 6 * ((1 / 4) ** 3 + 1.25 * (1 / 5) ** 3) + manifest.radiance_per_count / (
+        last.level * last.exposure_s
+    )
     assert np.abs(seen - truth)[inside].max() < bound
     assert np.abs(smooth_image(24, 18, 3, 0, light) - truth)[inside].max() > 10 * bound
 
@@ -212,7 +232,9 @@ class CancelAfter(LocalContext):
 
 
 @pytest.mark.parametrize("damage", [False, True])
-def test_a_cancelled_capture_is_dark_and_resumes(tmp_path: Path, job: Callable[..., JobSpec], address: Address, damage: bool) -> None:
+def test_a_cancelled_capture_is_dark_and_resumes(
+    tmp_path: Path, job: Callable[..., JobSpec], address: Address, damage: bool
+) -> None:
     spec = job(simulation=SimulatedCameraSpec(motion_px=1.0))
     root = tmp_path / "job"
     with pytest.raises(JobCancelledError):
@@ -242,7 +264,9 @@ def long_job(job: Callable[..., JobSpec], monkeypatch: pytest.MonkeyPatch) -> Ca
 
     def plan(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
         frames = plan_capture(rig, lights)
-        return tuple(frame.model_copy(update={"exposure_s": 0.01}) if frame.kind == "black" else frame for frame in frames)
+        return tuple(
+            frame.model_copy(update={"exposure_s": 0.01}) if frame.kind == "black" else frame for frame in frames
+        )
 
     monkeypatch.setattr("services.capture.rig.plan_capture", plan)
     monkeypatch.setattr("services.capture.preflight.preflight", lambda *_: ())
@@ -272,7 +296,9 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("cameras", ["simulated", "playback"])
-def test_a_cancel_in_mid_exposure_ends_the_capture_in_the_dark(tmp_path: Path, long_job: Callable[..., JobSpec], address: Address, cameras: str) -> None:
+def test_a_cancel_in_mid_exposure_ends_the_capture_in_the_dark(
+    tmp_path: Path, long_job: Callable[..., JobSpec], address: Address, cameras: str
+) -> None:
     thread, raised = begin(long_job(cameras=cameras), tmp_path / "job")
     try:
         wait_until(lambda: outputs(address).any())
@@ -307,7 +333,9 @@ def test_a_cancel_darkens_a_camera_that_is_still_exposing(
     assert [type(problem) for problem in raised] == [JobCancelledError]
 
 
-def test_frames_of_another_capture_are_not_mixed_in(tmp_path: Path, job: Callable[..., JobSpec], address: Address) -> None:
+def test_frames_of_another_capture_are_not_mixed_in(
+    tmp_path: Path, job: Callable[..., JobSpec], address: Address
+) -> None:
     root = tmp_path / "job"
     with pytest.raises(JobCancelledError):
         stage.run(job(), CancelAfter(root, 5, address))
@@ -317,8 +345,12 @@ def test_frames_of_another_capture_are_not_mixed_in(tmp_path: Path, job: Callabl
     assert not list(root.glob(".capture.[0-9]*"))
 
 
-@pytest.mark.parametrize(("spoil", "recaptured"), [(lambda text: text[:-40], 2), (lambda text: text.replace('"index":1,', '"in', 1), 1)])
-def test_a_torn_journal_line_is_no_frame(tmp_path: Path, job: Callable[..., JobSpec], address: Address, spoil: Callable[[str], str], recaptured: int) -> None:
+@pytest.mark.parametrize(
+    ("spoil", "recaptured"), [(lambda text: text[:-40], 2), (lambda text: text.replace('"index":1,', '"in', 1), 1)]
+)
+def test_a_torn_journal_line_is_no_frame(
+    tmp_path: Path, job: Callable[..., JobSpec], address: Address, spoil: Callable[[str], str], recaptured: int
+) -> None:
     root = tmp_path / "job"
     with pytest.raises(JobCancelledError):
         stage.run(job(), CancelAfter(root, 3, address))
@@ -340,7 +372,9 @@ def test_an_overtaken_attempt_stores_nothing_more(tmp_path: Path) -> None:
         store.store(frame.model_copy(update={"index": 1}), image)
 
 
-def test_preflight_names_a_dead_light_before_any_frame(tmp_path: Path, job: Callable[..., JobSpec], address: Address) -> None:
+def test_preflight_names_a_dead_light_before_any_frame(
+    tmp_path: Path, job: Callable[..., JobSpec], address: Address
+) -> None:
     order_fault(*address, FaultKind.DEAD_LIGHT, 4)
     with pytest.raises(ReadbackError, match="Light 4 emits"):
         stage.run(job(), LocalContext(tmp_path / "job"))
@@ -348,7 +382,9 @@ def test_preflight_names_a_dead_light_before_any_frame(tmp_path: Path, job: Call
     assert not (tmp_path / "job" / ".capture.1" / "capture.zarr" / "c").exists()
 
 
-def test_a_light_that_dies_during_the_capture_ends_it_with_the_frames_kept(tmp_path: Path, job: Callable[..., JobSpec], address: Address) -> None:
+def test_a_light_that_dies_during_the_capture_ends_it_with_the_frames_kept(
+    tmp_path: Path, job: Callable[..., JobSpec], address: Address
+) -> None:
     def kill_light(event: StageEvent) -> None:
         if event.kind == "progress" and event.data["light"] == "l2":
             order_fault(*address, FaultKind.DEAD_LIGHT, 3)
@@ -371,7 +407,10 @@ def look(mouth: Path, address: Address, kind: type[SimulatedCameras], gain_level
     rig = RigSpec(mouth=mouth, exposure_s=0.01, simulation=NOISELESS)
     plan = plan_capture(rig, LIGHTS)
     stills = Stills(mouth, read_record(mouth / "capture.json", FolderCapture))
-    with ModbusDome(*address, ExposureBudget(10, 10)) as dome, kind(stills, rig, gain_level, SubjectMotion(0, 0, 1, 0), *address) as cameras:
+    with (
+        ModbusDome(*address, ExposureBudget(10, 10)) as dome,
+        kind(stills, rig, gain_level, SubjectMotion(0, 0, 1, 0), *address) as cameras,
+    ):
         return preflight(plan, dome, cameras, rig, lambda: None)
 
 
@@ -463,7 +502,12 @@ def _replace(array: NDArray[np.generic]) -> Callable[[Path], None]:
     ],
 )
 def test_bad_input_is_one_sentence_before_any_light(
-    tmp_path: Path, mouth: Path, job: Callable[..., JobSpec], spoil: Callable[[Path], None], error: type[DentineError], words: tuple[str, ...]
+    tmp_path: Path,
+    mouth: Path,
+    job: Callable[..., JobSpec],
+    spoil: Callable[[Path], None],
+    error: type[DentineError],
+    words: tuple[str, ...],
 ) -> None:
     spoil(mouth)
     with pytest.raises(error) as caught:

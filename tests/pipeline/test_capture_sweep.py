@@ -14,8 +14,13 @@ from services.core.settings import ServerSettings
 from tests.support.live_server import serving
 
 
-def test_the_sweep_goes_on_after_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    faults, is_swept = iter([sql.exc.OperationalError("SELECT", None, OSError("away")), PermissionError("locked")]), threading.Event()
+def test_the_sweep_goes_on_after_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults, is_swept = (
+        iter([sql.exc.OperationalError("SELECT", None, OSError("away")), PermissionError("locked")]),
+        threading.Event(),
+    )
 
     def sweep(_captures: Captures) -> None:
         if (fault := next(faults, None)) is not None:

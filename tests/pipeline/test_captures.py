@@ -101,9 +101,13 @@ def test_nothing_is_sent_twice(serve: Serve, tmp_path: Path) -> None:
 def test_an_idempotency_key_belongs_to_one_manifest(serve: Serve, tmp_path: Path) -> None:
     client = serve()
     contents = contents_of(write_capture(tmp_path / "mine"))
-    answers = [client.post("/v1/captures", json=manifest_of(contents), headers={"Idempotency-Key": "k"}) for _ in range(2)]
+    answers = [
+        client.post("/v1/captures", json=manifest_of(contents), headers={"Idempotency-Key": "k"}) for _ in range(2)
+    ]
     assert [answer.status_code for answer in answers] == [201, 200]
-    other = client.post("/v1/captures", json=manifest_of(contents | {"a.json": b"{}"}), headers={"Idempotency-Key": "k"})
+    other = client.post(
+        "/v1/captures", json=manifest_of(contents | {"a.json": b"{}"}), headers={"Idempotency-Key": "k"}
+    )
     assert (other.status_code, other.json()["code"]) == (409, "capture-state")
 
 
@@ -130,7 +134,11 @@ def test_a_commit_lists_exactly_what_is_missing_or_corrupt(serve: Serve, tmp_pat
 def test_an_image_bomb_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
     client = serve()
     contents = contents_of(write_capture(tmp_path / "mine"))
-    shape = b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999, 3), }".ljust(117) + b"\n"
+    shape = (
+        b"\x93NUMPY\x01\x00\x76\x00"
+        + b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999, 3), }".ljust(117)
+        + b"\n"
+    )
     contents["c0_l1.npy"] = shape
     capture = announce(client, contents)
     send_missing(client, capture, contents)
@@ -188,7 +196,9 @@ def test_captures_are_listed_in_pages(serve: Serve, tmp_path: Path) -> None:
         ({"largest_text_bytes": 20}, "'capture.json'"),
     ],
 )
-def test_limits_are_named_before_anything_is_sent(serve: Serve, tmp_path: Path, limits: dict[str, int], named: str) -> None:
+def test_limits_are_named_before_anything_is_sent(
+    serve: Serve, tmp_path: Path, limits: dict[str, int], named: str
+) -> None:
     answer = serve(**limits).post("/v1/captures", json=manifest_of(contents_of(write_capture(tmp_path / "mine"))))
     assert (answer.status_code, answer.json()["code"]) == (413, "upload-too-large")
     assert named in answer.json()["detail"]
@@ -196,11 +206,15 @@ def test_limits_are_named_before_anything_is_sent(serve: Serve, tmp_path: Path, 
 
 def test_a_capture_that_the_disk_cannot_hold_is_refused(serve: Serve) -> None:
     vast = {"path": "a.npy", "bytes": 2**50, "sha256": "0" * 64}
-    answer = serve(largest_file_bytes=2**51, largest_capture_bytes=2**51).post("/v1/captures", json={"files": [entry("capture.json", b"{}"), vast]})
+    answer = serve(largest_file_bytes=2**51, largest_capture_bytes=2**51).post(
+        "/v1/captures", json={"files": [entry("capture.json", b"{}"), vast]}
+    )
     assert (answer.status_code, answer.json()["code"]) == (507, "disk-full")
 
 
-@pytest.mark.parametrize("path", ["/v1/captures/none", "/v1/captures/a%00b", "/v1/uploads/none/0", "/v1/captures/%27--/commit"])
+@pytest.mark.parametrize(
+    "path", ["/v1/captures/none", "/v1/captures/a%00b", "/v1/uploads/none/0", "/v1/captures/%27--/commit"]
+)
 def test_what_is_not_there_is_a_problem_document(serve: Serve, path: str) -> None:
     client = serve()
     method = client.post if path.endswith("commit") else client.head if "uploads" in path else client.get

@@ -22,7 +22,20 @@ from tests.support.uploading import write_capture
 
 ROOT = Path(__file__).parents[2]
 DENTINE = [sys.executable, "-m", "services"]
-BEYOND_THE_BASE = ("alembic", "fastapi", "uvicorn", "starlette", "structlog", "prometheus_client", "mitsuba", "drjit", "cv2", "scipy", "pymodbus", "psycopg")
+BEYOND_THE_BASE = (
+    "alembic",
+    "fastapi",
+    "uvicorn",
+    "starlette",
+    "structlog",
+    "prometheus_client",
+    "mitsuba",
+    "drjit",
+    "cv2",
+    "scipy",
+    "pymodbus",
+    "psycopg",
+)
 WITHOUT = f"""
 import runpy, sys
 class Absent:
@@ -37,7 +50,9 @@ runpy.run_module('services', run_name='__main__', alter_sys=True)
 
 def dentine(*arguments: str, command: list[str] = DENTINE) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL, env=environment)
+    return subprocess.run(
+        [*command, *arguments], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL, env=environment
+    )
 
 
 def sentence(answer: subprocess.CompletedProcess[str]) -> str:
@@ -69,12 +84,18 @@ def test_a_job_is_named_listed_downloaded_and_deleted_by_the_base_install(tmp_pa
     address = ("--server", str(server.base_url))
     job_file = tmp_path / "job.toml"
     job_file.write_text(f'capture = "{write_capture(tmp_path / "mine")}"\n')
-    made = dentine("submit", str(job_file), "--upload", "--name", " Anna, upper left ", "--watch", *address, command=bare)
+    made = dentine(
+        "submit", str(job_file), "--upload", "--name", " Anna, upper left ", "--watch", *address, command=bare
+    )
     assert made.returncode == 0, made.stderr
     job = made.stdout.split()[0]
     listed = dentine("jobs", *address, command=bare)
-    assert re.fullmatch(rf"{job}  SUCCEEDED      \d{{4}}-\d\d-\d\d \d\d:\d\d UTC  Anna, upper left  captures/\w+\n", listed.stdout)
-    (told,) = json.loads(dentine("jobs", "--state", "succeeded", "--capture", "captures/", "--json", *address, command=bare).stdout)
+    assert re.fullmatch(
+        rf"{job}  SUCCEEDED      \d{{4}}-\d\d-\d\d \d\d:\d\d UTC  Anna, upper left  captures/\w+\n", listed.stdout
+    )
+    (told,) = json.loads(
+        dentine("jobs", "--state", "succeeded", "--capture", "captures/", "--json", *address, command=bare).stdout
+    )
     assert (told["id"], told["name"]) == (job, "Anna, upper left")
     assert dentine("jobs", "--state", "failed", *address, command=bare).stdout == "There is no such job.\n"
 
@@ -122,7 +143,9 @@ def test_a_job_under_way_is_not_deleted(tmp_path: Path) -> None:
         (mine / "steering" / "hold-prepare-start").unlink()
 
 
-@pytest.mark.parametrize("arguments", [("jobs",), ("delete", "x"), ("download", "x"), pytest.param(("watch", "x"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "arguments", [("jobs",), ("delete", "x"), ("download", "x"), pytest.param(("watch", "x"), marks=pytest.mark.slow)]
+)
 def test_no_server_is_a_sentence(arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     answer = dentine(*arguments, "--server", "http://127.0.0.1:9")
@@ -134,10 +157,17 @@ def test_no_server_is_a_sentence(arguments: tuple[str, ...], tmp_path: Path, mon
 def test_a_capture_that_the_server_lacks_names_the_ways(tmp_path: Path, server: httpx.Client) -> None:
     job_file = tmp_path / "job.toml"
     job_file.write_text('capture = "nowhere"\n')
-    assert "upload it, with dentine submit --upload" in sentence(dentine("submit", str(job_file), "--server", str(server.base_url)))
+    assert "upload it, with dentine submit --upload" in sentence(
+        dentine("submit", str(job_file), "--server", str(server.base_url))
+    )
     job_file.write_text('[rig]\nmouth = "nowhere"\n')
-    assert "dentine submit --upload, or try the demonstration with dentine demo" in sentence(dentine("submit", str(job_file), "--server", str(server.base_url)))
-    assert "is not a folder; give the folder that holds capture.json" in dentine("submit", str(job_file), "--upload", "--server", str(server.base_url)).stderr
+    assert "dentine submit --upload, or try the demonstration with dentine demo" in sentence(
+        dentine("submit", str(job_file), "--server", str(server.base_url))
+    )
+    assert (
+        "is not a folder; give the folder that holds capture.json"
+        in dentine("submit", str(job_file), "--upload", "--server", str(server.base_url)).stderr
+    )
 
 
 def test_a_mouth_is_uploaded_used_and_kept_while_a_job_names_it(tmp_path: Path, server: httpx.Client) -> None:
@@ -172,7 +202,10 @@ def test_a_job_is_renamed_and_its_options_stay(server: httpx.Client) -> None:
 
 
 def test_the_same_key_makes_one_job_whatever_its_name(server: httpx.Client) -> None:
-    first, second = (server.post("/v1/jobs", json={"capture": "/", "name": name}, headers={"Idempotency-Key": "k"}) for name in ("one", "two"))
+    first, second = (
+        server.post("/v1/jobs", json={"capture": "/", "name": name}, headers={"Idempotency-Key": "k"})
+        for name in ("one", "two")
+    )
     assert (first.status_code, second.status_code) == (201, 200)
     assert first.json()["id"] == second.json()["id"]
     assert second.json()["name"] == "one"

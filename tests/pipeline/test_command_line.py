@@ -18,7 +18,14 @@ DENTINE = [sys.executable, "-m", "services"]
 
 
 def dentine(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*DENTINE, *arguments], capture_output=True, text=True, env=os.environ | environment, check=False, stdin=subprocess.DEVNULL)
+    return subprocess.run(
+        [*DENTINE, *arguments],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
 
 
 def sentence(answer: subprocess.CompletedProcess[str]) -> str:
@@ -90,8 +97,17 @@ def test_benchmarks_are_listed_and_an_unknown_one_is_named() -> None:
         (["--layers", '[{"sigma": 2, "alpha": 0.9}]'], "thickness_mm"),
         (["--layers", '[{"sigma": 2, "alpha": 0.9, "thickness_mm": 1, "colour": 1}]'], "colour"),
         (["--layers", "[]", "--sigma", "2"], "leave out --sigma"),
-        (["--layers", '[{"sigma": 2, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1], "values": [1, 2]}}]'], "must increase from 0 to pi"),
-        (["--alpha", "0.9", "--sigma", "2", "--width", "1", "--exit-cosines", "0.1;1"], "--exit-cosines = 0.1;1 is not a list"),
+        (
+            [
+                "--layers",
+                '[{"sigma": 2, "alpha": 0.9, "thickness_mm": 1, "table": {"angles_rad": [0, 1], "values": [1, 2]}}]',
+            ],
+            "must increase from 0 to pi",
+        ),
+        (
+            ["--alpha", "0.9", "--sigma", "2", "--width", "1", "--exit-cosines", "0.1;1"],
+            "--exit-cosines = 0.1;1 is not a list",
+        ),
         (["--alpha", "0.9", "--sigma", "2", "--width", "1", "--ring-edges", "2,1"], "ring-edges = 2, 1"),
     ],
 )
@@ -143,7 +159,9 @@ def test_ctrl_c_during_a_capture_leaves_the_dome_dark(tmp_path: Path) -> None:
     (tmp_path / "hold-capture").touch()
     command = [sys.executable, str(script), str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=environment) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=environment
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "started\n"
         while not (tmp_path / "lit").exists():

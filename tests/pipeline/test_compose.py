@@ -48,7 +48,11 @@ def services() -> dict[str, dict[str, Any]]:
 
 
 def test_whoever_speaks_dask_speaks_tls() -> None:
-    of_dask = {name for name, one in services().items() if "scheduler" in str(one.get("command")) or "DENTINE__SERVER__SCHEDULER" in one.get("environment", {})}
+    of_dask = {
+        name
+        for name, one in services().items()
+        if "scheduler" in str(one.get("command")) or "DENTINE__SERVER__SCHEDULER" in one.get("environment", {})
+    }
     assert of_dask == {"api", "scheduler", "worker", "rig"}
     assert all(services()[name]["environment"]["DENTINE__SERVER__TLS"] == "/secrets/tls" for name in of_dask)
 
@@ -61,7 +65,9 @@ def test_no_password_stands_in_a_variable() -> None:
 
 
 def test_only_the_api_is_published_and_only_on_loopback() -> None:
-    assert {name: one["ports"] for name, one in services().items() if "ports" in one} == {"api": ["127.0.0.1:8000:8000"]}
+    assert {name: one["ports"] for name, one in services().items() if "ports" in one} == {
+        "api": ["127.0.0.1:8000:8000"]
+    }
 
 
 def test_one_worker_alone_may_reach_the_dome() -> None:
@@ -73,7 +79,10 @@ def test_one_worker_alone_may_reach_the_dome() -> None:
 def test_each_network_has_those_who_need_it_and_leads_nowhere() -> None:
     networks = yaml.safe_load(COMPOSE.read_text())["networks"]
     assert [name for name, one in networks.items() if not (one or {}).get("internal")] == ["front"]
-    members = {network: {name for name, one in services().items() if network in one.get("networks", [])} for network in networks}
+    members = {
+        network: {name for name, one in services().items() if network in one.get("networks", [])}
+        for network in networks
+    }
     assert members["front"] == {"api"}
     assert members["parts"] == {"api", "scheduler", "worker", "rig"}
     assert members["database"] == {"api", "postgres", "worker", "rig"}
@@ -82,7 +91,11 @@ def test_each_network_has_those_who_need_it_and_leads_nowhere() -> None:
 
 
 def test_the_authority_is_nobodys_but_that_of_whoever_makes_certificates() -> None:
-    holders = {name for name, one in services().items() if any(volume.startswith("authority:") for volume in one.get("volumes", []))}
+    holders = {
+        name
+        for name, one in services().items()
+        if any(volume.startswith("authority:") for volume in one.get("volumes", []))
+    }
     assert holders == {"secrets"}
 
 
@@ -98,7 +111,10 @@ def test_every_service_is_checked_closed_and_starts_again() -> None:
 
 
 def test_each_image_is_built_once() -> None:
-    assert {name: one["build"]["target"] for name, one in services().items() if "build" in one} == {"api": "api", "worker": "worker"}
+    assert {name: one["build"]["target"] for name, one in services().items() if "build" in one} == {
+        "api": "api",
+        "worker": "worker",
+    }
 
 
 class Composition:
@@ -122,7 +138,11 @@ class Composition:
 
     def environment(self, name: str) -> dict[str, str]:
         """Of a service, on top of this machine's own."""
-        return os.environ | {"PYTHONPATH": str(ROOT)} | {key: self._here(value or "") for key, value in services()[name].get("environment", {}).items()}
+        return (
+            os.environ
+            | {"PYTHONPATH": str(ROOT)}
+            | {key: self._here(value or "") for key, value in services()[name].get("environment", {}).items()}
+        )
 
     def command(self, name: str) -> list[str]:
         """Of a service, after the program's name."""
@@ -134,7 +154,9 @@ class Composition:
         """Start a service by its own command."""
         with (self._folder / f"{name}.log").open("wb") as log:
             command = [*DENTINE, *self.command(name)]
-            self._processes[name] = subprocess.Popen(command, env=self.environment(name), cwd=self._folder, stdout=log, stderr=log, start_new_session=True)
+            self._processes[name] = subprocess.Popen(
+                command, env=self.environment(name), cwd=self._folder, stdout=log, stderr=log, start_new_session=True
+            )
 
     def close(self) -> None:
         """End all of them in order, as the engine does."""
@@ -150,7 +172,11 @@ class Composition:
 
     def _here(self, text: str) -> str:
         for theirs, ours in self._names.items():
-            text = re.sub(rf"(?<!\w){re.escape(theirs)}\b", ours, text) if theirs.startswith("/") else text.replace(theirs, ours)
+            text = (
+                re.sub(rf"(?<!\w){re.escape(theirs)}\b", ours, text)
+                if theirs.startswith("/")
+                else text.replace(theirs, ours)
+            )
         return text
 
 
@@ -182,7 +208,9 @@ def _is_live(address: str) -> bool:
 
 
 def dentine(folder: Path, environment: Mapping[str, str], *arguments: str, ends_with: Collection[int] = (0,)) -> str:
-    done = subprocess.run([*DENTINE, *arguments], cwd=folder, env=dict(environment), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*DENTINE, *arguments], cwd=folder, env=dict(environment), capture_output=True, text=True, check=False
+    )
     assert done.returncode in ends_with, done.stderr
     return done.stdout.strip()
 
@@ -218,7 +246,9 @@ def work_the_dome(client: httpx.Client, token: str) -> None:
     headers = {"Authorization": f"Bearer {token}"}
     told = client.get("/v1/dome", headers=headers).json()
     assert (told["capturing"], told["status"]["lit"], told["status"]["stopped"]) == ([], [], False)
-    assert client.put("/v1/dome/light", json={"light": 3, "level": 0.05, "on_s": 30}, headers=headers).json()["lit"] == [3]
+    assert client.put("/v1/dome/light", json={"light": 3, "level": 0.05, "on_s": 30}, headers=headers).json()[
+        "lit"
+    ] == [3]
     dark = client.post("/v1/dome/off", headers=headers).json()["status"]
     assert (dark["lit"], dark["stopped"]) == ([], True)
     assert client.get("/v1/dome", headers=headers).json()["status"] == dark

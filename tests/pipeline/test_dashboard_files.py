@@ -28,7 +28,9 @@ def test_the_first_page_is_never_blank(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_the_wheel_contains_the_page(tmp_path: Path) -> None:
-    wheel = build_wheel(tmp_path, {f"services/api/dashboard/static/{name}": "" for name in BUNDLE if not (STATIC / name).exists()})
+    wheel = build_wheel(
+        tmp_path, {f"services/api/dashboard/static/{name}": "" for name in BUNDLE if not (STATIC / name).exists()}
+    )
     names = set(zipfile.ZipFile(wheel).namelist())
     of_page = [*(STATIC / name for name in (*BUNDLE, "index.html", "icon.svg")), *UNBUILT.iterdir()]
     folder = Path(app_module.__file__).parents[2]

@@ -55,7 +55,9 @@ def await_scheduler(address: str, tls: Path) -> None:
 
 def ready(client: httpx.Client) -> dict[str, str]:
     """What readiness complains about."""
-    return {check["name"]: check["sentence"] for check in client.get("/v1/health/ready").json()["checks"] if not check["ok"]}
+    return {
+        check["name"]: check["sentence"] for check in client.get("/v1/health/ready").json()["checks"] if not check["ok"]
+    }
 
 
 def await_ready(client: httpx.Client) -> None:
@@ -70,10 +72,25 @@ def await_ready(client: httpx.Client) -> None:
 @pytest.mark.attack("Dask and files as another user", "a scheduler by TLS, without a certificate")
 def test_a_job_runs_by_tls_and_strangers_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.pipeline.workers.CONNECT_S", 2.0)
-    ours, theirs, address = certificates(tmp_path / "ours"), certificates(tmp_path / "theirs"), f"tcp://127.0.0.1:{free_port()}"
+    ours, theirs, address = (
+        certificates(tmp_path / "ours"),
+        certificates(tmp_path / "theirs"),
+        f"tcp://127.0.0.1:{free_port()}",
+    )
     with (
         part(tmp_path, ours, "scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2]),
-        part(tmp_path, ours, "worker", address, "--nworkers", "1", "--nthreads", "1", "--local-directory", str(tmp_path / "dask")),
+        part(
+            tmp_path,
+            ours,
+            "worker",
+            address,
+            "--nworkers",
+            "1",
+            "--nthreads",
+            "1",
+            "--local-directory",
+            str(tmp_path / "dask"),
+        ),
     ):
         await_scheduler(address, ours)
         for stranger in (None, Certificates.of(theirs)):

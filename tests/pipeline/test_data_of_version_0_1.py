@@ -51,7 +51,10 @@ def test_the_archive_is_small() -> None:
 
 def test_its_jobs_captures_and_names_are_listed(client: httpx.Client) -> None:
     jobs = client.get("/v1/jobs").json()["jobs"]
-    assert [(job["number"], job["id"], job["state"]) for job in jobs] == [(2, CANCELLED, "CANCELLED"), (1, SUCCEEDED, "SUCCEEDED")]
+    assert [(job["number"], job["id"], job["state"]) for job in jobs] == [
+        (2, CANCELLED, "CANCELLED"),
+        (1, SUCCEEDED, "SUCCEEDED"),
+    ]
     assert jobs[1]["spec"]["capture"] == f"captures/{CAPTURE}"
     assert [capture["id"] for capture in client.get("/v1/captures").json()["captures"]] == [CAPTURE]
     assert [one["name"] for one in client.get("/v1/calibrations").json()] == ["first"]
@@ -62,7 +65,11 @@ def test_its_jobs_captures_and_names_are_listed(client: httpx.Client) -> None:
 
 def test_a_finished_job_is_shown_with_its_files(client: httpx.Client) -> None:
     job = client.get(f"/v1/jobs/{SUCCEEDED}").json()
-    assert [(stage["stage"], stage["state"]) for stage in job["stages"]] == [("prepare", "finished"), ("fit", "finished"), ("export", "finished")]
+    assert [(stage["stage"], stage["state"]) for stage in job["stages"]] == [
+        ("prepare", "finished"),
+        ("fit", "finished"),
+        ("export", "finished"),
+    ]
     parameters = client.get(f"/v1/jobs/{SUCCEEDED}/artifacts/parameters.json")
     assert hashlib.sha256(parameters.content).hexdigest() == PARAMETERS_SHA256
     assert "Tooth" in client.get(f"/v1/jobs/{SUCCEEDED}/artifacts/report.html").text
@@ -84,10 +91,24 @@ def test_the_store_of_a_finished_job_is_whole(data: Path) -> None:
 
 
 def test_what_it_stored_belongs_to_the_default_group(data: Path) -> None:
-    members, others = (make_token(data, name, Scope.SUBMIT, group=group) for name, group in (("member", "default"), ("other", None)))
+    members, others = (
+        make_token(data, name, Scope.SUBMIT, group=group) for name, group in (("member", "default"), ("other", None))
+    )
     with serving(create_app(ServerSettings(data=data, access="tokens"), lambda *_: None)) as client:
-        paths = ("/v1/jobs", "/v1/captures", "/v1/calibrations", f"/v1/jobs/{SUCCEEDED}", f"/v1/captures/{CAPTURE}", "/v1/calibrations/first")
-        seen, hidden = ([client.get(path, headers={"Authorization": f"Bearer {token}"}) for path in paths] for token in (members, others))
-        assert all(answer.status_code == 200 and "owner" in answer.text for answer in seen), [answer.text for answer in seen]
+        paths = (
+            "/v1/jobs",
+            "/v1/captures",
+            "/v1/calibrations",
+            f"/v1/jobs/{SUCCEEDED}",
+            f"/v1/captures/{CAPTURE}",
+            "/v1/calibrations/first",
+        )
+        seen, hidden = (
+            [client.get(path, headers={"Authorization": f"Bearer {token}"}) for path in paths]
+            for token in (members, others)
+        )
+        assert all(answer.status_code == 200 and "owner" in answer.text for answer in seen), [
+            answer.text for answer in seen
+        ]
         assert [answer.status_code for answer in hidden] == [200] * 3 + [404] * 3
         assert (hidden[0].json()["jobs"], hidden[1].json()["captures"], hidden[2].json()) == ([], [], [])

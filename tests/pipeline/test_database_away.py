@@ -45,12 +45,17 @@ def test_a_token_that_cannot_be_looked_up_is_neither_right_nor_wrong(tmp_path: P
         with without("token", server):
             answer = server.ask("GET", "/v1/jobs", headers={"Authorization": f"Bearer {token}"})
             assert problem_of(answer) == (503, "database-lost")
-        assert server.ask("GET", "/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == (200 if credential == "right" else 401)
+        assert server.ask("GET", "/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == (
+            200 if credential == "right" else 401
+        )
 
 
 def test_a_refusal_that_cannot_be_audited_is_503(tmp_path: Path) -> None:
     with guarded(tmp_path) as server, without("audit", server):
-        assert problem_of(server.ask("GET", "/v1/jobs", headers={"Authorization": "Bearer wrong"})) == (503, "database-lost")
+        assert problem_of(server.ask("GET", "/v1/jobs", headers={"Authorization": "Bearer wrong"})) == (
+            503,
+            "database-lost",
+        )
         assert problem_of(server.ask("GET", "/v1/jobs")) == (503, "database-lost")
         assert problem_of(server.ask("POST", "/v1/jobs", Scope.READ, json={"capture": "/"})) == (503, "database-lost")
 
@@ -85,7 +90,9 @@ def test_a_stream_outlasts_the_absence_of_its_token(tmp_path: Path, monkeypatch:
 
 
 def test_a_server_whose_connections_are_all_taken_is_503(tmp_path: Path) -> None:
-    engine = sql.create_engine(f"sqlite:///{tmp_path / 'some.sqlite'}", poolclass=sql.QueuePool, pool_size=1, max_overflow=0, pool_timeout=0.01)
+    engine = sql.create_engine(
+        f"sqlite:///{tmp_path / 'some.sqlite'}", poolclass=sql.QueuePool, pool_size=1, max_overflow=0, pool_timeout=0.01
+    )
     app = FastAPI()
     problems.install(app)
 

@@ -110,7 +110,11 @@ def test_a_changed_password_needs_no_restart(tmp_path: Path, url: str, server: P
 def test_a_bad_password_file_is_named(tmp_path: Path, content: bytes | None, reason: str) -> None:
     if content is not None:
         (tmp_path / "password").write_bytes(content)
-    chosen = ServerSettings(data=tmp_path / "data", database=SecretStr("postgresql://dentine@127.0.0.1:1/x"), database_password_file=tmp_path / "password")
+    chosen = ServerSettings(
+        data=tmp_path / "data",
+        database=SecretStr("postgresql://dentine@127.0.0.1:1/x"),
+        database_password_file=tmp_path / "password",
+    )
     with pytest.raises(SettingsError, match=reason) as told:
         Jobs(chosen, lambda *_: None)
     assert str(tmp_path / "password") in told.value.message

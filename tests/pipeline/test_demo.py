@@ -110,7 +110,9 @@ def test_a_cancel_ends_the_rendering_in_mid_kernel(tmp_path: Path) -> None:
 
 def test_a_rendering_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo_mouth, "OPTIONS", SMALL | {"samples": "1"})
-    with pytest.raises(CrashError, match="could not be rendered: A phantom needs at least one camera, one light, 16 samples"):
+    with pytest.raises(
+        CrashError, match="could not be rendered: A phantom needs at least one camera, one light, 16 samples"
+    ):
         demo_mouth.make_demo_mouth(tmp_path / "draft", tmp_path / "kept", lambda _fraction: None)
     assert [path.name for path in tmp_path.iterdir()] in ([], ["draft"])
 
@@ -118,8 +120,19 @@ def test_a_rendering_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytes
 def test_each_stage_sees_the_mouth_where_it_is(tmp_path: Path) -> None:
     seen: list[str] = []
     doors = DOORS | {"phantom": "tests.pipeline.test_demo:tell_mouth", "capture": "tests.pipeline.test_demo:tell_mouth"}
-    run_stages(DEMO, tmp_path / "job", ("phantom", "capture"), lambda event: seen.append(event.message), doors=doors, phantoms=tmp_path / "kept", workers=1)
-    assert [line for line in seen if line.startswith("/")] == [str(tmp_path / "kept"), str(tmp_path / "job" / "phantom")]
+    run_stages(
+        DEMO,
+        tmp_path / "job",
+        ("phantom", "capture"),
+        lambda event: seen.append(event.message),
+        doors=doors,
+        phantoms=tmp_path / "kept",
+        workers=1,
+    )
+    assert [line for line in seen if line.startswith("/")] == [
+        str(tmp_path / "kept"),
+        str(tmp_path / "job" / "phantom"),
+    ]
     assert json.loads((tmp_path / "job" / "job.json").read_text())["rig"]["mouth"] == str(DEMO_MOUTH)
 
 
@@ -140,9 +153,16 @@ def test_one_command_runs_it_on_a_server(tmp_path: Path) -> None:
         assert (job["state"], job["name"], job["spec"]["rig"]["mouth"]) == ("SUCCEEDED", "Demonstration", "demo")
         assert ran.stdout.splitlines()[-1] == f"report: {server}/v1/jobs/{job['id']}/artifacts/report.html"
         stages = client.get(f"/v1/jobs/{job['id']}").json()["stages"]
-        assert [(stage["stage"], stage["state"]) for stage in stages] == [(name, "finished") for name in stages_of(DEMO)]
+        assert [(stage["stage"], stage["state"]) for stage in stages] == [
+            (name, "finished") for name in stages_of(DEMO)
+        ]
         example = ["submit", str(ROOT / "deploy" / "examples" / "demo.toml"), "--watch", "--server", server]
-        assert subprocess.run([sys.executable, "-m", "services", *example], capture_output=True, check=False, env=environment).returncode == 0
+        assert (
+            subprocess.run(
+                [sys.executable, "-m", "services", *example], capture_output=True, check=False, env=environment
+            ).returncode
+            == 0
+        )
     assert list(tmp_path.iterdir()) == [tmp_path / "data"]
 
 
@@ -155,9 +175,15 @@ def test_a_demonstration_has_one_source() -> None:
 @pytest.mark.timeout(3600)
 def test_the_demonstration_finds_the_optics_of_its_mouth(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "services", "demo", "--out", str(tmp_path / "demo"), "--json"]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    ran = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
     assert ran.returncode == 0, ran.stderr
     assert json.loads(ran.stdout)["converged"]
     found = json.loads((tmp_path / "demo" / "parameters.json").read_text())["green"]["enamel.sigma_s_reduced"]
-    truth = json.loads((tmp_path / "demo" / "phantom" / "truth.json").read_text())["channels"]["green"]["enamel"]["sigma_s_reduced"]
-    assert abs(found["value"] - truth) < 4 * found["se"]  # four standard errors: one in 16,000 runs of an honest ± would fail
+    truth = json.loads((tmp_path / "demo" / "phantom" / "truth.json").read_text())["channels"]["green"]["enamel"][
+        "sigma_s_reduced"
+    ]
+    assert (
+        abs(found["value"] - truth) < 4 * found["se"]
+    )  # four standard errors: one in 16,000 runs of an honest ± would fail

@@ -19,7 +19,9 @@ MONITORING = DEPLOY / "monitoring"
 
 def compose_schema(file: Path) -> int:
     return subprocess.run(
-        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(file)], capture_output=True, check=False
+        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(file)],
+        capture_output=True,
+        check=False,
     ).returncode
 
 
@@ -29,7 +31,9 @@ def kubernetes(file: Path) -> int:
 
 
 def promtool(*arguments: str, cwd: Path) -> int:
-    program = shutil.which("promtool") or pytest.skip("promtool is not installed; Debian's package prometheus brings it.")
+    program = shutil.which("promtool") or pytest.skip(
+        "promtool is not installed; Debian's package prometheus brings it."
+    )
     return subprocess.run([program, *arguments], cwd=cwd, capture_output=True, check=False).returncode
 
 
@@ -47,7 +51,9 @@ def test_the_manifests_are_those_of_the_compose_file(tmp_path: Path) -> None:
     copy = shutil.copytree(DEPLOY, tmp_path / "deploy")
     changed = copy / "compose.yaml"
     changed.write_text(changed.read_text().replace("--port=5020", "--port=5021"))
-    assert subprocess.run([sys.executable, str(copy / "kubernetes" / "render.py"), "--check"], check=False).returncode == 1
+    assert (
+        subprocess.run([sys.executable, str(copy / "kubernetes" / "render.py"), "--check"], check=False).returncode == 1
+    )
 
 
 def test_the_manifests_are_valid(tmp_path: Path) -> None:
@@ -82,13 +88,20 @@ def test_the_runbook_has_every_alarm() -> None:
 
 def test_prometheus_takes_its_configuration(tmp_path: Path) -> None:
     assert promtool("check", "config", "--syntax-only", "prometheus.yml", cwd=MONITORING) == 0
-    (tmp_path / "prometheus.yml").write_text((MONITORING / "prometheus.yml").read_text().replace("metrics_path", "metric_path"))
+    (tmp_path / "prometheus.yml").write_text(
+        (MONITORING / "prometheus.yml").read_text().replace("metrics_path", "metric_path")
+    )
     assert promtool("check", "config", "--syntax-only", "prometheus.yml", cwd=tmp_path) != 0
 
 
 def test_the_curves_ask_for_metrics_that_the_server_has() -> None:
     told = yaml.safe_load((MONITORING / "grafana" / "dashboards" / "dentine.json").read_text())
-    asked = {name for panel in told["panels"] for target in panel["targets"] for name in re.findall(r"dentine_\w+", target["expr"])}
+    asked = {
+        name
+        for panel in told["panels"]
+        for target in panel["targets"]
+        for name in re.findall(r"dentine_\w+", target["expr"])
+    }
     source = (DEPLOY.parent / "services" / "api" / "metrics.py").read_text()
     for name in asked:
         assert f'"{re.sub("_(total|bucket)$", "", name)}"' in source, name

@@ -41,7 +41,9 @@ def disk() -> Iterator[Disk]:
     disk.is_mended.set()
 
 
-def test_a_job_is_told_without_its_time_and_everything_else_as_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
+def test_a_job_is_told_without_its_time_and_everything_else_as_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk
+) -> None:
     monkeypatch.setattr("services.api.jobs.time_ranges.size_of", disk)
     monkeypatch.setattr("services.api.jobs.routes.LOOK_S", 0.1)
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: disk.is_mended.wait(60))) as client:
@@ -58,7 +60,9 @@ def test_a_job_is_told_without_its_time_and_everything_else_as_ever(tmp_path: Pa
         assert client.get(f"/v1/jobs/{job}").json()["remaining"] is None
 
 
-def test_a_job_whose_size_is_being_predicted_can_be_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
+def test_a_job_whose_size_is_being_predicted_can_be_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk
+) -> None:
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client:
         monkeypatch.setattr("services.api.jobs.admission.Admission.refuse_too_large", lambda *_: None)
         monkeypatch.setattr("services.api.jobs.admission.predict", disk)
@@ -72,9 +76,14 @@ def test_a_job_whose_size_is_being_predicted_can_be_asked_for(tmp_path: Path, mo
             disk.is_mended.set()
 
 
-def test_many_who_wait_for_files_of_jobs_keep_nobody_from_submitting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk) -> None:
+def test_many_who_wait_for_files_of_jobs_keep_nobody_from_submitting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk
+) -> None:
     monkeypatch.setattr("services.api.jobs.routes.list_artifacts", disk.list_nothing)
-    with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client, ThreadPoolExecutor(FILE_READERS) as pool:
+    with (
+        serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: None)) as client,
+        ThreadPoolExecutor(FILE_READERS) as pool,
+    ):
         files = f"{client.base_url}/v1/jobs/{submit(client, tmp_path)}/artifacts"
         waiting = [pool.submit(httpx.get, files, timeout=60) for _ in range(FILE_READERS)]
         assert disk.is_asked.wait(60)

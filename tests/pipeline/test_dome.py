@@ -114,7 +114,14 @@ def problem_of(answer: httpx.Response) -> tuple[int, str]:
 def rig(tmp_path: Path, **options: Any) -> dict[str, Any]:
     if not (tmp_path / "mouth").exists():
         write_mouth(tmp_path / "mouth", LIGHTS)
-    return {"mouth": str(tmp_path / "mouth"), "exposure_s": 0.01, "settle_s": 0.0, "watchdog_s": WATCHDOG_S, "tracking_every": 3, **options}
+    return {
+        "mouth": str(tmp_path / "mouth"),
+        "exposure_s": 0.01,
+        "settle_s": 0.0,
+        "watchdog_s": WATCHDOG_S,
+        "tracking_every": 3,
+        **options,
+    }
 
 
 def test_one_light_goes_on_is_seen_and_goes_off(client: httpx.Client, observer: DomeObserver) -> None:
@@ -123,7 +130,12 @@ def test_one_light_goes_on_is_seen_and_goes_off(client: httpx.Client, observer: 
     assert lit(observer) == (3,)
     assert client.put("/v1/dome/light", json={"light": 4, "level": 0.1, "on_s": 30}).json()["lit"] == [4]
     state = client.get("/v1/dome").json()
-    assert (state["status"]["light_count"], state["status"]["lit"], state["status"]["stopped"], state["capturing"]) == (LIGHTS, [4], False, [])
+    assert (state["status"]["light_count"], state["status"]["lit"], state["status"]["stopped"], state["capturing"]) == (
+        LIGHTS,
+        [4],
+        False,
+        [],
+    )
     assert client.delete("/v1/dome/light").json()["lit"] == []
     assert lit(observer) == ()
 
@@ -160,7 +172,9 @@ def test_all_off_holds_until_somebody_starts_anew(client: httpx.Client, observer
         ({}, "'light'"),
     ],
 )
-def test_a_light_that_cannot_be_is_refused_in_the_dark(client: httpx.Client, observer: DomeObserver, wanted: dict[str, float], named: str) -> None:
+def test_a_light_that_cannot_be_is_refused_in_the_dark(
+    client: httpx.Client, observer: DomeObserver, wanted: dict[str, float], named: str
+) -> None:
     answer = client.put("/v1/dome/light", json=wanted)
     assert problem_of(answer) == (422, "bad-settings")
     assert named in answer.json()["detail"]
@@ -189,7 +203,9 @@ def test_light_by_hand_adds_up_to_the_limit(shared_dome: Address, observer: Dome
         assert answer(do="light", light=1, level=0.1, on_s=14.9).code is None
 
 
-def test_a_light_that_was_asked_for_before_all_off_does_not_come_after_it(shared_dome: Address, observer: DomeObserver) -> None:
+def test_a_light_that_was_asked_for_before_all_off_does_not_come_after_it(
+    shared_dome: Address, observer: DomeObserver
+) -> None:
     with console(shared_dome) as answer:
         assert answer(number=2, do="off").code is None
         assert answer(number=1, do="light", light=0, level=0.1, on_s=5).code == "rig-stopped"
@@ -215,13 +231,20 @@ def test_an_open_interlock_is_a_sentence(client: httpx.Client, shared_dome: Addr
 
 def test_a_server_without_a_dome_says_so(tmp_path: Path) -> None:
     with serving(create_app(ServerSettings(data=tmp_path))) as client:
-        for method, path, body in (("GET", "", None), ("POST", "/off", None), ("PUT", "/light", {"light": 0}), ("DELETE", "/light", None)):
+        for method, path, body in (
+            ("GET", "", None),
+            ("POST", "/off", None),
+            ("PUT", "/light", {"light": 0}),
+            ("DELETE", "/light", None),
+        ):
             answer = client.request(method, f"/v1/dome{path}", json=body)
             assert problem_of(answer) == (404, "dome-unknown"), path
             assert "DENTINE__SERVER__DOME__ADDRESS" in answer.json()["detail"]
 
 
-def test_without_the_packages_of_the_dome_the_server_says_so(shared_dome: Address, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_packages_of_the_dome_the_server_says_so(
+    shared_dome: Address, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     with serving(create_app(settings_of(shared_dome, tmp_path))) as client:
         answer = client.get("/v1/dome")
@@ -229,7 +252,9 @@ def test_without_the_packages_of_the_dome_the_server_says_so(shared_dome: Addres
         assert "dentine[capture]" in answer.json()["detail"]
 
 
-def test_the_dome_asks_for_its_scope_and_is_audited(shared_dome: Address, observer: DomeObserver, tmp_path: Path) -> None:
+def test_the_dome_asks_for_its_scope_and_is_audited(
+    shared_dome: Address, observer: DomeObserver, tmp_path: Path
+) -> None:
     with guarded(tmp_path, dome=settings_of(shared_dome, tmp_path).dome) as server:
         assert server.ask("GET", "/v1/dome", Scope.OPERATE_DOME).status_code == 200
         assert server.ask("PUT", "/v1/dome/light", Scope.OPERATE_DOME, json={"light": 5}).status_code == 200
@@ -245,14 +270,20 @@ def test_the_dome_asks_for_its_scope_and_is_audited(shared_dome: Address, observ
         ]
 
 
-def test_a_preflight_tells_what_it_finds(client: httpx.Client, observer: DomeObserver, shared_dome: Address, tmp_path: Path) -> None:
+def test_a_preflight_tells_what_it_finds(
+    client: httpx.Client, observer: DomeObserver, shared_dome: Address, tmp_path: Path
+) -> None:
     assert client.post("/v1/dome/preflight", json=rig(tmp_path)).json() == {"findings": []}
     assert lit(observer) == ()
     order_fault(*shared_dome, FaultKind.DEAD_LIGHT, 4)
     answer = client.post("/v1/dome/preflight", json=rig(tmp_path))
     assert problem_of(answer) == (502, "rig-readback")
     assert "Light 4" in answer.json()["detail"]
-    for wrong, named in ({"mouth": "mouth"}, "relative"), ({"mouth": "/no/such"}, "does not exist"), ({"dome": "other:5020"}, "and no other"):
+    for wrong, named in (
+        ({"mouth": "mouth"}, "relative"),
+        ({"mouth": "/no/such"}, "does not exist"),
+        ({"dome": "other:5020"}, "and no other"),
+    ):
         answer = client.post("/v1/dome/preflight", json=rig(tmp_path) | wrong)
         assert problem_of(answer) == (422, "bad-settings")
         assert named in answer.json()["detail"]
@@ -272,7 +303,9 @@ def test_all_off_ends_a_preflight(client: httpx.Client, observer: DomeObserver, 
     assert lit(observer) == ()
 
 
-def test_a_capture_has_the_dome_for_itself(client: httpx.Client, observer: DomeObserver, jobs: Jobs, tmp_path: Path) -> None:
+def test_a_capture_has_the_dome_for_itself(
+    client: httpx.Client, observer: DomeObserver, jobs: Jobs, tmp_path: Path
+) -> None:
     begun, go = threading.Event(), threading.Event()
     jobs.run = lambda *_: (begun.set(), go.wait(60))
     client.put("/v1/dome/light", json={"light": 2, "on_s": 30}).raise_for_status()
@@ -340,7 +373,9 @@ def test_all_off_stops_a_capture_and_no_light_is_seen_after_it(
         assert answer["stopped"] == [job]
         ended = client.get(f"/v1/jobs/{job}/events").text
         # Whether it stood between two frames or in one: it says which.
-        assert client.get(f"/v1/jobs/{job}").json()["state"] == "CANCELLED" or '"code":"rig-stopped"' in ended, ended[-600:]
+        assert client.get(f"/v1/jobs/{job}").json()["state"] == "CANCELLED" or '"code":"rig-stopped"' in ended, ended[
+            -600:
+        ]
     finally:
         seen.close()
     assert not [at for at in seen.lit_at_s if at > off_s]
@@ -368,7 +403,9 @@ def console_of(server: int) -> psutil.Process:
     return next(child for child in psutil.Process(server).children() if "services.capture.console" in child.cmdline())
 
 
-def test_all_off_ends_a_process_that_hangs(client: httpx.Client, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_off_ends_a_process_that_hangs(
+    client: httpx.Client, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.api.dome.dome.OFF_S", 0.5)
     client.put("/v1/dome/light", json={"light": 3, "on_s": 30}).raise_for_status()
     hanging = console_of(os.getpid())
@@ -378,7 +415,9 @@ def test_all_off_ends_a_process_that_hangs(client: httpx.Client, observer: DomeO
     assert not hanging.is_running()
 
 
-def test_of_two_all_offs_at_once_the_later_one_holds(shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_all_offs_at_once_the_later_one_holds(
+    shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch
+) -> None:
     later: list[threading.Thread] = []
     with console(shared_dome) as answer:
 
@@ -398,7 +437,9 @@ def test_of_two_all_offs_at_once_the_later_one_holds(shared_dome: Address, obser
         assert answer(number=8, do="light", light=0, level=0.1, on_s=1).code is None
 
 
-def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(
+    shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch
+) -> None:
     late_s = 3.0
     for module in ("dome_controller", "dome_modbus"):
         monkeypatch.setattr(f"services.capture.{module}.REPLY_TIMEOUT_S", 4 * late_s)

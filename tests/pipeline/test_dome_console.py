@@ -46,7 +46,9 @@ def observer(address: Address) -> Iterator[DomeObserver]:
 @pytest.fixture
 def rig(tmp_path: Path) -> Callable[..., RigSpec]:
     write_mouth(tmp_path, LIGHTS)
-    return lambda **options: RigSpec(**{"mouth": tmp_path, "exposure_s": 0.01, "settle_s": 0.0, "watchdog_s": WATCHDOG_S} | options)
+    return lambda **options: RigSpec(
+        **{"mouth": tmp_path, "exposure_s": 0.01, "settle_s": 0.0, "watchdog_s": WATCHDOG_S} | options
+    )
 
 
 @contextmanager
@@ -71,7 +73,9 @@ def require_failed_all_off(answer: DomeAnswer) -> None:
     assert "not confirmed dark" in answer.message
 
 
-def test_all_off_darkens_a_light_by_hand_though_the_controller_takes_no_further_connection(address: Address, observer: DomeObserver) -> None:
+def test_all_off_darkens_a_light_by_hand_though_the_controller_takes_no_further_connection(
+    address: Address, observer: DomeObserver
+) -> None:
     proxy = Proxy(address)
     with console(proxy.address) as answer:
         assert answer(do="light", light=2, level=0.1, on_s=30).code is None
@@ -86,7 +90,9 @@ def test_all_off_ends_a_preflight_though_the_controller_takes_no_further_connect
 ) -> None:
     proxy, answers, exposure_s = Proxy(address), list[DomeAnswer](), 1.0
     with console(proxy.address) as answer:
-        asking = threading.Thread(target=lambda: answers.append(answer(do="preflight", rig=rig(exposure_s=exposure_s, level=0.4))))
+        asking = threading.Thread(
+            target=lambda: answers.append(answer(do="preflight", rig=rig(exposure_s=exposure_s, level=0.4)))
+        )
         asking.start()
         # All lights at once are those of its last exposure.
         wait_until(lambda: len(observer.status().lit) == LIGHTS)
@@ -116,7 +122,9 @@ def test_a_preflight_lights_no_further_light_once_it_is_unwanted(address: Addres
     assert set(spent_s) == {0, 1}
 
 
-def test_a_preflight_may_not_ask_for_more_than_the_server_allows(address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]) -> None:
+def test_a_preflight_may_not_ask_for_more_than_the_server_allows(
+    address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]
+) -> None:
     unbounded: dict[str, Any] = {"light_exposure_limit_s": 1e9, "total_exposure_limit_s": 1e9, "watchdog_s": 60.0}
     triggers = observer.trigger_count()
     with console(address) as answer:
@@ -127,7 +135,9 @@ def test_a_preflight_may_not_ask_for_more_than_the_server_allows(address: Addres
         assert link.read(reg.WATCHDOG_MS) == [round(1000 * WATCHDOG_S)]
 
 
-def test_preflights_add_up_to_the_limit_with_light_by_hand(address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]) -> None:
+def test_preflights_add_up_to_the_limit_with_light_by_hand(
+    address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]
+) -> None:
     # The last light is on for 0.3 s and a glimpse of 5 ms in each preflight, the others for the glimpse. A preflight and the capture after it are within
     # the limit, which a second preflight passes.
     wanted = rig(level=1.0, exposure_s=0.3, tracking_every=0)

@@ -38,7 +38,16 @@ def scores(report: FitReport) -> list[float]:
 def off(report: FitReport) -> float:
     """Root mean square relative error of the reduced quantities."""
     table = report.parameters["green"]
-    return float(np.sqrt(np.mean([(table[f"{part}.{leaf}"].value / getattr(getattr(TRUTH, part), leaf) - 1) ** 2 for part, leaf in QUANTITIES])))
+    return float(
+        np.sqrt(
+            np.mean(
+                [
+                    (table[f"{part}.{leaf}"].value / getattr(getattr(TRUTH, part), leaf) - 1) ** 2
+                    for part, leaf in QUANTITIES
+                ]
+            )
+        )
+    )
 
 
 def require_truth(report: FitReport, largest: float = 0.1) -> None:
@@ -71,7 +80,11 @@ def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
 
 
 def test_what_is_held_stays_and_only_the_shape_is_asked_for_where_all_media_are(tmp_path: Path) -> None:
-    media = {f"{part}.{leaf}": getattr(getattr(TRUTH, part), leaf) for part in ("enamel", "dentin") for leaf in ("sigma", "alpha", "g1")}
+    media = {
+        f"{part}.{leaf}": getattr(getattr(TRUTH, part), leaf)
+        for part in ("enamel", "dentin")
+        for leaf in ("sigma", "alpha", "g1")
+    }
     write_prepared(tmp_path)
     report = fit(tmp_path, dentin="fit", held=media)
     table = report.parameters["green"]

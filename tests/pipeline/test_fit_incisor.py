@@ -31,13 +31,18 @@ def noisy_copy(target: Path, seed: int) -> Path:
     for image in json.loads((target / "capture.json").read_text())["images"]:
         radiance, variance = (np.load(target / image[key]) for key in ("file", "variance_file"))
         noise = np.where(radiance > 0, (0.01 * radiance) ** 2 + (0.002 * radiance.max()) ** 2, 0.0)
-        np.save(target / image["file"], (radiance + np.sqrt(noise) * rng.standard_normal(radiance.shape)).astype(np.float32))
+        np.save(
+            target / image["file"], (radiance + np.sqrt(noise) * rng.standard_normal(radiance.shape)).astype(np.float32)
+        )
         np.save(target / image["variance_file"], (variance + noise).astype(np.float32))
     return target
 
 
 def spec_for(folder: Path, seed: int, **options: int) -> JobSpec:
-    return JobSpec.model_validate({"capture": noisy_copy(folder / "capture", seed), "boundary": "matched", "dentin": "known", "seed": seed} | options)
+    return JobSpec.model_validate(
+        {"capture": noisy_copy(folder / "capture", seed), "boundary": "matched", "dentin": "known", "seed": seed}
+        | options
+    )
 
 
 def true_reduced_scattering() -> dict[str, float]:
@@ -57,7 +62,9 @@ def test_quarter_of_the_pixels_on_two_workers(tmp_path: Path) -> None:
     spec = spec_for(tmp_path, seed=3, pixel_step=2, max_samples_per_pixel=256, max_steps=4, search_candidates=5000)
     with (
         dask.config.set({"distributed.worker.daemon": False}),
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50) as cluster,
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", silence_logs=50
+        ) as cluster,
         Client(cluster) as client,
     ):
         client.submit(run_both_stages, spec, tmp_path / "job").result(timeout=280)
@@ -74,7 +81,9 @@ def test_quarter_of_the_pixels_on_two_workers(tmp_path: Path) -> None:
     rows = json.loads((folder / "trace.json").read_text())
     images, jacobians = ([row for row in rows if row["kind"] == kind] for kind in ("image", "jacobian"))
     assert any(
-        a["step"] == b["step"] and a["worker"] != b["worker"] and min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"])
+        a["step"] == b["step"]
+        and a["worker"] != b["worker"]
+        and min(a["end_s"], b["end_s"]) > max(a["start_s"], b["start_s"])
         for a in images
         for b in jacobians
     )

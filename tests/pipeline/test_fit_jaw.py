@@ -29,7 +29,11 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
 
 
 def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **options: Any) -> FitReport:
-    return run(spec_for(root, **options), LocalContext(root, attempt, events.append if events is not None else None), engine=FAKE)
+    return run(
+        spec_for(root, **options),
+        LocalContext(root, attempt, events.append if events is not None else None),
+        engine=FAKE,
+    )
 
 
 def without_time(report: FitReport) -> dict[str, Any]:
@@ -71,21 +75,27 @@ def test_a_failed_tooth_does_not_sink_the_jaw(finished: tuple[Path, FitReport, l
     assert "green" not in tooth.fit_error
 
 
-def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(
+    finished: tuple[Path, FitReport, list[StageEvent]],
+) -> None:
     _, report, _ = finished
     assert report.teeth[TIED].state == "tied"
     assert "hidden or masked in every image" in report.teeth[TIED].sentence
     for fdi in (TIED, FAILED):
         for part in ("enamel", "dentin"):
             found = report.teeth[fdi].parameters["green"][f"{part}.sigma_s_reduced"]
-            others = [np.log(report.teeth[other].parameters["green"][f"{part}.sigma_s_reduced"].value) for other in FITTED]
+            others = [
+                np.log(report.teeth[other].parameters["green"][f"{part}.sigma_s_reduced"].value) for other in FITTED
+            ]
             # No fitted pixel of the formula depends on them: their prior alone speaks, the median of two front teeth as the last stage found them.
             assert np.log(found.value) == pytest.approx(np.mean(others), abs=TIED_SD["sigma"])
             assert not found.determined
             assert found.se == pytest.approx(TIED_SD["sigma"] * found.value, rel=0.01)
 
 
-def test_steps_of_single_teeth_come_before_those_of_the_whole(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+def test_steps_of_single_teeth_come_before_those_of_the_whole(
+    finished: tuple[Path, FitReport, list[StageEvent]],
+) -> None:
     root, report, events = finished
     steps = [e.data for e in events if e.kind == "step"]
     assert [s["step"] for s in steps] == list(range(1, report.steps + 1))
@@ -109,7 +119,11 @@ def test_enamel_of_one_mouth_has_one_mean_cosine(finished: tuple[Path, FitReport
 def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
     root, report, _ = finished
     manifest = export(spec_for(root), LocalContext(root))
-    assert {f"teeth/{fdi}/{part}.ply" for fdi in FDI for part in ("outer", "dentin")} | {"gums.ply", "cavity.ply", "scene_green.xml"} <= set(manifest.files)
+    assert {f"teeth/{fdi}/{part}.ply" for fdi in FDI for part in ("outer", "dentin")} | {
+        "gums.ply",
+        "cavity.ply",
+        "scene_green.xml",
+    } <= set(manifest.files)
     parameters = json.loads((root / "parameters.json").read_text())["green"]
     assert parameters["12.dentin.sigma"] == report.teeth["12"].parameters["green"]["dentin.sigma"].model_dump()
     assert {"gums.sigma", "cavity.reflectance"} <= parameters.keys()
@@ -127,7 +141,9 @@ def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEve
     assert report.teeth[FAILED].sentence in page
 
 
-def test_interrupted_fit_resumes_and_ends_with_the_same_answer(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
+    finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path
+) -> None:
     _, report, _ = finished
     write_prepared_jaw(tmp_path, FAKE, dark=(21,), hidden=(22,))
     joint = next(e.data["step"] for e in finished[2] if e.kind == "step" and e.data["tooth"] is None)
@@ -177,10 +193,19 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
 def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
     # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
     write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
-    spec = jaw_spec(tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600)
+    spec = jaw_spec(
+        tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600
+    )
     report = run(spec, LocalContext(tmp_path))
-    found = {name: report.parameters["green"][name] for name in ("gums.sigma_s_reduced", "gums.alpha_reduced", "cavity.reflectance")}
-    truth = {"gums.sigma_s_reduced": TRUE_GUMS.sigma_s_reduced, "gums.alpha_reduced": TRUE_GUMS.alpha_reduced, "cavity.reflectance": TRUE_REFLECTANCE}
+    found = {
+        name: report.parameters["green"][name]
+        for name in ("gums.sigma_s_reduced", "gums.alpha_reduced", "cavity.reflectance")
+    }
+    truth = {
+        "gums.sigma_s_reduced": TRUE_GUMS.sigma_s_reduced,
+        "gums.alpha_reduced": TRUE_GUMS.alpha_reduced,
+        "cavity.reflectance": TRUE_REFLECTANCE,
+    }
     for fdi in ("11", "12"):
         for leaf in ("sigma_s_reduced", "alpha_reduced"):
             found[f"{fdi}.{leaf}"] = report.teeth[fdi].parameters["green"][f"enamel.{leaf}"]

@@ -13,10 +13,15 @@ from tests.support.jaw_truth import read_jaw_truth
 
 def test_a_figure_is_judged_with_its_noise() -> None:
     media = {(0.14, 0.0): False, (0.17, 0.0): True, (0.17, 0.01): False}
-    assert {(value, se): JawFigure("", "", "enamel", value, 0.15, 0.05, 0.0, "", se).is_beyond_noise for value, se in media} == media
+    assert {
+        (value, se): JawFigure("", "", "enamel", value, 0.15, 0.05, 0.0, "", se).is_beyond_noise for value, se in media
+    } == media
     # 0.06^2 - 0.05^2 = 0.0011 is three times the square of 0.0191.
     images = {(0.06, 0.019): True, (0.06, 0.02): False}
-    assert {(value, error): JawFigure("", "", IMAGE, value, 0.05, 0.02, 0.0, "", error).is_beyond_noise for value, error in images} == images
+    assert {
+        (value, error): JawFigure("", "", IMAGE, value, 0.05, 0.02, 0.0, "", error).is_beyond_noise
+        for value, error in images
+    } == images
 
 
 @pytest.mark.slow
@@ -25,7 +30,11 @@ def test_jaw_of_fourteen(tmp_path: Path) -> None:
     found = list(figures(tmp_path, read_jaw_truth(), {"samples_per_pixel": 32, "max_samples_per_pixel": 512}))
     assert len(found) == 1 + 3 * 14
     # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43 honest numbers on its limit falls in 17 runs.
-    missed = [f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}" for one in found if one.is_beyond_noise]
+    missed = [
+        f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}"
+        for one in found
+        if one.is_beyond_noise
+    ]
     assert not missed
     # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is known to 3 to 16 % from these photographs.
     assert found[0].resolution < IMAGE_MUST

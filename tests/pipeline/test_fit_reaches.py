@@ -11,7 +11,9 @@ from tests.benchmarks.fit_table import LAYERED, Bench, Figure, cameras, homogene
 
 def missed(figures: list[Figure]) -> list[str]:
     assert figures
-    return [f"{one.subject}, {one.figure}: {one.value:.3f} > {one.must:g}" for one in figures if one.reached == "missed"]
+    return [
+        f"{one.subject}, {one.figure}: {one.value:.3f} > {one.must:g}" for one in figures if one.reached == "missed"
+    ]
 
 
 def test_a_figure_is_judged_by_its_limits() -> None:

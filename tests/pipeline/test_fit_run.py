@@ -58,7 +58,9 @@ def test_finds_the_reduced_quantities_within_their_errors(finished: tuple[Path, 
     assert report.held_out_error["green"] < 0.02
 
 
-def test_says_what_is_known_what_goes_together_and_what_would_help(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+def test_says_what_is_known_what_goes_together_and_what_would_help(
+    finished: tuple[Path, FitReport, list[StageEvent]],
+) -> None:
     _, report, _ = finished
     found = report.correlations["green"]
     assert found.names == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.cosine")
@@ -113,7 +115,9 @@ def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path:
     manifest = export(spec, LocalContext(tmp_path))
     assert not manifest.converged
     assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
-    assert (tmp_path / "report.html").read_text().index("did not converge") < (tmp_path / "report.html").read_text().index("Error on held-out images")
+    assert (tmp_path / "report.html").read_text().index("did not converge") < (
+        tmp_path / "report.html"
+    ).read_text().index("Error on held-out images")
 
 
 def test_publishes_history_trace_and_pictures(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
@@ -127,7 +131,9 @@ def test_publishes_history_trace_and_pictures(finished: tuple[Path, FitReport, l
         assert sum(name.endswith(".name") for name in stored_pictures.files) == 4
 
 
-def test_same_job_gives_the_same_answer_and_another_seed_another(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+def test_same_job_gives_the_same_answer_and_another_seed_another(
+    finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path
+) -> None:
     _, report, _ = finished
     write_prepared(tmp_path)
     assert without_time(fit(tmp_path)) == without_time(report)
@@ -156,7 +162,9 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
     assert min(e.data["step"] for e in events if e.kind == "step") == stop_at + 1
 
 
-def test_a_step_cut_off_before_its_report_is_told_by_the_next_attempt(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+def test_a_step_cut_off_before_its_report_is_told_by_the_next_attempt(
+    finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path
+) -> None:
     _, report, _ = finished
     write_prepared(tmp_path)
     fit(tmp_path)
@@ -171,7 +179,9 @@ def test_a_step_cut_off_before_its_report_is_told_by_the_next_attempt(finished: 
     assert len(json.loads((tmp_path / "fit" / "history.json").read_text())) == report.steps
 
 
-def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_job_is_kept_said_and_not_continued(
+    finished: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path
+) -> None:
     _, report, _ = finished
     write_prepared(tmp_path)
     fit(tmp_path, seed=2, max_steps=1)
@@ -255,7 +265,9 @@ def test_three_channels_and_no_dentin(tmp_path: Path) -> None:
         ({}, {"channels": ("violet",)}, SettingsError, "'violet'"),
     ],
 )
-def test_bad_input_ends_in_one_sentence(tmp_path: Path, prepared: dict[str, Any], options: dict[str, Any], kind: type[DentineError], words: str) -> None:
+def test_bad_input_ends_in_one_sentence(
+    tmp_path: Path, prepared: dict[str, Any], options: dict[str, Any], kind: type[DentineError], words: str
+) -> None:
     write_prepared(tmp_path, **prepared)
     with pytest.raises(kind) as caught:
         fit(tmp_path, **options)

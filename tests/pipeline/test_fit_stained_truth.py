@@ -37,7 +37,9 @@ CERTAINTY = 3.0
 @pytest.mark.slow
 def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
-    write_phantom(capture, pixel_mm=PIXEL_MM, cameras=2, lights=12, renderer="mitsuba", samples=256, stains=True, seed=SEED)
+    write_phantom(
+        capture, pixel_mm=PIXEL_MM, cameras=2, lights=12, renderer="mitsuba", samples=256, stains=True, seed=SEED
+    )
     spec = JobSpec(
         capture=capture, boundary="matched", dentin="known", stains=True,
         samples_per_pixel=128, max_samples_per_pixel=512, search_candidates=5000, max_steps=6,
@@ -55,7 +57,11 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
     (scanned,) = tooth.observations.teeth
     dentin = dentin_shape(scanned, tooth.observations.manifest.cameras, spec)
     judge = replace(tooth, engine=Engine(channel_scene(tooth.observations, "green", [dentin], spec, found.corners_uv)))
-    tissues = similar_tissue(ends["homogeneous"], SIMILAR_G), ends["exact"], replace(reported, stain=found.textures["green"])
+    tissues = (
+        similar_tissue(ends["homogeneous"], SIMILAR_G),
+        ends["exact"],
+        replace(reported, stain=found.textures["green"]),
+    )
     fitted, held_out = zip(*(judge.errors(tissue, samples=JUDGE_SAMPLES, seed=SEED) for tissue in tissues), strict=True)
     homogeneous, media, stained = (sums.loss for sums in fitted)
     assert media < (1 - MIN_GAIN) * homogeneous
@@ -65,7 +71,9 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
 
     # The texture against the painted one where light came through it; the common depth is the media's to share.
     painted = stain_layout(read_mesh(capture / "teeth" / "11" / "outer.ply"), TEXEL_MM)
-    fitted_texels = stain_layout(read_mesh(tmp_path / "prepared" / "teeth" / "11" / "outer.ply"), texel_edge_mm(PIXEL_MM))
+    fitted_texels = stain_layout(
+        read_mesh(tmp_path / "prepared" / "teeth" / "11" / "outer.ply"), texel_edge_mm(PIXEL_MM)
+    )
     ours = fitted_texels.depths(found.textures["green"])
     true = painted_depth(painted, SEED)[cKDTree(painted.points_mm).query(fitted_texels.points_mm)[1]]
     seen = ours > 0.01

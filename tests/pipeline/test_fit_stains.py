@@ -73,11 +73,16 @@ def test_the_texture_explains_what_media_cannot(stained: tuple[Path, FitReport, 
     engine = FakeEngine(replace(RECIPE, teeth=(ToothSurfaces(sphere(4.0), None, layout.corners_uv),)))
     view = View(camera("c0"), np.argwhere(np.ones(SIZE)).astype(np.int32))
     texels, shares = engine._texels(view, truth.stain)
-    ours, true = (np.log((shares * stain.transmittance.reshape(-1)[texels]).sum(axis=1)) for stain in (found.textures["green"], truth.stain))
+    ours, true = (
+        np.log((shares * stain.transmittance.reshape(-1)[texels]).sum(axis=1))
+        for stain in (found.textures["green"], truth.stain)
+    )
     assert np.corrcoef(ours, true)[0, 1] > 0.9
 
 
-def test_an_interrupted_fit_ends_with_the_same_texture(stained: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path) -> None:
+def test_an_interrupted_fit_ends_with_the_same_texture(
+    stained: tuple[Path, FitReport, list[StageEvent]], tmp_path: Path
+) -> None:
     root, report, _ = stained
     truth, layout = stained_truth(tmp_path)
     write_prepared(tmp_path, truth=truth, stain_uv=layout.corners_uv)
@@ -105,7 +110,9 @@ def test_asset_and_report_carry_the_texture(stained: tuple[Path, FitReport, list
     assert {"teeth/11/stain_green.npy", "teeth/11/stain_green.png", "teeth/11/outer.ply"} <= set(manifest.files)
     kept = kept_stains(root / "fit")
     assert kept is not None
-    np.testing.assert_allclose(np.load(root / "asset/teeth/11/stain_green.npy"), kept.textures["green"].transmittance, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.load(root / "asset/teeth/11/stain_green.npy"), kept.textures["green"].transmittance, rtol=1e-6
+    )
     assert "teeth/11/stain_green.png" in (root / "asset/scene_green.xml").read_text()
     # Vertices that the seams split are one again for whoever reads the surface.
     assert len(read_mesh(root / "asset/teeth/11/outer.ply").vertices_mm) == len(sphere(4.0).vertices_mm)

@@ -7,7 +7,13 @@ import pytest
 
 from tests.benchmarks.honest_errors import FORMULA, INTERVAL, FormulaTooth, drawn_tissue, fit_rows
 
-OPTIONS: dict[str, object] = {"samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 8, "search_candidates": 2000, "advise": False}
+OPTIONS: dict[str, object] = {
+    "samples_per_pixel": 64,
+    "max_samples_per_pixel": 256,
+    "max_steps": 8,
+    "search_candidates": 2000,
+    "advise": False,
+}
 
 
 def held(fits: int, first: int, *, with_shape: bool = False) -> dict[str, int]:

@@ -58,7 +58,9 @@ def server(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guard
 def chair(server: Guarded) -> Callable[..., httpx.Response]:
     """Ask as one who may submit jobs and operate the dome."""
     token = make_token(server.data, "chair", Scope.SUBMIT, Scope.OPERATE_DOME)
-    return lambda method, path, **options: server.ask(method, path, headers={"Authorization": f"Bearer {token}"}, **options)
+    return lambda method, path, **options: server.ask(
+        method, path, headers={"Authorization": f"Bearer {token}"}, **options
+    )
 
 
 def job(**rig: Any) -> dict[str, Any]:
@@ -92,7 +94,9 @@ def test_a_retry_that_lights_a_dome_needs_the_scope_too(server: Guarded, chair: 
 
 
 @pytest.mark.attack("light", "a job that makes the server connect to any address")
-def test_a_dome_that_the_server_does_not_list_is_not_connected_to(server: Guarded, chair: Callable[..., httpx.Response]) -> None:
+def test_a_dome_that_the_server_does_not_list_is_not_connected_to(
+    server: Guarded, chair: Callable[..., httpx.Response]
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as elsewhere:
         address = f"127.0.0.1:{elsewhere.getsockname()[1]}"
         status, code, detail = problem_of(chair("POST", "/v1/jobs", **job(dome=address)))
@@ -116,13 +120,17 @@ def test_a_dome_that_the_server_does_not_list_is_not_connected_to(server: Guarde
     ],
 )
 @pytest.mark.attack("light", "limits of a job's own above the server's")
-def test_light_beyond_the_servers_limits_is_refused(chair: Callable[..., httpx.Response], options: dict[str, float], code: str, named: str) -> None:
+def test_light_beyond_the_servers_limits_is_refused(
+    chair: Callable[..., httpx.Response], options: dict[str, float], code: str, named: str
+) -> None:
     answer = problem_of(chair("POST", "/v1/jobs", **job(**options)))
     assert answer[:2] == (422, code)
     assert named in answer[2]
 
 
-def test_a_job_runs_with_the_lower_of_its_own_limits_and_the_servers(server: Guarded, chair: Callable[..., httpx.Response], ran: Ran) -> None:
+def test_a_job_runs_with_the_lower_of_its_own_limits_and_the_servers(
+    server: Guarded, chair: Callable[..., httpx.Response], ran: Ran
+) -> None:
     lavish = {"watchdog_s": 60.0, "light_exposure_limit_s": 1e9, "total_exposure_limit_s": 1e9}
     careful = {"watchdog_s": 0.5, "light_exposure_limit_s": 1.0, "total_exposure_limit_s": 3.0}
     for asked, held in ((lavish, (1.0, 2.0, 20.0)), (careful, tuple(careful.values()))):
@@ -134,7 +142,10 @@ def test_a_job_runs_with_the_lower_of_its_own_limits_and_the_servers(server: Gua
 
 
 def test_a_preflight_and_a_light_by_hand_keep_to_the_level(chair: Callable[..., httpx.Response]) -> None:
-    for method, path, body in (("PUT", "light", {"light": 0, "level": 0.9}), ("POST", "preflight", {"mouth": "/", "level": 0.9})):
+    for method, path, body in (
+        ("PUT", "light", {"light": 0, "level": 0.9}),
+        ("POST", "preflight", {"mouth": "/", "level": 0.9}),
+    ):
         status, code, detail = problem_of(chair(method, f"/v1/dome/{path}", json=body))
         assert (status, code) == (422, "bad-settings"), path
         assert "level" in detail

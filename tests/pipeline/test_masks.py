@@ -47,7 +47,13 @@ class InThisProcess:
     def __call__(self, spec: JobSpec, folder: Path, events: EventAddress) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("services.pipeline.stages._run_tasks", self._run)
-            run_stages(spec, folder, ("prepare", "fit", "export"), events=events, doors=toy_stages.DOORS | {"prepare": "services.preprocess.stage:run"})
+            run_stages(
+                spec,
+                folder,
+                ("prepare", "fit", "export"),
+                events=events,
+                doors=toy_stages.DOORS | {"prepare": "services.preprocess.stage:run"},
+            )
 
     def _run(self, _processes: object, _count: int, tasks: list[StageTask], *_: object) -> None:
         assert self.go.wait(60)
@@ -124,7 +130,10 @@ def test_a_mask_is_prepared_again_and_nothing_of_before_is_left(client: httpx.Cl
     assert put(client, job, "c0/all", every).status_code == 204
     assert client.get(f"/v1/jobs/{job}/masks/c0/l1").content == one
     listed = client.get(f"/v1/jobs/{job}/masks").json()
-    assert ([(entry["camera"], entry["light"]) for entry in listed["masks"]], listed["is_stale"]) == ([("c0", "all"), ("c0", "l1")], True)
+    assert ([(entry["camera"], entry["light"]) for entry in listed["masks"]], listed["is_stale"]) == (
+        [("c0", "all"), ("c0", "l1")],
+        True,
+    )
     assert (stored(data, job) == before).all(), "until the retry, what is published holds"
 
     assert client.post(f"/v1/jobs/{job}/retry").status_code == 202
@@ -176,7 +185,9 @@ def test_a_job_at_work_keeps_its_masks(client: httpx.Client, run: InThisProcess,
 
 
 @pytest.mark.parametrize(("place", "named"), [("c9/l0", "no camera c9"), ("c0/l9", "with light l9")])
-def test_a_mask_of_nothing_is_refused(client: httpx.Client, data: Path, shared_job: str, place: str, named: str) -> None:
+def test_a_mask_of_nothing_is_refused(
+    client: httpx.Client, data: Path, shared_job: str, place: str, named: str
+) -> None:
     answer = put(client, shared_job, place, mask())
     assert (answer.status_code, answer.json()["code"]) == (404, "mask-unknown")
     assert named in answer.json()["detail"]
@@ -187,10 +198,17 @@ def chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def png(rows_bytes: int, depth: int = 8, colour: int = 0, interlaced: int = 0, size: tuple[int, int] = (WIDTH, HEIGHT)) -> bytes:
+def png(
+    rows_bytes: int, depth: int = 8, colour: int = 0, interlaced: int = 0, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> bytes:
     """A PNG whose header and pixels may contradict each other."""
     header = struct.pack(">IIBBBBB", *size, depth, colour, 0, 0, interlaced)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(rows_bytes))) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(bytes(rows_bytes)))
+        + chunk(b"IEND", b"")
+    )
 
 
 WHOLE = HEIGHT * (1 + WIDTH)
@@ -225,7 +243,9 @@ def shared_job(client: httpx.Client, mouth: Path) -> str:
 
 
 @pytest.mark.parametrize("depth", [1, 8])
-def test_masks_of_other_programs_are_taken(client: httpx.Client, mouth: Path, data: Path, depth: int, shared_job: str) -> None:
+def test_masks_of_other_programs_are_taken(
+    client: httpx.Client, mouth: Path, data: Path, depth: int, shared_job: str
+) -> None:
     """As Pillow writes them."""
     image = pytest.importorskip("PIL.Image")
     bits = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)

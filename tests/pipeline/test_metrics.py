@@ -28,7 +28,11 @@ def scrape(client: Any) -> Samples:
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain")
     families = text_string_to_metric_families(answer.text)
-    return {(sample.name, frozenset(sample.labels.items())): sample.value for family in families for sample in family.samples}
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in families
+        for sample in family.samples
+    }
 
 
 def value(samples: Samples, name: str, **labels: str) -> float:
@@ -48,16 +52,20 @@ def test_jobs_steps_and_requests_are_counted(tmp_path: Path) -> None:
         first, second = (client.post("/v1/jobs", json={"capture": "/"}).json()["id"] for _ in range(2))
         assert entered.wait(60)
         samples = scrape(client)
-        assert [value(samples, "dentine_jobs", state=state) for state in ("RUNNING", "QUEUED", "SUCCEEDED", "FAILED")] == [1, 1, 0, 0]
-        assert [value(samples, "dentine_stages_running", stage=stage) for stage in ("capture", "prepare", "fit", "export")] == [0, 0, 1, 0]
+        assert [
+            value(samples, "dentine_jobs", state=state) for state in ("RUNNING", "QUEUED", "SUCCEEDED", "FAILED")
+        ] == [1, 1, 0, 0]
+        assert [
+            value(samples, "dentine_stages_running", stage=stage) for stage in ("capture", "prepare", "fit", "export")
+        ] == [0, 0, 1, 0]
         assert value(samples, "dentine_steps_total") == STEPS + 1
         assert value(samples, "dentine_oldest_queued_job_seconds") > 0
         assert value(samples, "dentine_disk_free_bytes") > 0
         assert value(samples, "dentine_requests_total", method="POST", route="/v1/jobs", status="2xx") == 2
         assert value(samples, "dentine_request_latency_seconds_count", method="POST", route="/v1/jobs") == 2
-        assert {part: value(samples, "dentine_up", part=part) for part in ("database", "scheduler", "store", "disk")} == dict.fromkeys(
-            ("database", "scheduler", "store", "disk"), 1.0
-        )
+        assert {
+            part: value(samples, "dentine_up", part=part) for part in ("database", "scheduler", "store", "disk")
+        } == dict.fromkeys(("database", "scheduler", "store", "disk"), 1.0)
         go_on.set()
         for job in (first, second):
             client.get(f"/v1/jobs/{job}/events")
@@ -66,7 +74,10 @@ def test_jobs_steps_and_requests_are_counted(tmp_path: Path) -> None:
         assert value(samples, "dentine_stages_running", stage="fit") == 0
         assert value(samples, "dentine_oldest_queued_job_seconds") == 0
         assert value(samples, "dentine_steps_total") == 2 * (STEPS + 1)
-        events = [sum(line.startswith("id: ") for line in client.get(f"/v1/jobs/{job}/events").text.splitlines()) for job in (first, second)]
+        events = [
+            sum(line.startswith("id: ") for line in client.get(f"/v1/jobs/{job}/events").text.splitlines())
+            for job in (first, second)
+        ]
         assert value(samples, "dentine_event_rows") == sum(events)
 
 
@@ -89,7 +100,9 @@ def test_strangers_cannot_make_series(tmp_path: Path) -> None:
 def test_a_scrape_is_eight_queries_however_many_jobs_there_are(tmp_path: Path) -> None:
     jobs = Jobs(ServerSettings(data=tmp_path), tell)
     engine = jobs.repository.engine
-    registry = build_registry(engine, Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes), jobs.free_bytes)
+    registry = build_registry(
+        engine, Readiness(engine, jobs.folder(""), jobs.is_running, jobs.free_bytes), jobs.free_bytes
+    )
     asked: list[str] = []
 
     @sql.event.listens_for(engine, "before_cursor_execute")

@@ -39,9 +39,17 @@ def scene(*positions_mm: tuple[float, float, float]) -> SceneRecipe:
 def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem:
     view = View(camera("c0"), PIXELS)
     reference = FakeEngine(recipe)._formula(TRUTH, view)
-    block = Block(view, reference, SENSOR.variance(reference), np.full(reference.shape, WEIGHT), np.zeros(reference.shape, dtype=bool))
+    block = Block(
+        view,
+        reference,
+        SENSOR.variance(reference),
+        np.full(reference.shape, WEIGHT),
+        np.zeros(reference.shape, dtype=bool),
+    )
     executor = LocalExecutor(InProcessHost(FAKE))
-    passes = Passes(executor, (write_block(folder, block),), write_recipe(folder, recipe), Seeds(1, "green"), lambda _: None)
+    passes = Passes(
+        executor, (write_block(folder, block),), write_recipe(folder, recipe), Seeds(1, "green"), lambda _: None
+    )
     return StackProblem(passes, DOMAIN, TRUTH, "final", jacobian_g=0.0)
 
 
@@ -54,7 +62,9 @@ def known_of(problem: StackProblem) -> Uncertainty:
 
 
 @pytest.fixture(scope="module")
-def few_lights(tmp_path_factory: pytest.TempPathFactory) -> tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path]:
+def few_lights(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path]:
     folder = tmp_path_factory.mktemp("few")
     problem = problem_of(folder, scene((-300.0, 300.0, -700.0)))
     known = known_of(problem)
@@ -73,7 +83,11 @@ def test_adding_a_light_gives_the_error_that_was_predicted(
     for k, words in enumerate(LIGHTS):
         candidate = next(c for c in candidates if c.words == f"A light {words}")
         after = estimates(TRUTH, PARTS, replace(known, covariance=covariance_with(known.sandwich, candidate.whole)))
-        actual = estimates(TRUTH, PARTS, known_of(problem_of(tmp_path, scene(*map(tuple, more.light_positions_mm[[0, 1 + k]].tolist())))))
+        actual = estimates(
+            TRUTH,
+            PARTS,
+            known_of(problem_of(tmp_path, scene(*map(tuple, more.light_positions_mm[[0, 1 + k]].tolist())))),
+        )
         for name in ("enamel.sigma_s_reduced", "enamel.sigma_a", "dentin.sigma_s_reduced", "dentin.sigma_a"):
             assert after[name].se == pytest.approx(actual[name].se, rel=0.3), (words, name)
             changed += (actual[name].se or 0.0) < 0.7 * (before[name].se or 0.0)
@@ -81,17 +95,25 @@ def test_adding_a_light_gives_the_error_that_was_predicted(
     assert changed > 4
 
 
-def test_the_sentence_names_quantity_and_both_errors(few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path]) -> None:
+def test_the_sentence_names_quantity_and_both_errors(
+    few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path],
+) -> None:
     _, _, text, candidates, _ = few_lights
-    assert {c.words for c in candidates} == {f"A light {words}" for words in LIGHTS} | {f"A camera {words}" for words in VIEWS}
+    assert {c.words for c in candidates} == {f"A light {words}" for words in LIGHTS} | {
+        f"A camera {words}" for words in VIEWS
+    }
     assert "would help most: it would cut the error of" in text
     assert text.count(" %") == 2
 
 
-def test_where_nothing_helps_that_is_said(few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path]) -> None:
+def test_where_nothing_helps_that_is_said(
+    few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path],
+) -> None:
     _, known, _, _, _ = few_lights
     nothing = Addition(np.zeros((4, 4)), np.zeros((4, 4)))
-    assert sentence(TRUTH, PARTS, known, [Candidate("A light above", (nothing, nothing))]).startswith("None of the 1 further lights and views")
+    assert sentence(TRUTH, PARTS, known, [Candidate("A light above", (nothing, nothing))]).startswith(
+        "None of the 1 further lights and views"
+    )
 
 
 def test_a_turned_camera_keeps_its_distance_and_looks_at_the_tooth() -> None:
@@ -101,7 +123,11 @@ def test_a_turned_camera_keeps_its_distance_and_looks_at_the_tooth() -> None:
     after, moved_depth = moved.project(centre[None])
     np.testing.assert_allclose(after, before, atol=1e-6)
     np.testing.assert_allclose(moved_depth, depth)
-    np.testing.assert_allclose(np.asarray(moved.camera_from_world)[:3, :3] @ np.asarray(first.camera_from_world)[:3, :3].T, similar_rotation(), atol=1e-12)
+    np.testing.assert_allclose(
+        np.asarray(moved.camera_from_world)[:3, :3] @ np.asarray(first.camera_from_world)[:3, :3].T,
+        similar_rotation(),
+        atol=1e-12,
+    )
 
 
 def similar_rotation() -> np.ndarray:

@@ -50,9 +50,17 @@ def test_log_lines_are_paged_and_filtered(client: httpx.Client, job: str) -> Non
         read += [line["message"] for line in page["lines"]]
         after, is_last = page["next_after"], page["is_last"]
     assert read == messages
-    assert client.get(f"{job}/logs", params={"after": after}).json() == {"lines": [], "next_after": after, "is_last": True}
-    assert [line["message"] for line in client.get(f"{job}/logs", params={"stage": "fit"}).json()["lines"]] == messages[1:]
-    assert [line["message"] for line in client.get(f"{job}/logs", params={"stage": "fit", "attempt": 2}).json()["lines"]] == messages[2:]
+    assert client.get(f"{job}/logs", params={"after": after}).json() == {
+        "lines": [],
+        "next_after": after,
+        "is_last": True,
+    }
+    assert [line["message"] for line in client.get(f"{job}/logs", params={"stage": "fit"}).json()["lines"]] == messages[
+        1:
+    ]
+    assert [
+        line["message"] for line in client.get(f"{job}/logs", params={"stage": "fit", "attempt": 2}).json()["lines"]
+    ] == messages[2:]
 
 
 def test_history_has_columns_of_every_step(client: httpx.Client, job: str) -> None:
@@ -69,7 +77,10 @@ def test_history_has_columns_of_every_step(client: httpx.Client, job: str) -> No
 
 def test_previews_are_listed_and_their_files_read_in_ranges(client: httpx.Client, job: str) -> None:
     page = client.get(f"{job}/previews").json()
-    shown = [(one["camera"], one["light"], one["channel"], one["step"], one["held_out"], one["attempt"]) for one in page["previews"]]
+    shown = [
+        (one["camera"], one["light"], one["channel"], one["step"], one["held_out"], one["attempt"])
+        for one in page["previews"]
+    ]
     assert shown == [("c0", "l1", "green", 1, False, 1), ("c0", "l1", "green", 11, True, 2)]
     for kind, path in page["previews"][1]["pictures"].items():
         whole = client.get(path)
@@ -82,7 +93,10 @@ def test_previews_are_listed_and_their_files_read_in_ranges(client: httpx.Client
     assert first["previews"] + second["previews"] == page["previews"]
 
 
-@pytest.mark.parametrize("path", ["previews/1/render", "previews/999999/render", "previews/0/render", "previews/1/mask", f"previews/{2**70}/photo"])
+@pytest.mark.parametrize(
+    "path",
+    ["previews/1/render", "previews/999999/render", "previews/0/render", "previews/1/mask", f"previews/{2**70}/photo"],
+)
 def test_what_is_no_preview_is_refused(client: httpx.Client, job: str, path: str) -> None:
     answer = client.get(f"{job}/{path}")
     assert answer.status_code in {404, 422}
@@ -99,7 +113,9 @@ def test_a_preview_cannot_name_a_file_outside_the_job(tmp_path: Path) -> None:
 
     def escape(_spec: JobSpec, _folder: Path, events: Any) -> None:
         with events.open() as log:
-            log.append(log.begin_stage("fit"), StageEvent(stage="fit", kind="preview", data={"render": "../../dentine.sqlite"}))
+            log.append(
+                log.begin_stage("fit"), StageEvent(stage="fit", kind="preview", data={"render": "../../dentine.sqlite"})
+            )
 
     with serving(create_app(ServerSettings(data=tmp_path), escape)) as client:
         job = run_job(client)

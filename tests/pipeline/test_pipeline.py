@@ -9,7 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from services.core.errors import CaptureInputError, FencedError, InputError, JobCancelledError, PlatformError, WorkerLostError
+from services.core.errors import (
+    CaptureInputError,
+    FencedError,
+    InputError,
+    JobCancelledError,
+    PlatformError,
+    WorkerLostError,
+)
 from services.core.events import JobEvent
 from services.core.records import JobSpec, RigSpec
 from services.core.stage import StageEvent
@@ -72,7 +79,9 @@ def test_a_stage_that_always_kills_ends_in_a_sentence(tmp_path: Path) -> None:
 
 def test_a_package_that_a_worker_lacks_is_named(tmp_path: Path) -> None:
     task = StageTask("capture", "tests.support.toy_stages:needy", RIG, tmp_path, folder_events(tmp_path))
-    with pytest.raises(PlatformError, match=r"needs no_such_package, which its workers do not have; install dentine\[capture\]"):
+    with pytest.raises(
+        PlatformError, match=r"needs no_such_package, which its workers do not have; install dentine\[capture\]"
+    ):
         task()
 
 

@@ -28,7 +28,9 @@ Tree = dict[str, Any]
 def write_folder(root: Path) -> Tree:
     """A minimal capture: a ball, two cameras of different size, two lights, two channels."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
-    write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32)))
+    write_mesh(
+        root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
+    )
     tree: Tree = {"units": "mm", "channels": ["green", "blue"], "cameras": [], "lights": [], "images": []}
     for name, size in (("front", (20, 16)), ("side", (24, 18))):
         K = [[1500, 0, size[0] / 2], [0, 1500, size[1] / 2], [0, 0, 1]]
@@ -61,7 +63,9 @@ def test_incisor_imports_whole(tmp_path: Path) -> None:
     folder = shared_path("data/tooth-ur1-truth")
     manifest = prepare(folder, tmp_path, boundary="matched", dentin="known")
     published, _ = open_stage(tmp_path, "prepared", PreparedManifest)
-    radiance, variance, valid = (zarr.open_array(published / "prepared.zarr" / name, mode="r") for name in ("radiance", "variance", "valid"))
+    radiance, variance, valid = (
+        zarr.open_array(published / "prepared.zarr" / name, mode="r") for name in ("radiance", "variance", "valid")
+    )
     assert radiance.shape == (3, 8, 34, 28, 1)
     assert valid.metadata.dimension_names == ("camera", "light", "y", "x")
     counts = (np.asarray(valid) == 0).sum(axis=(2, 3))
@@ -69,7 +73,12 @@ def test_incisor_imports_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(radiance[2, 5], np.load(folder / "c2_l5.npy"))
     np.testing.assert_array_equal(variance[1, 3], np.load(folder / "c1_l3_var.npy"))
     assert set(manifest.held_out) == {(f"c{k}", f"l{j}") for k in range(3) for j in (5, 6, 7)}
-    assert (manifest.fdi, manifest.dentin_known, manifest.median_motion_px, manifest.valid_fraction) == ((11,), (11,), None, 1.0)
+    assert (manifest.fdi, manifest.dentin_known, manifest.median_motion_px, manifest.valid_fraction) == (
+        (11,),
+        (11,),
+        None,
+        1.0,
+    )
     assert (published / "teeth" / "11" / "dentin.ply").is_file()
 
 
@@ -156,7 +165,10 @@ def test_held_out_lights_of_the_job_replace_the_captures(tmp_path: Path) -> None
     tree["images"][0]["held_out"] = True
     write_tree(tmp_path, tree)
     assert prepare(tmp_path, tmp_path / "own").held_out == (("front", "left"),)
-    assert prepare(tmp_path, tmp_path / "asked", held_out_lights=("right",)).held_out == (("front", "right"), ("side", "right"))
+    assert prepare(tmp_path, tmp_path / "asked", held_out_lights=("right",)).held_out == (
+        ("front", "right"),
+        ("side", "right"),
+    )
     assert prepare(tmp_path, tmp_path / "none", held_out_lights=()).held_out == ()
 
 
@@ -175,21 +187,28 @@ def replace_image(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, T
 def rescale_mesh(factor: float) -> Callable[[Path, Tree], None]:
     def damage(root: Path, _: Tree) -> None:
         ball = trimesh.creation.icosphere(subdivisions=3, radius=4 * factor)
-        write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32)))
+        write_mesh(
+            root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
+        )
 
     return damage
 
 
 def open_mesh(root: Path, _: Tree) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
-    write_mesh(root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces[3:], dtype=np.int32)))
+    write_mesh(
+        root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces[3:], dtype=np.int32))
+    )
 
 
 def darken_all(root: Path, tree: Tree) -> None:
     np.save(root / "noise.npy", np.full((18, 24, 2), 1e-4, dtype=np.float32))
     tree["cameras"][0]["size"] = tree["cameras"][1]["size"]
     for image in tree["images"]:
-        np.save(root / image["file"], 1e-2 * np.random.default_rng(len(image["file"])).standard_normal((18, 24, 2)).astype(np.float32))
+        np.save(
+            root / image["file"],
+            1e-2 * np.random.default_rng(len(image["file"])).standard_normal((18, 24, 2)).astype(np.float32),
+        )
         image["variance_file"] = "noise.npy"
     write_tree(root, tree)
 
@@ -233,31 +252,97 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
         CaptureInputError,
         r"side_left\.npy \(camera side, light left\) cannot be read .*truncated",
     ),
-    "not a file of arrays": (lambda root, _: (root / "side_left.npy").write_bytes(b""), CaptureInputError, r"side_left\.npy .*cannot be read"),
-    "wrong shape": (replace_image(lambda image: image[1:]), CaptureInputError, r"side_left\.npy .* shape \(17, 24, 2\) instead of \(18, 24, 2\)"),
-    "whole numbers": (replace_image(lambda image: (255 * image).astype(np.uint8)), CaptureInputError, r"side_left\.npy .*floating-point radiance"),
-    "NaN": (replace_image(lambda image: image * np.nan), CaptureInputError, r"side_left\.npy \(camera side, light left\) is not finite at \d+ tooth pixels"),
+    "not a file of arrays": (
+        lambda root, _: (root / "side_left.npy").write_bytes(b""),
+        CaptureInputError,
+        r"side_left\.npy .*cannot be read",
+    ),
+    "wrong shape": (
+        replace_image(lambda image: image[1:]),
+        CaptureInputError,
+        r"side_left\.npy .* shape \(17, 24, 2\) instead of \(18, 24, 2\)",
+    ),
+    "whole numbers": (
+        replace_image(lambda image: (255 * image).astype(np.uint8)),
+        CaptureInputError,
+        r"side_left\.npy .*floating-point radiance",
+    ),
+    "NaN": (
+        replace_image(lambda image: image * np.nan),
+        CaptureInputError,
+        r"side_left\.npy \(camera side, light left\) is not finite at \d+ tooth pixels",
+    ),
     "no image": (edit(lambda tree: tree.update(images=[])), CaptureInputError, r"lists no image"),
-    "unknown camera": (edit(lambda tree: tree["images"][1].update(camera="rear")), CaptureInputError, r"front_right\.npy names camera rear"),
-    "unknown light": (edit(lambda tree: tree["images"][1].update(light="sun")), CaptureInputError, r"front_right\.npy names light sun"),
-    "same pair twice": (edit(lambda tree: tree["images"].append(tree["images"][0])), CaptureInputError, r"camera front under light left twice"),
-    "same light twice": (edit(lambda tree: tree["lights"].append(tree["lights"][0])), CaptureInputError, r"light left twice"),
-    "channel without intensity": (edit(lambda tree: tree["lights"][1].update(intensity=[1e6])), CaptureInputError, r"light right has 1 intensities for 2"),
-    "other format": (edit(lambda tree: tree["images"][0].update(file="capture.json")), CaptureInputError, r"no \.npy file"),
-    "file elsewhere": (edit(lambda tree: tree["images"][0].update(file="../secret.npy")), CaptureInputError, r"secret\.npy lies outside"),
-    "camera whose name leads elsewhere": (edit(lambda tree: rename_camera(tree, "../../c0")), CaptureInputError, r"cameras\.0\.name: a name has 1 to 64 bytes"),
-    "light whose name leads elsewhere": (edit(lambda tree: tree["lights"][1].update(name="/tmp/l")), CaptureInputError, r"lights\.1\.name: .* no slash"),
-    "channel without a name": (edit(lambda tree: tree.update(channels=["green", ""])), CaptureInputError, r"channels\.1: a name has 1 to 64 bytes"),
+    "unknown camera": (
+        edit(lambda tree: tree["images"][1].update(camera="rear")),
+        CaptureInputError,
+        r"front_right\.npy names camera rear",
+    ),
+    "unknown light": (
+        edit(lambda tree: tree["images"][1].update(light="sun")),
+        CaptureInputError,
+        r"front_right\.npy names light sun",
+    ),
+    "same pair twice": (
+        edit(lambda tree: tree["images"].append(tree["images"][0])),
+        CaptureInputError,
+        r"camera front under light left twice",
+    ),
+    "same light twice": (
+        edit(lambda tree: tree["lights"].append(tree["lights"][0])),
+        CaptureInputError,
+        r"light left twice",
+    ),
+    "channel without intensity": (
+        edit(lambda tree: tree["lights"][1].update(intensity=[1e6])),
+        CaptureInputError,
+        r"light right has 1 intensities for 2",
+    ),
+    "other format": (
+        edit(lambda tree: tree["images"][0].update(file="capture.json")),
+        CaptureInputError,
+        r"no \.npy file",
+    ),
+    "file elsewhere": (
+        edit(lambda tree: tree["images"][0].update(file="../secret.npy")),
+        CaptureInputError,
+        r"secret\.npy lies outside",
+    ),
+    "camera whose name leads elsewhere": (
+        edit(lambda tree: rename_camera(tree, "../../c0")),
+        CaptureInputError,
+        r"cameras\.0\.name: a name has 1 to 64 bytes",
+    ),
+    "light whose name leads elsewhere": (
+        edit(lambda tree: tree["lights"][1].update(name="/tmp/l")),
+        CaptureInputError,
+        r"lights\.1\.name: .* no slash",
+    ),
+    "channel without a name": (
+        edit(lambda tree: tree.update(channels=["green", ""])),
+        CaptureInputError,
+        r"channels\.1: a name has 1 to 64 bytes",
+    ),
     "not JSON": (lambda root, _: (root / "capture.json").write_text("{"), CaptureInputError, r"capture\.json"),
     "other units": (edit(lambda tree: tree.update(units="m")), CaptureInputError, r"capture\.json: units"),
-    "no mesh": (lambda root, _: (root / "teeth" / "11" / "outer.ply").unlink(), CaptureInputError, r"outer\.ply does not exist"),
+    "no mesh": (
+        lambda root, _: (root / "teeth" / "11" / "outer.ply").unlink(),
+        CaptureInputError,
+        r"outer\.ply does not exist",
+    ),
     "mesh in metres": (rescale_mesh(1e-3), MeshError, r"teeth/11/outer\.ply is 0\.008 units across.*rescale"),
     "mesh with holes": (open_mesh, MeshError, r"teeth/11/outer\.ply is not watertight"),
     "pose in metres": (edit(move_camera(1.0)), CaptureInputError, r"Camera side stands 1 mm from the teeth"),
     "pose in micrometres": (edit(move_camera(1e6)), CaptureInputError, r"teeth span 0\.012 px in camera side"),
-    "light in metres": (edit(lambda tree: tree["lights"][0].update(position_mm=[-0.9, 0, -0.4])), CaptureInputError, r"Light left stands 0\.985 mm"),
+    "light in metres": (
+        edit(lambda tree: tree["lights"][0].update(position_mm=[-0.9, 0, -0.4])),
+        CaptureInputError,
+        r"Light left stands 0\.985 mm",
+    ),
     "light in micrometres": (
-        edit(lambda tree: [light.update(position_mm=[1e3 * x for x in light["position_mm"]]) for light in tree["lights"]]),
+        edit(
+            lambda tree: [light.update(position_mm=[1e3 * x for x in light["position_mm"]]) for light in tree["lights"]]
+        ),
         CaptureInputError,
         r"times as bright as a white surface .* positions in mm",
     ),
@@ -267,7 +352,11 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
         r"times as bright as a white surface .* intensities per steradian with mm",
     ),
     "all images dark": (darken_all, CaptureInputError, r"Every image of .* is dark.*check exposure, lights"),
-    "header beyond all memory": (declare((10**9, 10**9, 2)), CaptureInputError, r"side_left\.npy \(camera side, light left\) cannot be read as npy"),
+    "header beyond all memory": (
+        declare((10**9, 10**9, 2)),
+        CaptureInputError,
+        r"side_left\.npy \(camera side, light left\) cannot be read as npy",
+    ),
     "header beyond all integers": (declare((10**40, 3)), CaptureInputError, r"side_left\.npy .*cannot be read as npy"),
     "header of brackets": (
         lambda root, _: (root / "side_left.npy").write_bytes(npy(b"(" * 5000)),
@@ -279,32 +368,72 @@ BAD: dict[str, tuple[Callable[[Path, Tree], object], type[DentineError], str]] =
         CaptureInputError,
         r"camera side has 2000000000 x 1 pixels",
     ),
-    "dark light": (edit(lambda tree: tree["lights"][1].update(intensity=[1e6, 0.0])), CaptureInputError, r"light right has intensity 0 in channel blue"),
-    "NUL in a path": (edit(lambda tree: tree["images"][0].update(file="a\0.npy")), CaptureInputError, r"images\.0\.file: .*character NUL"),
-    "a tooth that nobody has": (lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "99"), CaptureInputError, r"tooth 99, which is no FDI number"),
-    "a tooth that no integer names": (lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "\u00b2"), CaptureInputError, r"No tooth mesh"),
-    "mesh in fifths of a mm": (rescale_mesh(6.0), MeshError, r"teeth/11/outer\.ply is 48 units across, outside 2 to 45 mm"),
+    "dark light": (
+        edit(lambda tree: tree["lights"][1].update(intensity=[1e6, 0.0])),
+        CaptureInputError,
+        r"light right has intensity 0 in channel blue",
+    ),
+    "NUL in a path": (
+        edit(lambda tree: tree["images"][0].update(file="a\0.npy")),
+        CaptureInputError,
+        r"images\.0\.file: .*character NUL",
+    ),
+    "a tooth that nobody has": (
+        lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "99"),
+        CaptureInputError,
+        r"tooth 99, which is no FDI number",
+    ),
+    "a tooth that no integer names": (
+        lambda root, _: (root / "teeth" / "11").rename(root / "teeth" / "\u00b2"),
+        CaptureInputError,
+        r"No tooth mesh",
+    ),
+    "mesh in fifths of a mm": (
+        rescale_mesh(6.0),
+        MeshError,
+        r"teeth/11/outer\.ply is 48 units across, outside 2 to 45 mm",
+    ),
     "two shells in each other": (double_mesh, MeshError, r"teeth/11/outer\.ply holds 2 separate shells"),
-    "two teeth in each other": (lambda root, _: shutil.copytree(root / "teeth" / "11", root / "teeth" / "12"), MeshError, r"Teeth 11 and 12 lie in each other"),
+    "two teeth in each other": (
+        lambda root, _: shutil.copytree(root / "teeth" / "11", root / "teeth" / "12"),
+        MeshError,
+        r"Teeth 11 and 12 lie in each other",
+    ),
     "lights beyond any rig": (
         edit(lambda tree: tree["lights"].extend({**tree["lights"][0], "name": f"l{k}"} for k in range(10_000))),
         CaptureInputError,
         r"lists 10002 lights, more than any rig has \(1000\)",
     ),
-    "beyond single precision": (replace_image(lambda image: image.astype(np.float64) * 1e200), CaptureInputError, r"side_left\.npy .* beyond single precision"),
+    "beyond single precision": (
+        replace_image(lambda image: image.astype(np.float64) * 1e200),
+        CaptureInputError,
+        r"side_left\.npy .* beyond single precision",
+    ),
     "negative focal length": (
         edit(lambda tree: tree["cameras"][1]["K"][0].__setitem__(0, -1500)),
         CaptureInputError,
         r"camera side has focal lengths K\[0\]\[0\] = -1500",
     ),
-    "matrix of another kind": (edit(lambda tree: tree["cameras"][1]["K"][2].__setitem__(2, 2)), CaptureInputError, r"camera side has a K that is not"),
+    "matrix of another kind": (
+        edit(lambda tree: tree["cameras"][1]["K"][2].__setitem__(2, 2)),
+        CaptureInputError,
+        r"camera side has a K that is not",
+    ),
     "pose without its last row": (
         edit(lambda tree: tree["cameras"][1]["camera_from_world"][3].__setitem__(3, 0)),
         CaptureInputError,
         r"last row of camera_from_world",
     ),
-    "channel twice": (edit(lambda tree: tree.update(channels=["green", "green"])), CaptureInputError, r"lists channel green twice"),
-    "tooth out of view": (edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)), CaptureInputError, r"No tooth .* camera front"),
+    "channel twice": (
+        edit(lambda tree: tree.update(channels=["green", "green"])),
+        CaptureInputError,
+        r"lists channel green twice",
+    ),
+    "tooth out of view": (
+        edit(lambda tree: tree["cameras"][0]["camera_from_world"][0].__setitem__(3, 300.0)),
+        CaptureInputError,
+        r"No tooth .* camera front",
+    ),
 }
 
 

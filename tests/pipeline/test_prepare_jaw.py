@@ -32,21 +32,32 @@ GUMS, CAVITY = len(FDI), len(FDI) + 1
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("jaw") / "capture"
     options = "--jaw --subject 1 --pixel-mm 2 --cameras 2 --lights 3 --held-out 1 --samples 64"
-    outcome = CliRunner().invoke(build_app(), ["phantom", "--out", str(folder), *options.split()], catch_exceptions=False)
+    outcome = CliRunner().invoke(
+        build_app(), ["phantom", "--out", str(folder), *options.split()], catch_exceptions=False
+    )
     assert outcome.exit_code == 0
     return folder
 
 
-def prepare(capture: Path, root: Path, kind: str = "jaw", log: list[str] | None = None) -> tuple[PreparedManifest, dict[str, NDArray[Any]]]:
+def prepare(
+    capture: Path, root: Path, kind: str = "jaw", log: list[str] | None = None
+) -> tuple[PreparedManifest, dict[str, NDArray[Any]]]:
     spec = JobSpec.model_validate({"kind": kind, "capture": capture})
     manifest = run(spec, LocalContext(root, listener=None if log is None else lambda event: log.append(event.message)))
     store = root / "prepared" / "prepared.zarr"
-    return manifest, {name: np.asarray(zarr.open_array(store / name, mode="r")) for name in ("radiance", "variance", "valid", "surface")}
+    return manifest, {
+        name: np.asarray(zarr.open_array(store / name, mode="r"))
+        for name in ("radiance", "variance", "valid", "surface")
+    }
 
 
 @pytest.fixture(scope="module")
 def scene(capture: Path) -> RayScene:
-    return RayScene(*(tooth.outer for tooth in read_teeth(capture)), read_mesh(capture / "gums.ply"), read_mesh(capture / "cavity.ply"))
+    return RayScene(
+        *(tooth.outer for tooth in read_teeth(capture)),
+        read_mesh(capture / "gums.ply"),
+        read_mesh(capture / "cavity.ply"),
+    )
 
 
 def first_surface(scene: RayScene, camera: Camera, offset: tuple[float, float]) -> NDArray[np.int64]:
@@ -97,7 +108,10 @@ def test_everything_but_the_background_is_valid_for_a_jaw(capture: Path, scene: 
         dark = arrays["variance"][k, :, :height, :width, 0] == 0
         assert np.array_equal(valid & MaskBit.NOT_FINITE > 0, dark)
     assert shown >= {-1, GUMS, CAVITY, FDI.index(11), FDI.index(21)}
-    counted = [int(np.count_nonzero((arrays["valid"] == 0) & (arrays["surface"][:, None] == number))) for number in range(len(FDI))]
+    counted = [
+        int(np.count_nonzero((arrays["valid"] == 0) & (arrays["surface"][:, None] == number)))
+        for number in range(len(FDI))
+    ]
     assert manifest.tooth_pixels == tuple(counted)
     assert min(counted[FDI.index(number)] for number in (11, 12, 13, 21, 22, 23)) > 0
 
@@ -145,4 +159,7 @@ def test_surroundings_that_bound_nothing_are_refused(capture: Path, tmp_path: Pa
     # Gums that cover all teeth.
     cover = trimesh.creation.icosphere(radius=45.0)
     with pytest.raises(CaptureInputError, match="No tooth projects"):
-        prepare(with_gums("cover", Mesh(np.asarray(cover.vertices), np.asarray(cover.faces, dtype=np.int32))), tmp_path / "c")
+        prepare(
+            with_gums("cover", Mesh(np.asarray(cover.vertices), np.asarray(cover.faces, dtype=np.int32))),
+            tmp_path / "c",
+        )

@@ -36,8 +36,17 @@ AMPLITUDE_MM = 0.35
 def renders(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
     """Two views of 0.09 mm pixels; 12 lights, GGX roughness 0.1."""
     out = tmp_path_factory.mktemp("renders") / "tooth.npz"
-    options = {"size": [124, 156], "pixel_mm": 0.09, "views_deg": [[0, 0], [30, 10]], "lights": LIGHTS, "frames": FRAMES, "amplitude_mm": AMPLITUDE_MM}
-    subprocess.run([sys.executable, "-m", "tests.support.render_moving_tooth", str(out), json.dumps(options)], check=True)
+    options = {
+        "size": [124, 156],
+        "pixel_mm": 0.09,
+        "views_deg": [[0, 0], [30, 10]],
+        "lights": LIGHTS,
+        "frames": FRAMES,
+        "amplitude_mm": AMPLITUDE_MM,
+    }
+    subprocess.run(
+        [sys.executable, "-m", "tests.support.render_moving_tooth", str(out), json.dumps(options)], check=True
+    )
     with np.load(out) as stored:
         return dict(stored)
 
@@ -48,7 +57,10 @@ def description(renders: Mapping[str, Any]) -> Rendered:
         Camera(name=f"c{k}", size=(width, height), K=renders["K"].tolist(), camera_from_world=pose.tolist())
         for k, pose in enumerate(renders["camera_from_world"])
     )
-    lights = tuple(Light(name=f"l{k}", position_mm=place.tolist(), intensity=renders["intensity"].tolist()) for k, place in enumerate(renders["lights_mm"]))
+    lights = tuple(
+        Light(name=f"l{k}", position_mm=place.tolist(), intensity=renders["intensity"].tolist())
+        for k, place in enumerate(renders["lights_mm"])
+    )
     return Rendered(FRAMES, renders["total"], cameras, lights, Mesh(renders["vertices_mm"], renders["faces"]))
 
 
@@ -62,14 +74,18 @@ def true_displacement(rendered: Rendered, camera: Camera, footprint: Footprint, 
 
 
 @pytest.fixture(scope="module")
-def moved(renders: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Rendered, PreparedManifest, list[StageEvent]]:
+def moved(
+    renders: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Rendered, PreparedManifest, list[StageEvent]]:
     root, events = tmp_path_factory.mktemp("moved"), []
     rendered = description(renders)
     write_capture(root, rendered)
     return root, rendered, run(JobSpec(capture=root), LocalContext(root, listener=events.append)), events
 
 
-def test_residual_motion(moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]) -> None:
+def test_residual_motion(
+    moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
+) -> None:
     """At most 0.2 px in the median after stabilisation (acceptance), of a motion of several pixels that includes a nod and a turn."""
     root, rendered, manifest, _ = moved
     folder, _ = open_stage(root, "prepared", PreparedManifest)
@@ -89,7 +105,9 @@ def test_residual_motion(moved: tuple[Path, Rendered, PreparedManifest, list[Sta
     assert manifest.median_motion_px == pytest.approx(np.median([np.median(frame) for frame in before]), abs=0.2)
 
 
-def test_highlight_energy(moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]) -> None:
+def test_highlight_energy(
+    moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
+) -> None:
     """At least 90 % of the reflected light masked (acceptance; the goal is 95 %), and at most 3 % of the pixels that reflect less than the noise of 1 %."""
     root, rendered, _, _ = moved
     folder, _ = open_stage(root, "prepared", PreparedManifest)
@@ -99,7 +117,9 @@ def test_highlight_energy(moved: tuple[Path, Rendered, PreparedManifest, list[St
         footprint = project(camera, [rendered.mesh])
         for number, (light, _) in enumerate(FRAMES):
             if light >= 0:
-                truth = np.nan_to_num(true_displacement(rendered, camera, footprint, renders["motions"][number])).astype(np.float32)
+                truth = np.nan_to_num(
+                    true_displacement(rendered, camera, footprint, renders["motions"][number])
+                ).astype(np.float32)
                 whole = warp(renders["total"][k, number].mean(axis=-1), truth)
                 specular = (whole - warp(renders["diffuse"][k, number].mean(axis=-1), truth)) * footprint.covered
                 highlight = (np.asarray(valid[k, light]) & (MaskBit.HIGHLIGHT | MaskBit.SATURATED)) > 0
@@ -153,13 +173,21 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
     assert (events[0].kind, events[-1].kind) == ("started", "finished")
     report = read_record(root / "prepared" / "quality.json", QualityReport)
     assert len(report.images) == 2 * LIGHTS
-    assert sum(image.valid_pixels for image in report.images) / sum(image.tooth_pixels for image in report.images) == manifest.valid_fraction
-    assert all((root / "prepared" / "quality" / f"{image.camera}_{image.light}.png").stat().st_size > 1000 for image in report.images)
+    assert (
+        sum(image.valid_pixels for image in report.images) / sum(image.tooth_pixels for image in report.images)
+        == manifest.valid_fraction
+    )
+    assert all(
+        (root / "prepared" / "quality" / f"{image.camera}_{image.light}.png").stat().st_size > 1000
+        for image in report.images
+    )
     # No light was named and the capture marks none: every fourth is kept from the fit, in all cameras
     assert manifest.held_out == tuple((camera.name, f"l{k}") for camera in rendered.cameras for k in (3, 7, 11))
 
 
-def test_cancel_between_images_publishes_nothing(moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], tmp_path: Path) -> None:
+def test_cancel_between_images_publishes_nothing(
+    moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], tmp_path: Path
+) -> None:
     root = moved[0]
 
     def cancel_after_two(event: StageEvent) -> None:
@@ -189,7 +217,11 @@ def test_without_tracking_frames_the_operator_is_told(renders: Mapping[str, Any]
 
 def test_truncated_shard_is_named(renders: Mapping[str, Any], tmp_path: Path) -> None:
     write_capture(tmp_path, description(renders))
-    shard = next(path for path in sorted((tmp_path / "capture" / "capture.zarr").rglob("*")) if path.is_file() and path.name != "zarr.json")
+    shard = next(
+        path
+        for path in sorted((tmp_path / "capture" / "capture.zarr").rglob("*"))
+        if path.is_file() and path.name != "zarr.json"
+    )
     shard.write_bytes(shard.read_bytes()[:-100])
     with pytest.raises(CorruptStoreError, match=r"capture\.zarr.*truncated.*\.$"):
         run(JobSpec(capture=tmp_path), LocalContext(tmp_path))

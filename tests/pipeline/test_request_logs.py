@@ -51,18 +51,26 @@ def test_one_id_leads_from_the_answer_to_the_worker(tmp_path: Path) -> None:
     of_job = [line for line in lines if line.get("job") == job["id"] and line.get("request_id") == "visit-7.a"]
     assert {"Job submitted.", "Job ran."} <= {line["message"] for line in of_job}
     of_worker = [(line["stage"], line["attempt"], line["message"]) for line in of_job if "stage" in line]
-    assert of_worker == [(stage, 1, f"Stage {what}.") for stage in ("prepare", "fit", "export") for what in ("started", "finished")]
+    assert of_worker == [
+        (stage, 1, f"Stage {what}.") for stage in ("prepare", "fit", "export") for what in ("started", "finished")
+    ]
     submitted = [line for line in lines if line["message"] == "Request answered." and line["request_id"] == "visit-7.a"]
-    assert [(line["method"], line["route"], line["status"], line["client"]) for line in submitted] == [("POST", "/v1/jobs", 201, "127.0.0.1")]
+    assert [(line["method"], line["route"], line["status"], line["client"]) for line in submitted] == [
+        ("POST", "/v1/jobs", 201, "127.0.0.1")
+    ]
     assert submitted[0]["duration_s"] > 0
     started = [json.loads(line.removeprefix("data: ")) for line in events.splitlines() if '"kind":"started"' in line]
-    assert [event["data"] for event in started] == [{"job": job["id"], "request_id": "visit-7.a", "machine": machine_class()}] * 3
+    assert [event["data"] for event in started] == [
+        {"job": job["id"], "request_id": "visit-7.a", "machine": machine_class()}
+    ] * 3
 
 
 @pytest.mark.parametrize("asked", ["", "a b", "x" * 65, "-a", 'a"b', "<b>"])
 def test_an_id_that_is_not_well_formed_is_replaced(tmp_path: Path, asked: str) -> None:
     with serving(create_app(ServerSettings(data=tmp_path))) as client:
-        made = [client.get("/v1/health/live", headers={"X-Request-ID": asked}).headers["x-request-id"] for _ in range(2)]
+        made = [
+            client.get("/v1/health/live", headers={"X-Request-ID": asked}).headers["x-request-id"] for _ in range(2)
+        ]
     assert asked not in made
     assert made[0] != made[1]
     assert all(len(one) == 16 for one in made)
@@ -74,7 +82,12 @@ def test_a_line_holds_the_route_and_never_path_or_query(tmp_path: Path, lines: A
             client.get(path, headers={"Authorization": "Bearer hush-5", "Cookie": "session=hush-6"})
         client.get("/v1/jobs", headers={"Host": "hush-7.example"})
     told = [line for line in lines() if line["message"] == "Request answered."]
-    assert [(line["route"], line["status"]) for line in told] == [("/v1/jobs/{job_id}", 404), ("unrouted", 404), ("/v1/jobs", 200), ("unrouted", 400)]
+    assert [(line["route"], line["status"]) for line in told] == [
+        ("/v1/jobs/{job_id}", 404),
+        ("unrouted", 404),
+        ("/v1/jobs", 200),
+        ("unrouted", 400),
+    ]
     assert "hush" not in json.dumps(lines())
 
 
@@ -84,7 +97,11 @@ def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, 
     app.router.routes.insert(0, app.router.routes.pop())  # before the page, which takes every path
     with serving(app) as client:
         answer = client.get("/v1/broken", headers={"X-Request-ID": "r-500"})
-    assert (answer.status_code, answer.json()["code"], answer.headers["x-request-id"]) == (500, "internal-error", "r-500")
+    assert (answer.status_code, answer.json()["code"], answer.headers["x-request-id"]) == (
+        500,
+        "internal-error",
+        "r-500",
+    )
     assert "r-500" in answer.json()["detail"]
     of_request = [line for line in lines() if line.get("request_id") == "r-500"]
     assert [line["status"] for line in of_request if line["message"] == "Request answered."] == [500]
@@ -106,7 +123,13 @@ def test_what_is_logged_inside_a_block_carries_its_values(lines: Any) -> None:
     logging.getLogger("services.api.any").info("After.")
     logging.getLogger("elsewhere").info("Not heard.")
     inside, after = lines()
-    assert (inside["message"], inside["job"], inside["stage"], inside["level"], inside["logger"]) == ("Broke here.", "j1", "fit", "error", "services.api.any")
+    assert (inside["message"], inside["job"], inside["stage"], inside["level"], inside["logger"]) == (
+        "Broke here.",
+        "j1",
+        "fit",
+        "error",
+        "services.api.any",
+    )
     assert "ZeroDivisionError: on purpose" in inside["exception"]
     assert "request_id" not in inside
     assert (after["message"], "job" in after) == ("After.", False)

@@ -46,7 +46,10 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Folder of programs of each role; roles with the same extras share one."""
     folder = tmp_path_factory.mktemp("roles")
     wheel = build_wheel(folder / "build")
-    made = {extras: install(wheel, extras, folder / ("-".join(extras) or "base")) for extras in {role.extras for role in ROLES.values()}}
+    made = {
+        extras: install(wheel, extras, folder / ("-".join(extras) or "base"))
+        for extras in {role.extras for role in ROLES.values()}
+    }
     return {name: made[role.extras] for name, role in ROLES.items()}
 
 
@@ -59,9 +62,26 @@ class Parts:
         self.address = f"http://127.0.0.1:{self._ports['api']}"
         self.dome = f"127.0.0.1:{self._ports['dome']}"
         scheduler = f"tcp://127.0.0.1:{self._ports['scheduler']}"
-        worker = ["worker", scheduler, "--nworkers", "1", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "dask")]
+        worker = [
+            "worker",
+            scheduler,
+            "--nworkers",
+            "1",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--local-directory",
+            str(folder / "dask"),
+        ]
         self._commands = {
-            "scheduler": ["scheduler", "--host", "127.0.0.1", "--port", str(self._ports["scheduler"]), "--no-dashboard"],
+            "scheduler": [
+                "scheduler",
+                "--host",
+                "127.0.0.1",
+                "--port",
+                str(self._ports["scheduler"]),
+                "--no-dashboard",
+            ],
             "dome": ["dome-sim", "--port", str(self._ports["dome"]), "--lights", str(LIGHTS_OF_THE_DOME)],
             "worker": worker,
             "rig": [*worker, "--resources", "DOME=1"],
@@ -74,13 +94,17 @@ class Parts:
         settings = self._settings if name == "api" else {}
         log = stack.enter_context(self.log(name).open("wb"))
         command = [str(self._programs[name] / "dentine"), *self._commands[name]]
-        process = subprocess.Popen(command, cwd=self._folder, env=environment_without_this_tree(**settings), stdout=log, stderr=log)
+        process = subprocess.Popen(
+            command, cwd=self._folder, env=environment_without_this_tree(**settings), stdout=log, stderr=log
+        )
         stack.callback(end, process)
 
     def run(self, role: str, *arguments: str, ends_with: Collection[int] = (0,)) -> str:
         """Run a command to its end in a role's environment; gives what it printed."""
         command = [str(self._programs[role] / "dentine"), *arguments]
-        ended = subprocess.run(command, cwd=self._folder, env=environment_without_this_tree(), capture_output=True, text=True, check=False)
+        ended = subprocess.run(
+            command, cwd=self._folder, env=environment_without_this_tree(), capture_output=True, text=True, check=False
+        )
         assert ended.returncode in ends_with, f"{role}: {ended.stderr}\n{self.logs()}"
         return ended.stdout.strip()
 
@@ -134,7 +158,9 @@ def test_a_small_job_runs_through_parts_that_have_only_their_own_packages(parts:
 
     (tmp_path / "job.toml").write_text(JOB.format(port=parts.dome.rpartition(":")[2], mouth=tmp_path / "mouth"))
     # So few pixels and paths tell little: whether the fit converged is not asked here.
-    job = parts.run("client", "submit", "job.toml", "--watch", "--server", parts.address, ends_with=(0, NOT_CONVERGED_STATUS)).splitlines()[0]
+    job = parts.run(
+        "client", "submit", "job.toml", "--watch", "--server", parts.address, ends_with=(0, NOT_CONVERGED_STATUS)
+    ).splitlines()[0]
     with connect(parts.address) as client:
         detail = client.get(f"/v1/jobs/{job}").json()
         assert detail["state"] == "SUCCEEDED", detail
@@ -146,9 +172,15 @@ def test_a_small_job_runs_through_parts_that_have_only_their_own_packages(parts:
 
 
 def test_a_command_without_its_packages_names_the_extra(programs: dict[str, Path], tmp_path: Path) -> None:
-    for arguments, extra in ((["serve", "--port", "0"], "api"), (["dome-sim", "--port", "0"], "capture"), (["phantom", "--out", "mouth"], "worker")):
+    for arguments, extra in (
+        (["serve", "--port", "0"], "api"),
+        (["dome-sim", "--port", "0"], "capture"),
+        (["phantom", "--out", "mouth"], "worker"),
+    ):
         command = [str(programs["client"] / "dentine"), *arguments]
-        ended = subprocess.run(command, cwd=tmp_path, env=environment_without_this_tree(), capture_output=True, text=True, check=False)
+        ended = subprocess.run(
+            command, cwd=tmp_path, env=environment_without_this_tree(), capture_output=True, text=True, check=False
+        )
         assert (ended.returncode, ended.stdout) == (4, ""), ended.stderr
         assert f"dentine[{extra}]" in ended.stderr
         assert len(ended.stderr.splitlines()) == 1, ended.stderr

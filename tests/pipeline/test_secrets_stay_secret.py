@@ -40,7 +40,9 @@ def failing_server(tmp_path: Path) -> Iterator[tuple[httpx.Client, Path]]:
     said = tmp_path / "said.txt"
     with said.open("w") as stream:
         command = [sys.executable, "-X", "dev", "-W", "ignore", "-c", FAILING_SERVER, str(tmp_path / "data")]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True, cwd=Path(__file__).parents[2]) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=stream, text=True, cwd=Path(__file__).parents[2]
+        ) as process:
             try:
                 assert process.stdout is not None
                 with connect(process.stdout.readline().strip()) as client:
@@ -51,7 +53,9 @@ def failing_server(tmp_path: Path) -> Iterator[tuple[httpx.Client, Path]]:
 
 
 @pytest.mark.attack("tokens", "secrets in logs, files and answers")
-def test_secrets_are_nowhere_in_what_the_server_writes_and_says(failing_server: tuple[httpx.Client, Path], tmp_path: Path) -> None:
+def test_secrets_are_nowhere_in_what_the_server_writes_and_says(
+    failing_server: tuple[httpx.Client, Path], tmp_path: Path
+) -> None:
     client, said = failing_server
     answers: list[str] = []
 
@@ -114,7 +118,9 @@ def test_the_command_line_does_not_repeat_its_token(failing_server: tuple[httpx.
     client, _ = failing_server
     guess = "dentine_0123456789ab_a-guess-that-nobody-may-read-again"
     command = [sys.executable, "-m", "services", "cancel", "none", "--server", str(client.base_url)]
-    answer = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"DENTINE__CLIENT__TOKEN": guess}, check=False)
+    answer = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"DENTINE__CLIENT__TOKEN": guess}, check=False
+    )
     assert answer.returncode == 8
     assert "unknown, expired or revoked" in answer.stderr
     assert "a-guess" not in answer.stdout + answer.stderr

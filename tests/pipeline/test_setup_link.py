@@ -74,7 +74,9 @@ def test_a_link_makes_an_administrator_once(client: httpx.Client, engine: sql.En
         assert (again.status_code, again.json()["code"]) == (403, "setup-link-void")
         assert COOKIE not in again.cookies
     rows = client.get("/v1/audit", headers={"Authorization": f"Bearer {token['token']}"}).json()["entries"]
-    tries = [(row["who"], row["outcome"], row["ids"].get("token_id")) for row in rows if row["action"] == "POST /v1/setup"]
+    tries = [
+        (row["who"], row["outcome"], row["ids"].get("token_id")) for row in rows if row["action"] == "POST /v1/setup"
+    ]
     assert tries == [("setup link", 403, None), ("setup link", 403, None), ("setup link", 201, token["id"])]
 
 
@@ -158,6 +160,12 @@ def test_each_start_without_a_token_writes_one_link(tmp_path: Path) -> None:
 
 
 def test_help_names_the_setting() -> None:
-    answer = subprocess.run([sys.executable, "-m", "services", "jobs"], capture_output=True, text=True, check=False, env={"DENTINE__SERVER__PUBLIC_URL": "lab"})
+    answer = subprocess.run(
+        [sys.executable, "-m", "services", "jobs"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"DENTINE__SERVER__PUBLIC_URL": "lab"},
+    )
     assert answer.returncode == 2
     assert "DENTINE__SERVER__PUBLIC_URL" in answer.stderr

@@ -29,7 +29,9 @@ def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     told["images"][0]["held_out"] = True
     folder = SlabFolder.model_validate(told)
     rig = rig_of(folder, WAVELENGTH_NM)
-    images = render(rig, henyey_greenstein(1.2, 0.6, 0.05), seed=99, step=0, batches=1, paths=200_000, scores=False).mean
+    images = render(
+        rig, henyey_greenstein(1.2, 0.6, 0.05), seed=99, step=0, batches=1, paths=200_000, scores=False
+    ).mean
     (root / "slab.json").write_text(json.dumps(told))
     noise = np.random.default_rng(1)
     for entry, image in zip(folder.images, images, strict=True):

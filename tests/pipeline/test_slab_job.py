@@ -178,7 +178,9 @@ def test_a_new_attempt_takes_the_wavelengths_that_are_done(job: Path, spec: JobS
 
 
 @pytest.mark.slow
-def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(
+    job: Path, spec: JobSpec, tmp_path: Path
+) -> None:
     (copied_checkpoint(job, tmp_path) / CHECKPOINT / "532" / "fit.json").write_text("{")
     again = run(spec, LocalContext(tmp_path, attempt=2)).fits[0]
     assert json.loads(again.parameters.model_dump_json()) == stored_fits(job)[0]["parameters"]
@@ -224,7 +226,9 @@ def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> Non
         ({"kind": "slab", "effort": 0}, "greater than or equal to 0.01"),
     ],
 )
-def test_options_that_a_kind_does_not_have_are_refused(options: dict[str, object], sentence: str, tmp_path: Path) -> None:
+def test_options_that_a_kind_does_not_have_are_refused(
+    options: dict[str, object], sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(SettingsError, match=re.escape(sentence)):
         job_from_tree({"capture": "cell"} | options, tmp_path, "JOB.toml")
 

@@ -93,7 +93,9 @@ def test_jobs_that_succeed_are_counted_until_they_suffice(server: httpx.Client, 
     assert server.get(f"/v1/jobs/{unlike}").json()["remaining"]["past_jobs"] == 0
 
 
-def test_a_queued_job_waits_for_those_before_it(server: httpx.Client, held: HeldJob, capture: str, tmp_path: Path) -> None:
+def test_a_queued_job_waits_for_those_before_it(
+    server: httpx.Client, held: HeldJob, capture: str, tmp_path: Path
+) -> None:
     remember_runs(tmp_path / "data", capture, (900.0, 950.0, 1000.0, 1050.0, 1100.0))
     running = submit_held(server, held, capture)
     queued, last = submit(server, capture), submit(server, capture)
@@ -103,7 +105,9 @@ def test_a_queued_job_waits_for_those_before_it(server: httpx.Client, held: Held
         assert told["low_s"] < truth_s < told["high_s"] < 2 * truth_s
 
 
-def test_a_job_behind_one_without_a_range_has_none(server: httpx.Client, held: HeldJob, capture: str, tmp_path: Path) -> None:
+def test_a_job_behind_one_without_a_range_has_none(
+    server: httpx.Client, held: HeldJob, capture: str, tmp_path: Path
+) -> None:
     remember_runs(tmp_path / "data", capture, (900.0, 950.0, 1000.0, 1050.0, 1100.0))
     submit_held(server, held, capture, stains=True)
     queued = submit(server, capture)

@@ -16,7 +16,9 @@ DENTINE = [sys.executable, "-m", "services"]
 
 
 def dentine(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*DENTINE, *arguments], capture_output=True, text=True, env=os.environ | environment, check=False)
+    return subprocess.run(
+        [*DENTINE, *arguments], capture_output=True, text=True, env=os.environ | environment, check=False
+    )
 
 
 def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) -> None:
@@ -55,7 +57,10 @@ def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["create", "x", "--scope", "write"], "Scope 'write' does not exist; known are read, submit, operate-dome, admin"),
+        (
+            ["create", "x", "--scope", "write"],
+            "Scope 'write' does not exist; known are read, submit, operate-dome, admin",
+        ),
         (["create", "a b", "--scope", "read"], "Token name 'a b'"),
         (["create", "a", "--scope", "read", "--group", "a/b"], "Group 'a/b' of token a"),
         (["revoke", "nobody"], "There is no token nobody"),

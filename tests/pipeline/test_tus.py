@@ -106,7 +106,11 @@ def test_a_file_is_sent_in_parts(client: httpx.Client, upload: str) -> None:
         assert (answer.status_code, answer.headers["upload-offset"]) == (204, str(min(offset + 1000, len(CONTENT))))
     assert is_known(client, upload)
     head = client.head(upload, headers=TUS)
-    assert (head.headers["upload-length"], head.headers["upload-offset"], head.headers["cache-control"]) == ("4096", "4096", "no-store")
+    assert (head.headers["upload-length"], head.headers["upload-offset"], head.headers["cache-control"]) == (
+        "4096",
+        "4096",
+        "no-store",
+    )
 
 
 def test_creating_again_keeps_what_was_received(client: httpx.Client, upload: str) -> None:
@@ -125,7 +129,9 @@ def test_a_wrong_offset_is_refused_and_changes_nothing(client: httpx.Client, upl
 
 @pytest.mark.parametrize("version", [None, "0.2.2"])
 @pytest.mark.parametrize("method", ["POST", "HEAD", "PATCH", "DELETE"])
-def test_another_protocol_version_is_refused(client: httpx.Client, upload: str, method: str, version: str | None) -> None:
+def test_another_protocol_version_is_refused(
+    client: httpx.Client, upload: str, method: str, version: str | None
+) -> None:
     url = "/v1/uploads" if method == "POST" else upload
     answer = client.request(method, url, headers={"Tus-Resumable": version} if version else {})
     assert (answer.status_code, answer.headers["tus-version"]) == (412, "1.0.0")
@@ -142,7 +148,10 @@ def test_a_checksum_is_checked_before_anything_is_recorded(client: httpx.Client,
     assert code_of(altered) == (460, "upload-checksum")
     assert "a.npy" in altered.json()["detail"]
     assert offset_of(client, upload) == 0
-    assert patch(client, upload, 0, CONTENT[:100], **{"Upload-Checksum": checksum(CONTENT[:100], algorithm)}).status_code == 204
+    assert (
+        patch(client, upload, 0, CONTENT[:100], **{"Upload-Checksum": checksum(CONTENT[:100], algorithm)}).status_code
+        == 204
+    )
     assert patch(client, upload, 100, CONTENT[100:]).status_code == 204
     assert is_known(client, upload)
 
@@ -154,7 +163,16 @@ def test_a_malformed_checksum_is_refused(client: httpx.Client, upload: str, head
 
 
 @pytest.mark.parametrize(
-    "metadata", ["", "capture", "capture ???", "path YQ==", "capture YQ==,capture YQ==", "capture /w==,path YQ==", "capture YQ==,path AA=="]
+    "metadata",
+    [
+        "",
+        "capture",
+        "capture ???",
+        "path YQ==",
+        "capture YQ==,capture YQ==",
+        "capture /w==,path YQ==",
+        "capture YQ==,path AA==",
+    ],
 )
 def test_malformed_metadata_is_refused(client: httpx.Client, metadata: str) -> None:
     answer = client.post("/v1/uploads", headers=TUS | {"Upload-Length": "1", "Upload-Metadata": metadata})
@@ -165,9 +183,15 @@ def test_only_files_of_the_manifest_are_taken(client: httpx.Client) -> None:
     from services.client.tus import format_metadata
 
     capture = announce(client, CONTENTS)["id"]
-    other = client.post("/v1/uploads", headers=TUS | {"Upload-Length": "1", "Upload-Metadata": format_metadata({"capture": capture, "path": "b.npy"})})
+    other = client.post(
+        "/v1/uploads",
+        headers=TUS | {"Upload-Length": "1", "Upload-Metadata": format_metadata({"capture": capture, "path": "b.npy"})},
+    )
     assert code_of(other) == (404, "capture-unknown")
-    longer = client.post("/v1/uploads", headers=TUS | {"Upload-Length": "9", "Upload-Metadata": format_metadata({"capture": capture, "path": "a.npy"})})
+    longer = client.post(
+        "/v1/uploads",
+        headers=TUS | {"Upload-Length": "9", "Upload-Metadata": format_metadata({"capture": capture, "path": "a.npy"})},
+    )
     assert code_of(longer) == (422, "upload-corrupt")
     assert client.head(f"/v1/uploads/{capture}/1", headers=TUS).status_code == 404
 
@@ -180,7 +204,9 @@ def test_more_bytes_than_the_manifest_says_are_refused(client: httpx.Client, upl
 
 
 @pytest.mark.attack("uploads", "other bytes than were announced")
-def test_a_finished_file_with_another_sha256_is_refused_by_name_and_can_be_sent_again(client: httpx.Client, upload: str, tmp_path: Path) -> None:
+def test_a_finished_file_with_another_sha256_is_refused_by_name_and_can_be_sent_again(
+    client: httpx.Client, upload: str, tmp_path: Path
+) -> None:
     answer = patch(client, upload, 0, CONTENT[:-1] + b"\0")
     assert code_of(answer) == (422, "upload-corrupt")
     assert "'a.npy'" in answer.json()["detail"]
@@ -199,7 +225,9 @@ def test_a_terminated_upload_is_gone_until_it_is_created_again(client: httpx.Cli
     assert offset_of(client, upload) == 0
 
 
-def test_an_expired_upload_is_gone_and_its_bytes_too(client: httpx.Client, upload: str, world: World, tmp_path: Path) -> None:
+def test_an_expired_upload_is_gone_and_its_bytes_too(
+    client: httpx.Client, upload: str, world: World, tmp_path: Path
+) -> None:
     world.now_s += 90
     assert patch(client, upload, 0, CONTENT[:10]).status_code == 204
     world.now_s += 90
@@ -244,10 +272,20 @@ def test_a_second_request_to_one_upload_is_refused(client: httpx.Client, upload:
 
 
 @pytest.mark.parametrize("with_checksum", [False, True])
-def test_a_broken_connection_keeps_what_came_unless_it_was_to_be_checked(client: httpx.Client, upload: str, tmp_path: Path, *, with_checksum: bool) -> None:
+def test_a_broken_connection_keeps_what_came_unless_it_was_to_be_checked(
+    client: httpx.Client, upload: str, tmp_path: Path, *, with_checksum: bool
+) -> None:
     host, port = client.base_url.host, client.base_url.port
-    lines = [f"PATCH {upload} HTTP/1.1", f"Host: {host}:{port}", "Tus-Resumable: 1.0.0", "Upload-Offset: 0", f"Content-Length: {len(CONTENT)}"]
-    lines += ["Content-Type: application/offset+octet-stream"] + ([f"Upload-Checksum: {checksum(CONTENT)}"] if with_checksum else [])
+    lines = [
+        f"PATCH {upload} HTTP/1.1",
+        f"Host: {host}:{port}",
+        "Tus-Resumable: 1.0.0",
+        "Upload-Offset: 0",
+        f"Content-Length: {len(CONTENT)}",
+    ]
+    lines += ["Content-Type: application/offset+octet-stream"] + (
+        [f"Upload-Checksum: {checksum(CONTENT)}"] if with_checksum else []
+    )
     with socket.create_connection((host, port)) as connection:
         connection.sendall("\r\n".join([*lines, "", ""]).encode() + CONTENT[:1000])
         wait_for_partial(tmp_path)
@@ -259,9 +297,17 @@ def test_a_broken_connection_keeps_what_came_unless_it_was_to_be_checked(client:
 @pytest.mark.attack("exhaustion", "an upload that falls silent")
 def test_a_silent_client_is_told_and_loses_nothing(client: httpx.Client, upload: str) -> None:
     host, port = client.base_url.host, client.base_url.port
-    lines = [f"PATCH {upload} HTTP/1.1", f"Host: {host}:{port}", "Tus-Resumable: 1.0.0", "Upload-Offset: 0", f"Content-Length: {len(CONTENT)}"]
+    lines = [
+        f"PATCH {upload} HTTP/1.1",
+        f"Host: {host}:{port}",
+        "Tus-Resumable: 1.0.0",
+        "Upload-Offset: 0",
+        f"Content-Length: {len(CONTENT)}",
+    ]
     with socket.create_connection((host, port)) as connection:
-        connection.sendall("\r\n".join([*lines, "Content-Type: application/offset+octet-stream", "", ""]).encode() + CONTENT[:1000])
+        connection.sendall(
+            "\r\n".join([*lines, "Content-Type: application/offset+octet-stream", "", ""]).encode() + CONTENT[:1000]
+        )
         assert connection.recv(100).startswith(b"HTTP/1.1 408")
     assert offset_of(client, upload) == 1000
 
@@ -276,7 +322,9 @@ def test_a_full_disk_is_a_507_and_keeps_what_was_acknowledged(client: httpx.Clie
     assert is_known(client, upload)
 
 
-def test_a_disk_without_room_for_one_more_file_is_a_507_and_hangs_nobody(client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_room_for_one_more_file_is_a_507_and_hangs_nobody(
+    client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads: list[str] = []
 
     def truncate(_descriptor: int, _size: int) -> None:
@@ -293,7 +341,9 @@ def test_a_disk_without_room_for_one_more_file_is_a_507_and_hangs_nobody(client:
 def test_disk_promised_to_open_captures_is_not_promised_twice(client: httpx.Client, world: World) -> None:
     world.free_bytes = 2 * (2 + len(CONTENT)) + 9
     announce(client, CONTENTS)
-    other: dict[str, Any] = {"files": [{"path": "capture.json", "bytes": 2 + len(CONTENT), "sha256": hashlib.sha256(b"other").hexdigest()}]}
+    other: dict[str, Any] = {
+        "files": [{"path": "capture.json", "bytes": 2 + len(CONTENT), "sha256": hashlib.sha256(b"other").hexdigest()}]
+    }
     assert client.post("/v1/captures", json=other).json()["code"] == "disk-full"
     world.free_bytes += 1
     assert client.post("/v1/captures", json=other).status_code == 201
@@ -317,7 +367,9 @@ def test_bytes_that_the_disk_lost_are_asked_for_again(client: httpx.Client, uplo
     assert is_known(client, upload)
 
 
-def test_a_whole_file_that_was_never_verified_is_verified_by_an_empty_request(client: httpx.Client, upload: str, tmp_path: Path) -> None:
+def test_a_whole_file_that_was_never_verified_is_verified_by_an_empty_request(
+    client: httpx.Client, upload: str, tmp_path: Path
+) -> None:
     patch(client, upload, 0, CONTENT[:-1])
     (partial,) = (path for path in (tmp_path / "partial").rglob("*") if path.is_file())
     partial.write_bytes(CONTENT)
@@ -332,7 +384,9 @@ def test_a_whole_file_that_was_never_verified_is_verified_by_an_empty_request(cl
     assert is_known(client, upload)
 
 
-def test_a_long_request_is_recorded_before_it_ends(client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_request_is_recorded_before_it_ends(
+    client: httpx.Client, upload: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.api.captures.receiving.BLOCK_BYTES", 256)
     monkeypatch.setattr("services.api.captures.receiving.RECORD_BYTES", 1024)
     may_end = threading.Event()

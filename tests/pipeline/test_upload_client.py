@@ -50,7 +50,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def wanted(folder: Path) -> dict[str, bytes]:
-    return {path: content for path, content in contents_of(folder).items() if path not in {"notes.txt", ".hidden", "link.npy"}}
+    return {
+        path: content
+        for path, content in contents_of(folder).items()
+        if path not in {"notes.txt", ".hidden", "link.npy"}
+    }
 
 
 def test_a_folder_is_uploaded_once(server: httpx.Client, folder: Path, data: Path) -> None:
@@ -82,7 +86,11 @@ def test_a_server_that_never_comes_back_is_a_sentence(server: httpx.Client, fold
     assert server.base_url.port is not None
     cuts = [3 * 2**20 + number for number in range(1000)]
     told = "repeat this command, what was sent is kept"
-    with cutting(server.base_url.port, cuts) as proxy, Client(proxy.address) as client, pytest.raises(PlatformError, match=told):
+    with (
+        cutting(server.base_url.port, cuts) as proxy,
+        Client(proxy.address) as client,
+        pytest.raises(PlatformError, match=told),
+    ):
         client.run(Uploader(proxy.address, patience_s=1.0).upload(folder))
 
 
@@ -101,7 +109,10 @@ def test_a_folder_that_is_no_capture_is_refused_before_anything_is_sent(server: 
 
 def test_an_image_with_metadata_never_leaves_this_machine(server: httpx.Client, folder: Path) -> None:
     (folder / "beauty.png").write_bytes(told_png())
-    with Client(str(server.base_url)) as client, pytest.raises(UploadError, match=r"^Image beauty\.png carries metadata \(eXIf"):
+    with (
+        Client(str(server.base_url)) as client,
+        pytest.raises(UploadError, match=r"^Image beauty\.png carries metadata \(eXIf"),
+    ):
         client.upload(folder)
     assert server.get("/v1/captures").json()["captures"] == []
 

@@ -75,7 +75,10 @@ def test_only_the_newest_fit_of_a_job_that_has_succeeded_counts(server: httpx.Cl
 
     def run_again(_spec: JobSpec, _folder: Path, events: EventAddress) -> None:
         with events.open() as log:
-            log.append(log.begin_stage("fit"), StageEvent(stage="fit", kind="finished", data={VERDICT: next(fits).model_dump(mode="json")}))
+            log.append(
+                log.begin_stage("fit"),
+                StageEvent(stage="fit", kind="finished", data={VERDICT: next(fits).model_dump(mode="json")}),
+            )
 
     settings = ServerSettings(data=tmp_path)
     with serving(create_app(settings, run_again)) as client:
@@ -114,7 +117,9 @@ def test_submit_tells_it_with_its_exit_status(server: httpx.Client, tmp_path: Pa
 
 @pytest.mark.parametrize(("judged", "status"), [(GOOD, 0), (BAD, NOT_CONVERGED_STATUS), (None, 0)])
 @pytest.mark.parametrize("as_json", [False, True])
-def test_a_run_without_a_server_tells_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: Verdict | None, status: int, as_json: bool) -> None:
+def test_a_run_without_a_server_tells_it_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: Verdict | None, status: int, as_json: bool
+) -> None:
     asset = AssetManifest(files=(), held_out_error=0.2, converged=judged is not BAD, verdict=judged)
     monkeypatch.setattr("services.pipeline.stages.run_job", lambda *_: asset)
     (job := tmp_path / "JOB.toml").write_text(f'capture = "{tmp_path / "capture"}"\n')
@@ -123,7 +128,11 @@ def test_a_run_without_a_server_tells_it_too(tmp_path: Path, monkeypatch: pytest
     if as_json:
         assert json.loads(told)[VERDICT] == (None if judged is None else judged.model_dump(mode="json"))
     else:
-        shown = {None: "held-out error: 20.00 %", GOOD.headline: "held-out error: 4.0 ± 1.2 %", BAD.headline: "held-out error: 33.6 ± 1.2 %"}
+        shown = {
+            None: "held-out error: 20.00 %",
+            GOOD.headline: "held-out error: 4.0 ± 1.2 %",
+            BAD.headline: "held-out error: 33.6 ± 1.2 %",
+        }
         assert told.splitlines()[0] == shown[None if judged is None else judged.headline]
     if judged is not None:
         assert judged.headline in said

@@ -26,9 +26,20 @@ from tests.support.uploading import write_capture
 @pytest.fixture
 def cluster() -> Iterator[LocalCluster]:
     # The worker lives in the tests' own process, which may hold more than the limit that is told: so it is not acted upon.
-    unlimited = dict.fromkeys((f"distributed.worker.memory.{act}" for act in ("target", "spill", "pause", "terminate")), False)
-    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp", "dashboard_address": "127.0.0.1:0", "memory_limit": "1 GiB"}
-    as_if_alone = unlimited | {"distributed.worker.preload": []}  # which every connection of a server leaves for its process
+    unlimited = dict.fromkeys(
+        (f"distributed.worker.memory.{act}" for act in ("target", "spill", "pause", "terminate")), False
+    )
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 1,
+        "processes": False,
+        "protocol": "tcp",
+        "dashboard_address": "127.0.0.1:0",
+        "memory_limit": "1 GiB",
+    }
+    as_if_alone = unlimited | {
+        "distributed.worker.preload": []
+    }  # which every connection of a server leaves for its process
     with dask.config.set(as_if_alone), LocalCluster(**options, resources={"DOME": 1}) as cluster:
         yield cluster
 
@@ -64,7 +75,9 @@ def test_workers_tell_what_they_do(tmp_path: Path, cluster: LocalCluster) -> Non
         assert http.get("/v1/workers").status_code == 503
 
 
-def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_collected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("services.pipeline.workers.CONNECT_S", 0.1)
     workers, frozen = Workers("tcp://127.0.0.1:1"), []
     for _ in range(3):
@@ -76,5 +89,13 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_co
 
 
 def test_workers_that_were_not_started_are_not_told_of(tmp_path: Path) -> None:
-    with serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as http, Client(str(http.base_url)) as client:
-        assert client.workers() == {"workers": [], "sentence": "Workers start with the next job.", "succeeded_last_hour": 0, "succeeded_last_day": 0}
+    with (
+        serving(create_app(ServerSettings(data=tmp_path), lambda *_: None)) as http,
+        Client(str(http.base_url)) as client,
+    ):
+        assert client.workers() == {
+            "workers": [],
+            "sentence": "Workers start with the next job.",
+            "succeeded_last_hour": 0,
+            "succeeded_last_day": 0,
+        }

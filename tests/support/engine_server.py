@@ -23,10 +23,14 @@ MEMORY_BYTES = 1200 * MIB
 @contextmanager
 def engine_server(data: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
     """Such a server as a process of its own."""
-    with running_server([sys.executable, "-m", "tests.support.engine_server", json.dumps({"data": str(data), "port": 0})]) as running:
+    with running_server(
+        [sys.executable, "-m", "tests.support.engine_server", json.dumps({"data": str(data), "port": 0})]
+    ) as running:
         yield running
 
 
 if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_RSS, (MEMORY_BYTES, MEMORY_BYTES))  # the system knows no such limit, Dask shares it out among the processors
+    resource.setrlimit(
+        resource.RLIMIT_RSS, (MEMORY_BYTES, MEMORY_BYTES)
+    )  # the system knows no such limit, Dask shares it out among the processors
     main(ServerSettings.model_validate_json(sys.argv[1]), "tests.support.engine_stages")

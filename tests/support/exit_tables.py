@@ -57,7 +57,9 @@ def angular_cases(relative_tolerance: float) -> list[ExitCase]:
         cosines = tuple(sorted({float(row["mu_exit"]) for row in rows}))
         values = np.full((1 + len(cosines), 2), UNKNOWN)
         for row in rows:
-            values[1 + cosines.index(float(row["mu_exit"])), "RT".index(row["side"])] = float(row["pi_L_recomputed"]) / math.pi
+            values[1 + cosines.index(float(row["mu_exit"])), "RT".index(row["side"])] = (
+                float(row["pi_L_recomputed"]) / math.pi
+            )
         layer = Layer(sigma=1, alpha=float(a), g1=float(g), thickness_mm=float(tau))
         options = {"mu_incident": float(mu), "exit_cosines": cosines}
         cases.append(ExitCase(f"a={a} g={g} tau={tau} mu={mu}", layer, options, values, relative_tolerance * values))

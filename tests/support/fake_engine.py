@@ -46,7 +46,9 @@ class FakeEngine:
         sigma = NOISE / np.sqrt(samples) * truth
         return StackEstimate(truth + sigma * self._normal(view, seed, 0), sigma**2)
 
-    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
+    def jacobian(
+        self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4
+    ) -> JacobianEstimate:
         image = self.images(tissue, view, samples=samples, seed=seed)
         rows = []
         for k, name in enumerate(names):
@@ -55,15 +57,23 @@ class FakeEngine:
             exact = (high - low) / (2 * step)
             scale = SCORE_NOISE * np.abs(exact).mean() / np.sqrt(samples)
             rows.append((exact + scale * self._normal(view, seed, k + 1), np.full(exact.shape, scale**2)))
-        return JacobianEstimate(names, image.mean, image.variance, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
+        return JacobianEstimate(
+            names, image.mean, image.variance, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
+        )
 
-    def stain_gradient(self, tissue: Tissue, view: View, cotangent: Array, *, samples: int, seed: int, batches: int = 16) -> StainGradient:
+    def stain_gradient(
+        self, tissue: Tissue, view: View, cotangent: Array, *, samples: int, seed: int, batches: int = 16
+    ) -> StainGradient:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
         assert tissue.stain is not None
         light = (np.asarray(cotangent) * image).sum(axis=0)
         texels, shares = self._texels(view, tissue.stain)
         values = tissue.stain.transmittance.reshape(-1)
-        out = np.bincount(texels.reshape(-1), (shares * (light / (shares * values[texels]).sum(axis=1))[:, None]).reshape(-1), values.size)
+        out = np.bincount(
+            texels.reshape(-1),
+            (shares * (light / (shares * values[texels]).sum(axis=1))[:, None]).reshape(-1),
+            values.size,
+        )
         entry = light.sum() / values.sum()
         gradient = (out + entry).reshape(tissue.stain.transmittance.shape)
         return StainGradient((gradient,), (np.zeros_like(gradient),), samples)
@@ -76,14 +86,19 @@ class FakeEngine:
         middle = uv[(37 * x + 101 * y) % len(uv)].mean(axis=1)
         return bilinear_texels(middle, (stain.transmittance.shape[0], stain.transmittance.shape[1]))
 
-    def order_images(self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1) -> Array:
+    def order_images(
+        self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1
+    ) -> Array:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
         # Shares of the orders whose power series in the albedo follows the formula's mean image.
         alphas = 1 - np.logspace(-4, -0.7, 40)
         whites = [replace(medium, alpha=1.0) for medium in (tissue.enamel, tissue.dentin)]
         white = self._formula(Tissue(*whites, tissue.shape), view)
         image = image * white / self._formula(tissue, view)
-        grey = [self._formula(Tissue(*(replace(m, alpha=a) for m in whites), tissue.shape), view).mean() / white.mean() for a in alphas]
+        grey = [
+            self._formula(Tissue(*(replace(m, alpha=a) for m in whites), tissue.shape), view).mean() / white.mean()
+            for a in alphas
+        ]
         powers = bin_powers(alphas, bin_edges)
         share = np.linalg.solve(powers.T @ powers + 1e-6 * np.eye(len(bin_edges) - 1), powers.T @ np.array(grey))
         return share[:, None, None] / share.sum() * image
@@ -112,7 +127,10 @@ class FakeEngine:
         return image
 
     def _normal(self, view: View, seed: int, stream: int) -> Array:
-        own, shared = self._numbers(view, seed, stream, by_light=True), self._numbers(view, seed, stream, by_light=False)
+        own, shared = (
+            self._numbers(view, seed, stream, by_light=True),
+            self._numbers(view, seed, stream, by_light=False),
+        )
         return np.sqrt(1 - self.shared_noise) * own + np.sqrt(self.shared_noise) * shared if self.shared_noise else own
 
     def _numbers(self, view: View, seed: int, stream: int, *, by_light: bool) -> Array:
@@ -152,7 +170,9 @@ class Slowly(FakeEngine):
         time.sleep(0.01)
         return super().images(tissue, view, samples=samples, seed=seed)
 
-    def jacobian(self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4) -> JacobianEstimate:
+    def jacobian(
+        self, tissue: Tissue, view: View, names: tuple[str, ...], *, samples: int, seed: int, batches: int = 4
+    ) -> JacobianEstimate:
         time.sleep(0.02)
         return super().jacobian(tissue, view, names, samples=samples, seed=seed)
 

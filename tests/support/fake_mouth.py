@@ -26,8 +26,15 @@ class FakeMouthEngine(FakeEngine):
             return super()._formula(tissue, view)
         shown = self._shown(view)
         by_tooth = np.stack([super(FakeMouthEngine, self)._formula(tooth, view) for tooth in tissue.teeth])
-        image = np.take_along_axis(by_tooth, np.broadcast_to(np.minimum(shown, len(by_tooth) - 1), by_tooth.shape[1:])[None], axis=0)[0]
-        gums = 0.05 if tissue.gums is None else tissue.gums.alpha_reduced**1.5 * (1 - np.exp(-tissue.gums.sigma_s_reduced * (0.3 + view.pixels[:, 0] / 40)))
+        image = np.take_along_axis(
+            by_tooth, np.broadcast_to(np.minimum(shown, len(by_tooth) - 1), by_tooth.shape[1:])[None], axis=0
+        )[0]
+        gums = (
+            0.05
+            if tissue.gums is None
+            else tissue.gums.alpha_reduced**1.5
+            * (1 - np.exp(-tissue.gums.sigma_s_reduced * (0.3 + view.pixels[:, 0] / 40)))
+        )
         wall = 0.1 * (tissue.reflectance or 0.0) * np.cos(view.pixels[:, 1] / 9.0) ** 2
         return np.asarray(np.where(shown < len(by_tooth), image, gums) + wall)
 

@@ -24,7 +24,14 @@ from services.fit.stage import run
 from tests.support.prepared import FAKE, write_prepared
 
 STORED = Path(__file__).parents[1] / "data" / "numerics.npz"
-FIT_OPTIONS = {"boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 128, "max_steps": 4, "search_candidates": 500}
+FIT_OPTIONS = {
+    "boundary": "matched",
+    "dentin": "known",
+    "samples_per_pixel": 64,
+    "max_samples_per_pixel": 128,
+    "max_steps": 4,
+    "search_candidates": 500,
+}
 PASSING = frozenset({"begun", "seconds"})
 """Recorded, but no numerics."""
 
@@ -38,7 +45,10 @@ def renders() -> dict[str, NDArray[np.float32]]:
     found = {}
     for boundary in get_args(Boundary):
         result = picture(Engine(stained_recipe(boundary), 2))
-        found |= {f"render/{boundary}/{field.name}": getattr(result, field.name).astype(np.float32) for field in fields(Picture)}
+        found |= {
+            f"render/{boundary}/{field.name}": getattr(result, field.name).astype(np.float32)
+            for field in fields(Picture)
+        }
     return found
 
 

@@ -25,7 +25,9 @@ def make_deed() -> AuditedAction:
     return AuditedAction("test", "command line", "local")
 
 
-def make_token(data: Path, name: str, *scopes: Scope, database: str | None = None, group: str | None = DEFAULT_GROUP) -> str:
+def make_token(
+    data: Path, name: str, *scopes: Scope, database: str | None = None, group: str | None = DEFAULT_GROUP
+) -> str:
     """A new token on a data folder, as ``dentine token create --group`` makes it."""
     engine = open_database(database or ServerSettings(data=data).database_url)
     try:

@@ -28,7 +28,17 @@ def build_wheel(folder: Path, added: Mapping[str, str] = MappingProxyType({})) -
             shutil.copy(source, tree)
     for path, text in added.items():
         (tree / path).write_text(text)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder / "wheel"), str(tree)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(folder / "wheel"),
+        str(tree),
+    ]
     subprocess.run(command, check=True, cwd=folder)
     (wheel,) = (folder / "wheel").glob("*.whl")
     return wheel

@@ -70,9 +70,15 @@ def read_jaw_truth(stored: Path = STORED) -> JawTruth:
     """Read the images, and build the jaw that they show."""
     jaw = jaw_surfaces(SUBJECT)
     with np.load(stored) as arrays:
-        assert np.allclose(arrays["moments"], _moments(jaw), rtol=1e-6), f"the phantom jaw is not the one of {stored.name}; render it again"
-        mean, error = ([arrays[f"{kind}_{k}"].astype(np.float64) for k in range(CAMERAS)] for kind in ("mean", "standard_error"))
-    return JawTruth(jaw, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights(), tuple(mean), tuple(one**2 for one in error))
+        assert np.allclose(arrays["moments"], _moments(jaw), rtol=1e-6), (
+            f"the phantom jaw is not the one of {stored.name}; render it again"
+        )
+        mean, error = (
+            [arrays[f"{kind}_{k}"].astype(np.float64) for k in range(CAMERAS)] for kind in ("mean", "standard_error")
+        )
+    return JawTruth(
+        jaw, known_mouth(jaw, CHANNEL, SUBJECT), cameras(jaw), lights(), tuple(mean), tuple(one**2 for one in error)
+    )
 
 
 def by_engine(truth: JawTruth, samples: int) -> JawTruth:
@@ -100,11 +106,21 @@ def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool 
     for camera, mean, variance in zip(truth.cameras, truth.mean, truth.variance, strict=True):
         sensor = (NOISE_RELATIVE * mean) ** 2 + (NOISE_FLOOR * mean.max(axis=(1, 2), keepdims=True)) ** 2
         noisy = mean + np.sqrt(sensor) * random.standard_normal(mean.shape)
-        entries += write_images(folder, camera, truth.lights, noisy[..., None], (sensor + _of_neighbours(variance))[..., None], kept)
-    jaw = truth.jaw if dentin else JawSurfaces(tuple(type(tooth)(tooth.fdi, tooth.outer) for tooth in truth.jaw.teeth), truth.jaw.gums, truth.jaw.cavity)
+        entries += write_images(
+            folder, camera, truth.lights, noisy[..., None], (sensor + _of_neighbours(variance))[..., None], kept
+        )
+    jaw = (
+        truth.jaw
+        if dentin
+        else JawSurfaces(
+            tuple(type(tooth)(tooth.fdi, tooth.outer) for tooth in truth.jaw.teeth), truth.jaw.gums, truth.jaw.cavity
+        )
+    )
     write_jaw_meshes(folder, jaw)
     known = jaw_truth(truth.jaw, {CHANNEL: truth.mouth}, "matched")
-    write_description(folder, (CHANNEL,), truth.cameras, truth.lights, entries, known | {"subject": SUBJECT, "renderer": "mitsuba"})
+    write_description(
+        folder, (CHANNEL,), truth.cameras, truth.lights, entries, known | {"subject": SUBJECT, "renderer": "mitsuba"}
+    )
 
 
 def _of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -113,7 +129,9 @@ def _of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
 
     width = 2 * NEIGHBOURS_PX + 1
     lit = variance > 0
-    total, count = (uniform_filter(array, (0, width, width), mode="constant") * width**2 for array in (variance, lit.astype(float)))
+    total, count = (
+        uniform_filter(array, (0, width, width), mode="constant") * width**2 for array in (variance, lit.astype(float))
+    )
     others, number = np.maximum(total - variance, 0.0), np.round(count - lit)
     return np.where(number > 0, others / np.maximum(number, 1), 0.0)
 

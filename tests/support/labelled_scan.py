@@ -99,8 +99,18 @@ def write_vtp(
 
 def write_labelled_ply(path: Path, mesh: Mesh, labels: NDArray[np.int64]) -> None:
     """An ascii PLY with a label per face."""
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices_mm)}", *(f"property double {axis}" for axis in "xyz")]
-    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label", "end_header"]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(mesh.vertices_mm)}",
+        *(f"property double {axis}" for axis in "xyz"),
+    ]
+    lines += [
+        f"element face {len(mesh.faces)}",
+        "property list uchar int vertex_indices",
+        "property int label",
+        "end_header",
+    ]
     lines += [" ".join(map(repr, row)) for row in mesh.vertices_mm.tolist()]
     lines += [f"3 {a} {b} {c} {label}" for (a, b, c), label in zip(mesh.faces.tolist(), labels.tolist(), strict=True)]
     path.write_text("\n".join(lines) + "\n")

@@ -57,7 +57,10 @@ def toy_server(
 
 @contextmanager
 def running_server(
-    command: list[str], log: IO[str] | None = None, cwd: Path = Path(__file__).parents[2], environment: Mapping[str, str] | None = None
+    command: list[str],
+    log: IO[str] | None = None,
+    cwd: Path = Path(__file__).parents[2],
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
     """A server as a process of its own, which tells its address in its first line."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=cwd, env=environment) as process:

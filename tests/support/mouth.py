@@ -15,7 +15,10 @@ from services.core.store import write_record
 
 
 def write_mouth(
-    folder: Path, lights: int = 6, sizes: tuple[tuple[int, int], ...] = ((24, 18), (20, 16)), channels: tuple[str, ...] = ("red", "green", "blue")
+    folder: Path,
+    lights: int = 6,
+    sizes: tuple[tuple[int, int], ...] = ((24, 18), (20, 16)),
+    channels: tuple[str, ...] = ("red", "green", "blue"),
 ) -> FolderCapture:
     """Write ``capture.json``, smooth images of distinct brightness per light and channel, and one round tooth, FDI 11."""
     cameras = tuple(
@@ -27,15 +30,23 @@ def write_mouth(
         )
         for i, size in enumerate(sizes)
     )
-    rig = tuple(Light(name=f"l{j}", position_mm=(10.0 * j, 0, -1000), intensity=(1e6,) * len(channels)) for j in range(lights))
-    images = tuple(ImageEntry(camera=f"c{i}", light=f"l{j}", file=f"c{i}_l{j}.npy") for i in range(len(sizes)) for j in range(lights))
+    rig = tuple(
+        Light(name=f"l{j}", position_mm=(10.0 * j, 0, -1000), intensity=(1e6,) * len(channels)) for j in range(lights)
+    )
+    images = tuple(
+        ImageEntry(camera=f"c{i}", light=f"l{j}", file=f"c{i}_l{j}.npy")
+        for i in range(len(sizes))
+        for j in range(lights)
+    )
     description = FolderCapture(units="mm", channels=channels, cameras=cameras, lights=rig, images=images)
     folder.mkdir(parents=True, exist_ok=True)
     for i, (width, height) in enumerate(sizes):
         for j in range(lights):
             np.save(folder / f"c{i}_l{j}.npy", smooth_image(width, height, len(channels), i, j))
     ball = trimesh.creation.icosphere(subdivisions=1, radius=4.0)
-    write_mesh(folder / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32)))
+    write_mesh(
+        folder / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
+    )
     write_record(folder / "capture.json", description)
     return description
 

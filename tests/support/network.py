@@ -52,7 +52,9 @@ class Network:
 
     def inside(self, host: str) -> list[str]:
         """What comes before a command that is to run on a host."""
-        return [] if host == HERE else ["nsenter", f"--net=/run/netns/{self._space(host)}"]  # not ip netns exec, which takes a view of the disks along
+        return (
+            [] if host == HERE else ["nsenter", f"--net=/run/netns/{self._space(host)}"]
+        )  # not ip netns exec, which takes a view of the disks along
 
     def cut(self, one: str, other: str) -> None:
         """Let nothing through between two hosts, without a word to either: what they send goes to a hardware address that nobody has."""
@@ -65,7 +67,18 @@ class Network:
             _ip(*self._table(near), "neigh", "delete", self.address(far), "dev", self._device(near))
 
     def _misdirect(self, near: str, far: str) -> None:
-        _ip(*self._table(near), "neigh", "replace", self.address(far), "lladdr", NOBODY, "nud", "permanent", "dev", self._device(near))
+        _ip(
+            *self._table(near),
+            "neigh",
+            "replace",
+            self.address(far),
+            "lladdr",
+            NOBODY,
+            "nud",
+            "permanent",
+            "dev",
+            self._device(near),
+        )
 
     def _table(self, host: str) -> list[str]:
         return [] if host == HERE else ["-n", self._space(host)]

@@ -22,6 +22,15 @@ def remember_runs(data: Path, capture: str, totals_s: Iterable[float]) -> None:
         for number, total_s in enumerate(totals_s):
             reached_s = {"prepare": [0.05] * 10, "fit": [0.1] * 6 + [total_s] * 4, "export": [total_s] * 10}
             course = Course.model_validate({"machine": machine_class(), "reached_s": reached_s, "total_s": total_s})
-            row = {"job": f"past-{number}", "ended_s": float(number), "method": method_of(spec), "machine": machine_class()}
-            connection.execute(past_run_table.insert().values(row | {"size": size.model_dump_json(), "course": course.model_dump_json()}))
+            row = {
+                "job": f"past-{number}",
+                "ended_s": float(number),
+                "method": method_of(spec),
+                "machine": machine_class(),
+            }
+            connection.execute(
+                past_run_table.insert().values(
+                    row | {"size": size.model_dump_json(), "course": course.model_dump_json()}
+                )
+            )
     engine.dispose()

@@ -16,7 +16,9 @@ from tests.support.z_scores import rms_bounds, student_to_normal
 BATCHES = 16
 
 
-def pixel_scores(means: list[NDArray[np.float64]], variances: list[NDArray[np.float64]], block: int = 1) -> NDArray[np.float64]:
+def pixel_scores(
+    means: list[NDArray[np.float64]], variances: list[NDArray[np.float64]], block: int = 1
+) -> NDArray[np.float64]:
     """z of two sides' images (lights, H, W), summed over blocks of pixels, NaN where unlit; variances are of means over BATCHES."""
     means = [sum_blocks(mean, block) for mean in means]
     squares = [sum_blocks(variance**2, block) for variance in variances]

@@ -74,7 +74,10 @@ class PostgresServer:
     def _run(self, program: str, *arguments: str) -> None:
         command, options = [str(self._programs / program), "--pgdata", str(self._data), *arguments], self._as_user
         if self._inside:  # only the superuser enters a namespace
-            command, options = [*self._inside, "setpriv", "--reuid", USER, "--regid", USER, "--clear-groups", *command], {}
+            command, options = (
+                [*self._inside, "setpriv", "--reuid", USER, "--regid", USER, "--clear-groups", *command],
+                {},
+            )
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=self._folder, **options)
 
 

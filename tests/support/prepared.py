@@ -29,7 +29,9 @@ def sphere(radius_mm: float) -> Mesh:
 
 
 def lights(count: int = 6) -> tuple[Light, ...]:
-    return tuple(Light(name=f"l{k}", position_mm=(140.0 * k - 300.0, 300.0, -700.0), intensity=(1e6,)) for k in range(count))
+    return tuple(
+        Light(name=f"l{k}", position_mm=(140.0 * k - 300.0, 300.0, -700.0), intensity=(1e6,)) for k in range(count)
+    )
 
 
 def camera(name: str) -> Camera:
@@ -70,16 +72,24 @@ def write_prepared(
     axes = ("camera", "light", "y", "x")
     store = writer.folder / "prepared.zarr"
     radiance, variance = (
-        create_array(store, name, (*shape, len(channels)), (1, 1, height, width, len(channels)), "float32", (*axes, "channel"))
+        create_array(
+            store, name, (*shape, len(channels)), (1, 1, height, width, len(channels)), "float32", (*axes, "channel")
+        )
         for name in ("radiance", "variance")
     )
     valid = create_array(store, "valid", shape, (1, 1, height, width), "uint16", axes)
     y, x = (index.reshape(-1) for index in np.mgrid[:height, :width])
     dentin = DentinShape(sphere(3.0), np.zeros((len(truth.shape), 1, 3)))
-    recipe = single_tooth(sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6))
+    recipe = single_tooth(
+        sphere(4.0), dentin, np.array([light.position_mm for light in all_lights]), np.full(light_count, 1e6)
+    )
     recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=stain_uv),))
     for c, one in enumerate(cameras):
-        image = engine(recipe)._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32))).reshape(light_count, height, width, 1)
+        image = (
+            engine(recipe)
+            ._formula(truth, View(one, np.stack([x, y], -1).astype(np.int32)))
+            .reshape(light_count, height, width, 1)
+        )
         image = np.repeat(np.zeros_like(image) if dark else image, len(channels), axis=-1)
         image[::2] *= 1 + uneven
         image = np.where(rng.uniform(size=(*image.shape[:-1], 1)) < shadowed, 0.1 * image, image) if shadowed else image

@@ -46,7 +46,9 @@ def receiving(*answers: int, tls: ssl.SSLContext | None = None) -> Iterator[Rece
             if len(body) < length:
                 return  # the sender was stopped in the middle
             answer = receiver.answers.pop(0) if receiver.answers else 204
-            receiver.received.append(({name.lower(): value for name, value in self.headers.items()} | {":path": self.path}, body))
+            receiver.received.append(
+                ({name.lower(): value for name, value in self.headers.items()} | {":path": self.path}, body)
+            )
             if answer == 0:
                 receiver.let_go.wait(60)
                 return

@@ -29,16 +29,24 @@ def tooth_mesh(rings: int = 96) -> tuple[FloatArray, NDArray[np.int32]]:
     unit = direction * radius[:, None]
     ridge = 1 + 0.015 * np.cos(9 * unit[:, 0])
     thickness = 3.2 * (1 - 0.35 * unit[:, 2])
-    vertices = np.stack([4.2 * unit[:, 0] * (1 + 0.12 * unit[:, 2]), thickness * unit[:, 1] * ridge, 5.5 * unit[:, 2]], axis=1)
+    vertices = np.stack(
+        [4.2 * unit[:, 0] * (1 + 0.12 * unit[:, 2]), thickness * unit[:, 1] * ridge, 5.5 * unit[:, 2]], axis=1
+    )
     columns, rows = 2 * rings, rings - 1
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     upper, lower = i * columns + j, (i + 1) * columns + j
     upper_next, lower_next = i * columns + (j + 1) % columns, (i + 1) * columns + (j + 1) % columns
-    quads = [np.stack([upper, lower, upper_next], -1).reshape(-1, 3), np.stack([upper_next, lower, lower_next], -1).reshape(-1, 3)]
+    quads = [
+        np.stack([upper, lower, upper_next], -1).reshape(-1, 3),
+        np.stack([upper_next, lower, lower_next], -1).reshape(-1, 3),
+    ]
     ring = np.arange(columns)
     top, bottom = rows * columns, rows * columns + 1
     last = (rows - 1) * columns
-    caps = [np.stack([np.full(columns, top), ring, np.roll(ring, -1)], -1), np.stack([np.full(columns, bottom), last + np.roll(ring, -1), last + ring], -1)]
+    caps = [
+        np.stack([np.full(columns, top), ring, np.roll(ring, -1)], -1),
+        np.stack([np.full(columns, bottom), last + np.roll(ring, -1), last + ring], -1),
+    ]
     return vertices, np.concatenate([*quads, *caps]).astype(np.int32)
 
 
@@ -51,7 +59,9 @@ def tooth_colour(x: FloatArray, z: FloatArray) -> FloatArray:
         stain += np.cos(wave[0] * x + wave[1] * z + rng.uniform(0, 2 * np.pi)) / 60**0.5
     root = 1 / (1 + np.exp(0.8 * z + 1))
     level = 0.62 * (1 + 0.05 * stain) * (1 - 0.15 * root)
-    return level[..., None] * np.stack([np.ones_like(x), 0.94 - 0.05 * root, 0.82 - 0.12 * root - 0.02 * stain], axis=-1)
+    return level[..., None] * np.stack(
+        [np.ones_like(x), 0.94 - 0.05 * root, 0.82 - 0.12 * root - 0.02 * stain], axis=-1
+    )
 
 
 def camera_from_world(azimuth_deg: float, elevation_deg: float) -> FloatArray:
@@ -120,7 +130,9 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
                 "specular_reflectance": specular,
             }
         )
-        mesh = mi.Mesh("tooth", len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
+        mesh = mi.Mesh(
+            "tooth", len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties
+        )
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = (vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32).ravel()
         parameters["faces"] = faces.astype(np.uint32).ravel()
@@ -140,7 +152,14 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
             "to_world": mi.ScalarTransform4f(to_world),
             "near_clip": 1.0,
             "far_clip": 5000.0,
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"},
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
+            },
             "sampler": {"type": "independent", "sample_count": options.get("spp", 16)},
         }
         for light, time in options["frames"]:
@@ -149,8 +168,18 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
                 # Light by light, since choosing one light per sample at random would add noise; what is specular matters in light frames alone
                 image = np.zeros((height, width, 3), dtype=np.float32)
                 for k in [light] if light >= 0 else range(len(lights) if specular else 0):
-                    lamp = {"type": "point", "position": lights[k].tolist(), "intensity": {"type": "rgb", "value": intensity.tolist()}}
-                    scene = {"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor, "tooth": tooth(pose_now, specular), "lamp": lamp}
+                    lamp = {
+                        "type": "point",
+                        "position": lights[k].tolist(),
+                        "intensity": {"type": "rgb", "value": intensity.tolist()},
+                    }
+                    scene = {
+                        "type": "scene",
+                        "integrator": {"type": "direct"},
+                        "sensor": sensor,
+                        "tooth": tooth(pose_now, specular),
+                        "lamp": lamp,
+                    }
                     image += np.array(mi.render(mi.load_dict(scene), seed=11))
                 images.append(image)
     shape = (len(poses), len(options["frames"]), height, width, 3)

@@ -44,7 +44,8 @@ class RenderedTooth:
         shape, axes = (len(self.cameras), lights, height, width), ("camera", "light", "y", "x")
         store = writer.folder / "prepared.zarr"
         radiance, variance = (
-            create_array(store, name, (*shape, 1), (1, 1, height, width, 1), "float32", (*axes, "channel")) for name in ("radiance", "variance")
+            create_array(store, name, (*shape, 1), (1, 1, height, width, 1), "float32", (*axes, "channel"))
+            for name in ("radiance", "variance")
         )
         valid = create_array(store, "valid", shape, (1, 1, height, width), "uint16", axes)
         for c, (image, rendered) in enumerate(zip(self.images, self.variances, strict=True)):
@@ -63,7 +64,9 @@ class RenderedTooth:
                 cameras=self.cameras,
                 lights=tuple(
                     Light(name=f"l{k}", position_mm=(float(p[0]), float(p[1]), float(p[2])), intensity=(float(i),))
-                    for k, (p, i) in enumerate(zip(self.recipe.light_positions_mm, self.recipe.light_intensities, strict=True))
+                    for k, (p, i) in enumerate(
+                        zip(self.recipe.light_positions_mm, self.recipe.light_intensities, strict=True)
+                    )
                 ),
                 held_out=tuple((camera.name, f"l{lights - 1}") for camera in self.cameras),
                 fdi=(11,),
@@ -84,5 +87,7 @@ def rendered_tooth(tissue: Tissue, *, samples: int, seed: int, pixels: int = 10,
     recipe = single_tooth(ellipsoid(SEMI_AXES_MM), dentin, lights, np.full(len(lights), INTENSITY))
     engine = Engine(recipe)
     stacks = [engine.images(tissue, whole_view(camera), samples=samples, seed=seed) for camera in cameras]
-    images, variances = ([getattr(s, part).reshape(-1, pixels, pixels) for s in stacks] for part in ("mean", "variance"))
+    images, variances = (
+        [getattr(s, part).reshape(-1, pixels, pixels) for s in stacks] for part in ("mean", "variance")
+    )
     return RenderedTooth(cameras, recipe, tuple(images), tuple(variances))

@@ -29,7 +29,15 @@ class Rendered:
 
 
 def write_capture(
-    root: Path, rendered: Rendered, *, seed: int = 5, bits: int = 12, black: int = 64, relative: float = 0.01, floor: float = 0.002, peak: float | None = None
+    root: Path,
+    rendered: Rendered,
+    *,
+    seed: int = 5,
+    bits: int = 12,
+    black: int = 64,
+    relative: float = 0.01,
+    floor: float = 0.002,
+    peak: float | None = None,
 ) -> CaptureManifest:
     """Publish ``root/capture``; radiance ``peak`` (default: the brightest under one light) sits at 0.7 of the range above black."""
     rng = np.random.default_rng(seed)
@@ -58,11 +66,21 @@ def write_capture(
             array[camera, index] = np.clip(np.rint(noisy), 0, full_scale).astype(np.uint16)
         light = rendered.lights[what[0]].name if what is not None and what[0] >= 0 else None
         table.append(
-            FrameRecord(index=index, kind=kind, light=light, exposure_s=EXPOSURE_S, level=level, time_s=index * 0.06, readback=(round(level * 65535),) * 3)
+            FrameRecord(
+                index=index,
+                kind=kind,
+                light=light,
+                exposure_s=EXPOSURE_S,
+                level=level,
+                time_s=index * 0.06,
+                readback=(round(level * 65535),) * 3,
+            )
         )
     write_mesh(teeth_folder(writer.folder, 11) / "outer.ply", rendered.mesh)
     manifest = CaptureManifest(
-        description=FolderCapture(units="mm", channels=rendered.channels, cameras=rendered.cameras, lights=rendered.lights),
+        description=FolderCapture(
+            units="mm", channels=rendered.channels, cameras=rendered.cameras, lights=rendered.lights
+        ),
         frames=tuple(table),
         bits=bits,
         black_level=black,

@@ -29,10 +29,14 @@ class Refusal(importlib.abc.MetaPathFinder):
     def __init__(self, extras: Iterable[str]) -> None:
         allowed = distributions(extras)
         providers = importlib.metadata.packages_distributions()
-        self._refused = {package for package, names in providers.items() if not {normal(name) for name in names} & allowed}
+        self._refused = {
+            package for package, names in providers.items() if not {normal(name) for name in names} & allowed
+        }
         self._refused -= {"services", "tests", *sys.stdlib_module_names}
 
-    def find_spec(self, fullname: str, _path: Sequence[str] | None, _target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, _path: Sequence[str] | None, _target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         """Raise for what is refused, and leave the rest to the other finders."""
         if fullname.partition(".")[0] in self._refused:
             raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)

@@ -46,7 +46,16 @@ ROLES: Mapping[str, Role] = {
     "worker": Role(("worker",), _WORKER),
     "rig": Role(("worker", "capture"), (*_WORKER, "services.capture.stage")),
     "dome": Role(("capture",), (*_COMMANDS, "services.cli.dome_sim", "services.capture.dome.simulator")),
-    "client": Role((), (*_COMMANDS, "services.cli.client.submit", "services.cli.client.jobs", "services.cli.client.delete", "services.cli.client.download")),
+    "client": Role(
+        (),
+        (
+            *_COMMANDS,
+            "services.cli.client.submit",
+            "services.cli.client.jobs",
+            "services.cli.client.delete",
+            "services.cli.client.download",
+        ),
+    ),
 }
 
 

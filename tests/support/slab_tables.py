@@ -86,10 +86,22 @@ def derivative_cases() -> list[SlabCase]:
     for name, rows in groups.items():
         layers = tuple(_layer(rows[0], number) for number in range(1, int(rows[0]["layers"]) + 1))
         for source in SOURCES:
-            values = [[float(rows[0][f"{side}_{source}"]) for side in "RT"]] + [[float(row[f"d{side}_{source}"]) for side in "RT"] for row in rows]
+            values = [[float(rows[0][f"{side}_{source}"]) for side in "RT"]] + [
+                [float(row[f"d{side}_{source}"]) for side in "RT"] for row in rows
+            ]
             # One layer of one lobe prints plain names; the order is the table's.
             names = ("sigma", "alpha", "g") if len(rows) == 3 else tuple(row["wrt"] for row in rows)
-            cases.append(SlabCase(f"{name} {source}", layers, BOUNDARIES[rows[0]["boundary"]], float(rows[0]["n"]), source, names, np.array(values)))
+            cases.append(
+                SlabCase(
+                    f"{name} {source}",
+                    layers,
+                    BOUNDARIES[rows[0]["boundary"]],
+                    float(rows[0]["n"]),
+                    source,
+                    names,
+                    np.array(values),
+                )
+            )
     return cases
 
 
@@ -98,13 +110,20 @@ def zero_cases() -> list[SlabCase]:
     cases = []
     for row in rows_of("boundary_zero_test.csv"):
         border, depth = float(row["c2_mm"]), float(row["depth_mm_T_below_1e-6"])
-        optics = {"alpha": float(row["alpha"]), "beta": float(row["beta"]), "g1": float(row["g1"]), "g2": float(row["g2"])}
+        optics = {
+            "alpha": float(row["alpha"]),
+            "beta": float(row["beta"]),
+            "g1": float(row["g1"]),
+            "g2": float(row["g2"]),
+        }
         layers = (
             Layer(sigma=float(row["sigma_top"]), thickness_mm=border, **optics),
             Layer(sigma=float(row["sigma_bottom"]), thickness_mm=depth - border, **optics),
         )
         values = np.array([[float(row["R_diffuse"]), 0.0], [0.0, 0.0]])
-        cases.append(SlabCase(row["case"], layers, BOUNDARIES[row["boundary"]], float(row["n"]), "diffuse", ("c",), values))
+        cases.append(
+            SlabCase(row["case"], layers, BOUNDARIES[row["boundary"]], float(row["n"]), "diffuse", ("c",), values)
+        )
     return cases
 
 
@@ -119,7 +138,12 @@ def _layer(row: dict[str, str], number: int) -> Layer:
 
     n = str(number)
     return Layer(
-        sigma=value("sigma" + n), alpha=value("alpha" + n), beta=value("beta" + n, 1.0), g1=value(f"g{n}a"), g2=value(f"g{n}b"), thickness_mm=value("d" + n)
+        sigma=value("sigma" + n),
+        alpha=value("alpha" + n),
+        beta=value("beta" + n, 1.0),
+        g1=value(f"g{n}a"),
+        g2=value(f"g{n}b"),
+        thickness_mm=value("d" + n),
     )
 
 

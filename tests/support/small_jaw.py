@@ -33,7 +33,13 @@ TRUE_TEETH: Mapping[int, Tissue] = {
     22: Tissue(Medium(4.5, 0.992, g1=0.8), Medium(13.0, 0.980, g1=0.8)),
 }
 TRUE_GUMS, TRUE_REFLECTANCE = Medium(7.0, 0.96, g1=0.8), 0.35
-LIGHTS_MM = ((0.0, 500.0, 300.0), (-450.0, 300.0, 100.0), (400.0, 350.0, -50.0), (150.0, 480.0, 250.0), (-250.0, 450.0, -100.0))
+LIGHTS_MM = (
+    (0.0, 500.0, 300.0),
+    (-450.0, 300.0, 100.0),
+    (400.0, 350.0, -50.0),
+    (150.0, 480.0, 250.0),
+    (-250.0, 450.0, -100.0),
+)
 HELD_OUT_LIGHT = 3
 SIZE, SPAN_MM = 30, 30.0
 """Pixels of 1 mm."""
@@ -104,7 +110,10 @@ def write_prepared_jaw(
     writer = StageWriter(root, "prepared", 1)
     shape = (2, len(LIGHTS_MM), SIZE, SIZE)
     store, axes = writer.folder / "prepared.zarr", ("camera", "light", "y", "x")
-    radiance, variance = (create_array(store, name, (*shape, 1), (1, 1, SIZE, SIZE, 1), "float32", (*axes, "channel")) for name in ("radiance", "variance"))
+    radiance, variance = (
+        create_array(store, name, (*shape, 1), (1, 1, SIZE, SIZE, 1), "float32", (*axes, "channel"))
+        for name in ("radiance", "variance")
+    )
     valid = create_array(store, "valid", shape, (1, 1, SIZE, SIZE), "uint16", axes)
     module, name = engine.split(":")
     renderer = getattr(importlib.import_module(module), name)(scene)

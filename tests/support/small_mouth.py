@@ -26,7 +26,10 @@ GUMS_RADIUS_MM, GUMS_DEPTH_MM = 4.0, 3.0
 IOR, GUMS_IOR = 1.631, 1.33
 LIGHTS_MM = np.array([[100, 500, 300], [-500, 250, 50.0]])
 MOUTH = Mouth(
-    (Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5)), Tissue(Medium(2.0, 0.9, 1.0, 0.4), Medium(1.0, 0.5))),
+    (
+        Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5)),
+        Tissue(Medium(2.0, 0.9, 1.0, 0.4), Medium(1.0, 0.5)),
+    ),
     Medium(2.5, 0.8, 1.0, 0.6),
     0.5,
 )
@@ -38,7 +41,11 @@ def revolved(semi_axes_mm: tuple[float, float], centre_mm: tuple[float, float, f
     polar = np.linspace(0, np.pi, ALONG + 1)[1:-1]
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
     rows = np.stack(
-        np.broadcast_arrays(radius * np.sin(polar)[:, None] * np.cos(turn), radius * np.sin(polar)[:, None] * np.sin(turn), height * np.cos(polar)[:, None]),
+        np.broadcast_arrays(
+            radius * np.sin(polar)[:, None] * np.cos(turn),
+            radius * np.sin(polar)[:, None] * np.sin(turn),
+            height * np.cos(polar)[:, None],
+        ),
         axis=-1,
     )
     vertices = np.concatenate([[[0, 0, height]], rows.reshape(-1, 3), [[0, 0, -height]]]) + centre_mm
@@ -47,7 +54,10 @@ def revolved(semi_axes_mm: tuple[float, float], centre_mm: tuple[float, float, f
     faces = [np.stack([0 * k, 1 + k, 1 + following], axis=1)]
     for row in range(ALONG - 2):
         upper, lower = 1 + row * AROUND, 1 + (row + 1) * AROUND
-        faces += [np.stack([upper + k, lower + k, lower + following], axis=1), np.stack([upper + k, lower + following, upper + following], axis=1)]
+        faces += [
+            np.stack([upper + k, lower + k, lower + following], axis=1),
+            np.stack([upper + k, lower + following, upper + following], axis=1),
+        ]
     bottom = 1 + (ALONG - 2) * AROUND
     faces.append(np.stack([bottom + k, 0 * k + last, bottom + following], axis=1))
     return Mesh(vertices, np.concatenate(faces).astype(np.int32))
@@ -73,7 +83,10 @@ def gums(hole_radius_mm: float = 0.0) -> Mesh:
         np.stack([AROUND + k, 0 * k + hub, AROUND + following], axis=1),
     ]
     if hole_radius_mm:
-        faces += [np.stack([first + k, k, following], axis=1), np.stack([first + k, following, first + following], axis=1)]
+        faces += [
+            np.stack([first + k, k, following], axis=1),
+            np.stack([first + k, following, first + following], axis=1),
+        ]
     else:
         faces.append(np.stack([0 * k + first, k, following], axis=1))
     return Mesh(vertices, np.concatenate(faces).astype(np.int32))
@@ -89,13 +102,18 @@ def mouth_recipe(boundary: Boundary) -> SceneRecipe:
     """The scene, whose solids overlap."""
     known = DentinShape.known(CORE)
     teeth = (ToothSurfaces(ROOTED, known), ToothSurfaces(FREE))
-    return SceneRecipe(teeth, LIGHTS_MM, np.full(2, INTENSITY), boundary, IOR, gums=gums(), gums_ior=GUMS_IOR, cavity=wall())
+    return SceneRecipe(
+        teeth, LIGHTS_MM, np.full(2, INTENSITY), boundary, IOR, gums=gums(), gums_ior=GUMS_IOR, cavity=wall()
+    )
 
 
 def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, samples: int) -> dict[str, Any]:
     """The same for stock Mitsuba, of surfaces that do not overlap."""
     height = ROOTED.vertices_mm[ROOTED.faces].mean(axis=1)[:, 2]
-    parts = {"crown": Mesh(ROOTED.vertices_mm, ROOTED.faces[height > 0]), "root": Mesh(ROOTED.vertices_mm, ROOTED.faces[height < 0])}
+    parts = {
+        "crown": Mesh(ROOTED.vertices_mm, ROOTED.faces[height > 0]),
+        "root": Mesh(ROOTED.vertices_mm, ROOTED.faces[height < 0]),
+    }
     parts |= {"core": CORE, "free": FREE, "gums": gums(2.0), "wall": wall()}
     for name, mesh in parts.items():
         write_mesh(folder / f"{name}.ply", mesh)
@@ -104,9 +122,16 @@ def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, sa
     media = {"enamel": rooted.enamel, "dentin": rooted.dentin, "other": free.enamel, "flesh": MOUTH.gums}
 
     def surface(name: str, ior: float, inside: str, outside: str | None = None) -> dict[str, Any]:
-        sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | ({"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {})
+        sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | (
+            {"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {}
+        )
         bsdf = {"type": "null"} if ior == 1 else boundary_dict(boundary, ior)
-        return {"type": "ply", "filename": (folder / f"{name}.ply").as_posix(), "face_normals": True, "bsdf": bsdf} | sides
+        return {
+            "type": "ply",
+            "filename": (folder / f"{name}.ply").as_posix(),
+            "face_normals": True,
+            "bsdf": bsdf,
+        } | sides
 
     return (
         {
@@ -126,7 +151,10 @@ def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, sa
                 "type": "ply",
                 "filename": (folder / "wall.ply").as_posix(),
                 "face_normals": True,
-                "bsdf": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": MOUTH.reflectance}}},
+                "bsdf": {
+                    "type": "twosided",
+                    "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": MOUTH.reflectance}},
+                },
             },
         }
     )

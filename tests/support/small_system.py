@@ -62,7 +62,13 @@ class SmallSystem:
         has_rig_apart: bool = False,
         stages: str = "tests.support.toy_stages",
     ) -> None:
-        self.data, self.network, self.disk, self._folder, self._postgres = folder / "data", network, disk, folder, postgres
+        self.data, self.network, self.disk, self._folder, self._postgres = (
+            folder / "data",
+            network,
+            disk,
+            folder,
+            postgres,
+        )
         self.acknowledged: list[str] = []
 
         def host(name: str) -> str:
@@ -72,15 +78,55 @@ class SmallSystem:
             return network.inside(name) if network else []
 
         scheduler = f"tcp://{host('scheduler')}:{free_port()}"
-        settings = {"data": str(self.data), "port": free_port(), "database": new_database(postgres, "small"), "scheduler": scheduler}
+        settings = {
+            "data": str(self.data),
+            "port": free_port(),
+            "database": new_database(postgres, "small"),
+            "scheduler": scheduler,
+        }
         self.address = f"http://127.0.0.1:{settings['port']}"
         dask = [sys.executable, "-m", "dask"]
-        worker = [*dask, "worker", scheduler, "--nworkers", "1", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "dask")]
+        worker = [
+            *dask,
+            "worker",
+            scheduler,
+            "--nworkers",
+            "1",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--local-directory",
+            str(folder / "dask"),
+        ]
         self._commands = {
-            "scheduler": [*inside("scheduler"), *dask, "scheduler", "--host", host("scheduler"), "--port", scheduler.rpartition(":")[2], "--no-dashboard"],
+            "scheduler": [
+                *inside("scheduler"),
+                *dask,
+                "scheduler",
+                "--host",
+                host("scheduler"),
+                "--port",
+                scheduler.rpartition(":")[2],
+                "--no-dashboard",
+            ],
             "worker": [*inside("worker"), *worker, "--host", host("worker"), "--resources", RUNS_STAGES],
-            "rig": [*inside("rig"), *worker, "--host", host("rig"), "--resources", "DOME=1" if has_rig_apart else f"{RUNS_STAGES} DOME=1"],
-            "api": [sys.executable, "-m", "tests.support.stepped_clock", str(self._clock_step), "tests.support.toy_server", json.dumps(settings), stages],
+            "rig": [
+                *inside("rig"),
+                *worker,
+                "--host",
+                host("rig"),
+                "--resources",
+                "DOME=1" if has_rig_apart else f"{RUNS_STAGES} DOME=1",
+            ],
+            "api": [
+                sys.executable,
+                "-m",
+                "tests.support.stepped_clock",
+                str(self._clock_step),
+                "tests.support.toy_server",
+                json.dumps(settings),
+                stages,
+            ],
         }
         if has_rig_apart:
             self._commands["worker2"] = self._commands["worker"]
@@ -147,9 +193,13 @@ class SmallSystem:
     def _launch(self, *names: str) -> None:
         for name in names:
             if name in self._commands and (name not in self._processes or self._processes[name].poll() is not None):
-                environment = os.environ | {f"DASK_DISTRIBUTED__{option}": value for option, value in DASK_TIMEOUTS.items()}
+                environment = os.environ | {
+                    f"DASK_DISTRIBUTED__{option}": value for option, value in DASK_TIMEOUTS.items()
+                }
                 with (self._folder / f"{name}.log").open("ab") as log:
-                    self._processes[name] = subprocess.Popen(self._commands[name], cwd=ROOT, env=environment, stdout=log, stderr=log, start_new_session=True)
+                    self._processes[name] = subprocess.Popen(
+                        self._commands[name], cwd=ROOT, env=environment, stdout=log, stderr=log, start_new_session=True
+                    )
 
     def _answers(self) -> bool:
         with suppress(httpx.TransportError), connect(self.address) as client:
@@ -171,7 +221,10 @@ def small_system(folder: Path, *, on_hosts: bool = False, **options: Any) -> Ite
     with ExitStack() as stack:
         network, disk = None, None
         if on_hosts:
-            network, disk = stack.enter_context(network_of("scheduler", "worker", "rig", "database")), stack.enter_context(store_disk(folder / "data"))
+            network, disk = (
+                stack.enter_context(network_of("scheduler", "worker", "rig", "database")),
+                stack.enter_context(store_disk(folder / "data")),
+            )
         system = SmallSystem(folder, stack.enter_context(postgres_server(network)), network, disk, **options)
         system.data.mkdir(parents=True, exist_ok=True)
         stack.callback(system.close)

@@ -38,7 +38,9 @@ def dentin_shape() -> DentinShape:
     return DentinShape(base, np.stack([-0.9 * towards, buccal]))
 
 
-def camera_at(direction: tuple[float, float, float], size: int = 8, span_mm: float = 9.0, distance_mm: float = CAMERA_DISTANCE_MM) -> Camera:
+def camera_at(
+    direction: tuple[float, float, float], size: int = 8, span_mm: float = 9.0, distance_mm: float = CAMERA_DISTANCE_MM
+) -> Camera:
     """A camera that looks at the origin from a direction, ``span_mm`` across, z upwards in the image."""
     backward = np.asarray(direction) / np.linalg.norm(direction)
     x = np.cross(-backward, [0.0, 0.0, 1.0])
@@ -61,4 +63,6 @@ def whole_view(camera: Camera, margin: int = 0) -> View:
 
 def recipe(boundary: Boundary = "matched") -> SceneRecipe:
     """The tooth's scene."""
-    return single_tooth(ellipsoid(SEMI_AXES_MM), dentin_shape(), LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), boundary)
+    return single_tooth(
+        ellipsoid(SEMI_AXES_MM), dentin_shape(), LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), boundary
+    )

@@ -29,4 +29,6 @@ def stain(seed: int = 1, low: float = 0.3, high: float = 0.8) -> Stain:
 def stained_recipe(boundary: Boundary) -> SceneRecipe:
     """The scene."""
     (tooth,) = recipe(boundary).teeth
-    return replace(recipe(boundary), teeth=(ToothSurfaces(tooth.outer, tooth.dentin, texture_coordinates()[tooth.outer.faces]),))
+    return replace(
+        recipe(boundary), teeth=(ToothSurfaces(tooth.outer, tooth.dentin, texture_coordinates()[tooth.outer.faces]),)
+    )

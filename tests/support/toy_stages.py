@@ -16,7 +16,9 @@ from services.core.records import AssetManifest, JobSpec
 from services.core.stage import StageContext, StageEvent, StageName
 from services.core.store import StageWriter, require_intact
 
-DOORS: dict[StageName, str] = {stage: f"tests.support.toy_stages:{stage}" for stage in ("phantom", "capture", "prepare", "fit", "export")}
+DOORS: dict[StageName, str] = {
+    stage: f"tests.support.toy_stages:{stage}" for stage in ("phantom", "capture", "prepare", "fit", "export")
+}
 
 
 def _steering(spec: JobSpec, context: StageContext) -> Path:
@@ -83,9 +85,18 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
     _reach(spec, context, "fit", "start")
     require_intact(context.root, "prepared")
     for step in range(10):
-        data = {"channel": "green", "step": step, "loss": 0.5**step, "held_out_error": 0.6**step, "held_out_se": 0.002, "parameters": {"enamel.sigma": 4.0}}
+        data = {
+            "channel": "green",
+            "step": step,
+            "loss": 0.5**step,
+            "held_out_error": 0.6**step,
+            "held_out_se": 0.002,
+            "parameters": {"enamel.sigma": 4.0},
+        }
         context.report(StageEvent(stage="fit", kind="step", message=f"Step {step}.", done=(step + 1) / 10, data=data))
-        if step == 5 and ((context.root / "always-kill").exists() or ((context.root / "kill-fit").exists() and context.attempt == 1)):
+        if step == 5 and (
+            (context.root / "always-kill").exists() or ((context.root / "kill-fit").exists() and context.attempt == 1)
+        ):
             os.kill(os.getpid(), signal.SIGKILL)
         while (context.root / "deaf-fit").exists():
             time.sleep(0.02)

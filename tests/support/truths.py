@@ -56,10 +56,15 @@ def pack(capture: Path, stored: Path) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     for path in tooth.glob("*.ply"):
         mesh = read_mesh(path)
-        arrays[f"{path.stem}_vertices"], arrays[f"{path.stem}_faces"] = mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.uint16)
+        arrays[f"{path.stem}_vertices"], arrays[f"{path.stem}_faces"] = (
+            mesh.vertices_mm.astype(np.float32),
+            mesh.faces.astype(np.uint16),
+        )
     for camera in description["cameras"]:
         images = [image for image in description["images"] if image["camera"] == camera["name"]]
-        mean, variance = (np.stack([np.load(capture / image[key])[..., 0] for image in images]) for key in ("file", "variance_file"))
+        mean, variance = (
+            np.stack([np.load(capture / image[key])[..., 0] for image in images]) for key in ("file", "variance_file")
+        )
         arrays[f"{camera['name']}_mean"] = mean.astype(np.float32)
         arrays[f"{camera['name']}_standard_error"] = np.sqrt(variance).astype(np.float16)
     text = json.dumps({"capture": description, "truth": optics, "fdi": tooth.name})
@@ -71,13 +76,21 @@ def read(name: str) -> Truth:
     with np.load(FOLDER / f"{name}.npz") as stored:
         text = json.loads(str(stored["text"]))
         parts = [key.removesuffix("_faces") for key in stored if key.endswith("_faces")]
-        meshes = {part: Mesh(stored[f"{part}_vertices"].astype(float), stored[f"{part}_faces"].astype(np.int32)) for part in parts}
+        meshes = {
+            part: Mesh(stored[f"{part}_vertices"].astype(float), stored[f"{part}_faces"].astype(np.int32))
+            for part in parts
+        }
         cameras = [camera["name"] for camera in text["capture"]["cameras"]]
-        images = [{camera: stored[f"{camera}_{kind}"].astype(float) for camera in cameras} for kind in ("mean", "standard_error")]
+        images = [
+            {camera: stored[f"{camera}_{kind}"].astype(float) for camera in cameras}
+            for kind in ("mean", "standard_error")
+        ]
     return Truth(text["capture"], text["truth"], text["fdi"], meshes, images[0], images[1])
 
 
-def write_capture(name: str, target: Path, seed: int, *, tested_camera: str | None = None, dentin: bool = True) -> Truth:
+def write_capture(
+    name: str, target: Path, seed: int, *, tested_camera: str | None = None, dentin: bool = True
+) -> Truth:
     """Write a truth as a folder capture with sensor noise.
 
     Args:

@@ -16,7 +16,12 @@ from services.api.migrations import upgrade
 from services.client.tus import CHUNK_TYPE, VERSION, format_metadata
 from services.pipeline.database import open_database, sqlite_url
 
-CAMERA = {"name": "c0", "size": [8, 6], "K": [[10, 0, 4], [0, 10, 3], [0, 0, 1]], "camera_from_world": np.eye(4).tolist()}
+CAMERA = {
+    "name": "c0",
+    "size": [8, 6],
+    "K": [[10, 0, 4], [0, 10, 3], [0, 0, 1]],
+    "camera_from_world": np.eye(4).tolist(),
+}
 TUS = {"Tus-Resumable": VERSION}
 
 
@@ -44,7 +49,9 @@ def write_capture(folder: Path, images: int = 2, seed: int = 0) -> Path:
 
 def contents_of(folder: Path) -> dict[str, bytes]:
     """Every file's content by its path."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
 
 
 def entry(path: str, content: bytes) -> dict[str, Any]:
@@ -74,7 +81,9 @@ def create_upload(client: httpx.Client, capture: str, path: str, content: bytes)
 
 def patch(client: httpx.Client, upload: str, offset: int, content: Any, **headers: str) -> httpx.Response:
     """Send bytes."""
-    return client.patch(upload, content=content, headers=TUS | {"Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE} | headers)
+    return client.patch(
+        upload, content=content, headers=TUS | {"Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE} | headers
+    )
 
 
 def offset_of(client: httpx.Client, upload: str) -> int:

@@ -78,7 +78,12 @@ def test_those_who_stay_away_are_forgotten(clock: Clock) -> None:
 
 @pytest.mark.parametrize(
     ("address", "network"),
-    [("192.0.2.7", "192.0.2.7"), ("2001:db8::1", "2001:db8::/64"), ("2001:db8::ffff:1", "2001:db8::/64"), ("unknown", "unknown")],
+    [
+        ("192.0.2.7", "192.0.2.7"),
+        ("2001:db8::1", "2001:db8::/64"),
+        ("2001:db8::ffff:1", "2001:db8::/64"),
+        ("unknown", "unknown"),
+    ],
 )
 def test_an_ipv6_host_counts_as_its_network(address: str, network: str) -> None:
     assert network_of(address) == network

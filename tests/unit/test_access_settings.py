@@ -19,10 +19,15 @@ def test_open_access_is_for_loopback(host: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.4", "dentine.example", "localhost.example"])
-def test_an_open_server_on_the_network_does_not_start(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_open_server_on_the_network_does_not_start(
+    host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     settings = ServerSettings(host=host, port=0, data=tmp_path / "data")
     for start in (create_app, serve):
-        with pytest.raises(SettingsError, match=f"Host {host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens"):
+        with pytest.raises(
+            SettingsError,
+            match=f"Host {host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens",
+        ):
             start(settings)
     assert not (tmp_path / "data").exists()
     assert capsys.readouterr().out == ""
@@ -30,7 +35,9 @@ def test_an_open_server_on_the_network_does_not_start(host: str, tmp_path: Path,
 
 
 def test_a_client_token_does_not_show() -> None:
-    settings = read_settings({"DENTINE__CLIENT__TOKEN": "dentine_0123456789ab_hidden-hidden", "DENTINE__SERVER__ACCESS": "tokens"})
+    settings = read_settings(
+        {"DENTINE__CLIENT__TOKEN": "dentine_0123456789ab_hidden-hidden", "DENTINE__SERVER__ACCESS": "tokens"}
+    )
     assert settings.server.access == "tokens"
     assert settings.client.token is not None
     assert settings.client.token.get_secret_value().endswith("hidden-hidden")

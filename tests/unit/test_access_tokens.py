@@ -59,7 +59,9 @@ def table(engine: sql.Engine, clock: Clock) -> Tokens:
     return Tokens(engine, clock, clock.ticks)
 
 
-def issue(table: Tokens, name: str = "rig-1", scopes: tuple[Scope, ...] = (Scope.READ,), days: float | None = None) -> str:
+def issue(
+    table: Tokens, name: str = "rig-1", scopes: tuple[Scope, ...] = (Scope.READ,), days: float | None = None
+) -> str:
     return table.create(name, scopes, days, make_deed()).token.get_secret_value()
 
 
@@ -85,13 +87,24 @@ def test_a_token_is_known_by_all_of_it(table: Tokens) -> None:
     assert table.authenticate(token).name == "rig-1"
     other = issue(table, "rig-2")
     mixed = f"dentine_{token.split('_')[1]}_{other.split('_', 2)[2]}"
-    for wrong in (mixed, token[:-1], token + "A", token.upper(), "", "dentine_", "dentine_000000000000_x", "\udcff\x00é"):
+    for wrong in (
+        mixed,
+        token[:-1],
+        token + "A",
+        token.upper(),
+        "",
+        "dentine_",
+        "dentine_000000000000_x",
+        "\udcff\x00é",
+    ):
         with pytest.raises(UnauthenticatedError, match="unknown, expired or revoked; ask an administrator"):
             table.authenticate(wrong)
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_the_decision_is_compare_digest_of_two_hashes(table: Tokens, monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+def test_the_decision_is_compare_digest_of_two_hashes(
+    table: Tokens, monkeypatch: pytest.MonkeyPatch, known: bool
+) -> None:
     token = issue(table) if known else "dentine_0123456789ab_guess"
     compared: list[tuple[str, str]] = []
 
@@ -177,7 +190,9 @@ def test_trust_ends_in_time_though_the_clock_steps_back(table: Tokens, clock: Cl
     assert table.trusted(presented=token) is None
 
 
-def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(table: Tokens, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(
+    table: Tokens, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # The look-up has read its row and waits until the one who writes is done: he revokes.
     token = issue(table)
     monkeypatch.setattr(table, "_note_use", lambda _: table.revoke("rig-1", make_deed()))
@@ -188,7 +203,10 @@ def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(table: Tok
 def test_an_id_never_passes_for_a_token(table: Tokens) -> None:
     found = table.authenticate(token := issue(table))
     table.living(found.id)
-    assert [one.id for one in (table.trusted(session_of=found.id), table.trusted(presented=token)) if one] == [found.id, found.id]
+    assert [one.id for one in (table.trusted(session_of=found.id), table.trusted(presented=token)) if one] == [
+        found.id,
+        found.id,
+    ]
     assert table.trusted(presented=found.id) is None
     assert table.trusted(session_of=token) is None
 
@@ -214,7 +232,9 @@ def test_an_id_means_its_own_token_whatever_another_is_called(table: Tokens, eng
     assert {one.name: one.revoked_s is None for one in table.list()} == {"first": False, meant: True}
 
 
-@pytest.mark.parametrize("name", ["", "local", "0123456789ab", "a b", "-x", "x" * 65, "dentine_0123456789ab_secret", "é"])
+@pytest.mark.parametrize(
+    "name", ["", "local", "0123456789ab", "a b", "-x", "x" * 65, "dentine_0123456789ab_secret", "é"]
+)
 def test_malformed_names_are_refused(table: Tokens, name: str) -> None:
     with pytest.raises(InputError, match="Token name"):
         issue(table, name)
@@ -229,7 +249,11 @@ def test_the_last_use_is_noted_once_an_hour(table: Tokens, engine: sql.Engine, c
     token = issue(table)
     assert table.list()[0].last_used_s is None
     writes: list[str] = []
-    sql.event.listen(engine, "before_cursor_execute", lambda *arguments: writes.append(arguments[2]) if arguments[2].startswith("UPDATE") else None)
+    sql.event.listen(
+        engine,
+        "before_cursor_execute",
+        lambda *arguments: writes.append(arguments[2]) if arguments[2].startswith("UPDATE") else None,
+    )
     for step in range(11):
         clock.now_s = NOON_S + step * LAST_USE_STEP_S / 10
         table.authenticate(token)
@@ -252,7 +276,14 @@ def test_nothing_that_is_printed_shows_a_secret(table: Tokens) -> None:
     issued = table.create("rig-1", [Scope.READ], None, make_deed())
     secret = issued.token.get_secret_value().split("_", 2)[2]
     assert secret in issued.model_dump_json()
-    for text in (repr(issued), str(issued), f"{issued}", str(issued.model_dump()), str(table.list()), redacted(f"no {issued.token.get_secret_value()} here")):
+    for text in (
+        repr(issued),
+        str(issued),
+        f"{issued}",
+        str(issued.model_dump()),
+        str(table.list()),
+        redacted(f"no {issued.token.get_secret_value()} here"),
+    ):
         assert secret not in text
 
 
@@ -297,7 +328,9 @@ def test_a_changed_session_is_refused(table: Tokens, clock: Clock) -> None:
         Sessions(b"l" * 32, 60.0, clock).read(cookie)
 
 
-def test_signatures_are_compared_by_compare_digest(table: Tokens, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signatures_are_compared_by_compare_digest(
+    table: Tokens, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     issuer = Sessions(b"k" * 32, 60.0, clock)
     cookie, _ = issuer.issue(table.authenticate(issue(table)))
     monkeypatch.setattr(hmac, "compare_digest", lambda *_: False)

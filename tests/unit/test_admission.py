@@ -8,7 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from services.api.jobs.admission import DISK_PER_CAPTURE, KEPT_FREE_BYTES, MIN_DISK_BYTES, RETRY_S, WORKER_BYTES, Admission, Machine, predict
+from services.api.jobs.admission import (
+    DISK_PER_CAPTURE,
+    KEPT_FREE_BYTES,
+    MIN_DISK_BYTES,
+    RETRY_S,
+    WORKER_BYTES,
+    Admission,
+    Machine,
+    predict,
+)
 from services.api.jobs.size import size_of
 from services.client.errors import JobTooLargeError
 from services.core.errors import DentineError, DiskFullError, ReadOnlyStoreError, SchedulerLostError
@@ -46,7 +55,9 @@ def test_the_prediction_counts_what_lies_on_the_disk(spec: JobSpec) -> None:
     assert needs.memory_bytes == 2 * WORKER_BYTES
 
 
-def test_a_folder_that_is_no_capture_is_not_walked_through(spec: JobSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_is_no_capture_is_not_walked_through(
+    spec: JobSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "capture.json").unlink()
     monkeypatch.setattr(Path, "rglob", lambda *_: pytest.fail("it was walked through"))
     assert predict(spec).disk_bytes == MIN_DISK_BYTES
@@ -86,7 +97,11 @@ def test_a_job_waits_for_disk_and_starts_when_there_is_enough(spec: JobSpec) -> 
 
 @pytest.mark.parametrize(
     ("problem", "what"),
-    [(DiskFullError("Full; free some."), "disk"), (SchedulerLostError("Gone; start it."), "workers"), (ReadOnlyStoreError("Locked; open it."), "store")],
+    [
+        (DiskFullError("Full; free some."), "disk"),
+        (SchedulerLostError("Gone; start it."), "workers"),
+        (ReadOnlyStoreError("Locked; open it."), "store"),
+    ],
 )
 def test_what_was_paused_is_tried_again_after_a_while(spec: JobSpec, problem: DentineError, what: str) -> None:
     world = World()
@@ -112,7 +127,9 @@ def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> No
     world = World()
     world.free(0)
     world.admission.refuse_too_large(spec)  # it may wait
-    with pytest.raises(JobTooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB") as refusal:
+    with pytest.raises(
+        JobTooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB"
+    ) as refusal:
         world.admission.refuse_too_large(spec.model_copy(update={"workers": 64}))
     assert refusal.value.evidence == {"needed_memory_bytes": 64 * WORKER_BYTES, "memory_bytes": 16 * GIB}
     world.machine = Machine(0, MIN_DISK_BYTES, 16 * GIB)
@@ -127,7 +144,10 @@ def test_a_running_job_whose_workers_went_away_says_so_until_one_comes(spec: Job
     assert world.admission.stalled("fit") is None
     world.lacking[False] = "The scheduler has no workers; start some with dentine worker."
     world.admission.look_for_stalled()
-    assert world.admission.stalled("fit") == "Waits for workers: The scheduler has no workers; start some with dentine worker."
+    assert (
+        world.admission.stalled("fit")
+        == "Waits for workers: The scheduler has no workers; start some with dentine worker."
+    )
     world.lacking.clear()
     world.admission.look_for_stalled()
     assert world.admission.stalled("fit") is None

@@ -74,7 +74,9 @@ def test_every_weight_leaves_enamel_everywhere(case: Case, weights: tuple[float,
     moved = Mesh(case.shape.vertices_mm(weights), case.shape.base.faces)
     moved.require_solid("dentin")
     # Smoothness of the modes: hardly any triangle turns over, even where opposite walls have come close.
-    before, after = (trimesh.Trimesh(m.vertices_mm, m.faces, process=False).face_normals for m in (case.shape.base, moved))
+    before, after = (
+        trimesh.Trimesh(m.vertices_mm, m.faces, process=False).face_normals for m in (case.shape.base, moved)
+    )
     assert np.mean((before * after).sum(axis=1) < 0) < 2e-3
 
 
@@ -85,13 +87,18 @@ def test_each_mode_moves_along_its_axis_and_thickens_enamel(case: Case) -> None:
         assert np.abs(along).max() > 0.3
         # But for what is kept inside where the crown narrows.
         assert np.square(mode - along).sum() <= 0.1 * np.square(mode).sum()
-    volumes = [Mesh(case.shape.vertices_mm(c), case.shape.base.faces).signed_volume_mm3() for c in ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1))]
+    volumes = [
+        Mesh(case.shape.vertices_mm(c), case.shape.base.faces).signed_volume_mm3()
+        for c in ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1))
+    ]
     assert volumes == sorted(volumes, reverse=True)
 
 
 @pytest.mark.parametrize("fdi", [13, 16, 36, 45])
 def test_other_teeth_of_a_scan_have_a_blend_shape_too(fdi: int) -> None:
-    tooth = Case(read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={fdi}.obj")), ToothFrame.identity())
+    tooth = Case(
+        read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={fdi}.obj")), ToothFrame.identity()
+    )
     for weights in np.random.default_rng(fdi).random((5, 3)):
         assert tooth.smallest_depth_mm(tuple(weights)) >= CLEARANCE_MM - GRID_ERROR_MM
 
@@ -103,7 +110,12 @@ def test_weights_make_enamel_thicken_with_the_root_of_height() -> None:
     depth = SurfaceDistance(outer).closest(shape.vertices_mm((1, 1, 0)))[1]
     height = shape.base.vertices_mm[:, 2] - (outer.vertices_mm[:, 2].max() - crown.crown_length_mm)
     # The middle of the labial wall, where each side has room: the rule, less what smoothing takes. Nothing on the root.
-    wall = (np.abs(shape.base.vertices_mm[:, 0]) < 1.5) & (shape.base.vertices_mm[:, 1] > 0) & (height > 1.5) & (height < 4.5)
+    wall = (
+        (np.abs(shape.base.vertices_mm[:, 0]) < 1.5)
+        & (shape.base.vertices_mm[:, 1] > 0)
+        & (height > 1.5)
+        & (height < 4.5)
+    )
     assert wall.sum() > 10
     rule = BASE_DEPTH_MM + (FULL_DEPTH_MM - BASE_DEPTH_MM) * np.sqrt(height[wall] / crown.crown_length_mm)
     np.testing.assert_allclose(depth[wall], rule, atol=0.15)
@@ -119,7 +131,10 @@ def test_some_weights_are_near_the_dentin_of_other_makers(fdi: int) -> None:
     points = tooth.outer.vertices_mm[height > height.max() - upper_tooth(fdi % 10).crown_length_mm / 2][::7]
     true = SurfaceDistance(tooth.dentin).closest(points)[1]
     grid = np.stack(np.meshgrid(*[(0.3, 0.55, 0.8, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    errors = [np.abs(SurfaceDistance(Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)).closest(points)[1] - true).mean() for c in grid]
+    errors = [
+        np.abs(SurfaceDistance(Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)).closest(points)[1] - true).mean()
+        for c in grid
+    ]
     assert min(errors) < 0.15
 
 

@@ -44,7 +44,9 @@ def test_signed_grid_knows_inside_and_depth() -> None:
 
 def test_inward_direction_is_the_wall_normal() -> None:
     grid = SignedDistanceGrid(BOX, pitch_mm=0.2)
-    np.testing.assert_allclose(grid.inward(np.array([[1.5, 0.0, 0.0], [0.0, -2.6, 0.0]])), [[-1, 0, 0], [0, 1, 0]], atol=0.02)
+    np.testing.assert_allclose(
+        grid.inward(np.array([[1.5, 0.0, 0.0], [0.0, -2.6, 0.0]])), [[-1, 0, 0], [0, 1, 0]], atol=0.02
+    )
 
 
 @pytest.mark.parametrize("pitch", [0.3, 0.17])

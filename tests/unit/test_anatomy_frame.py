@@ -40,7 +40,16 @@ def test_the_scanned_incisor_is_seen_by_its_landmarks() -> None:
     cameras = read_record(root / "capture.json", FolderCapture).cameras
     centres = np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
     frame = estimate_frame(read_mesh(root / "teeth/11/outer.ply"), centres)
-    landmarks = np.array([[37.46, 47.35, 10.32], [34.96, 44.96, 5.36], [36.07, 50.19, 4.24], [40.46, 48.75, 5.65], [29.67, 59.43, 16.16], [41.20, 40.92, 1.98]])
+    landmarks = np.array(
+        [
+            [37.46, 47.35, 10.32],
+            [34.96, 44.96, 5.36],
+            [36.07, 50.19, 4.24],
+            [40.46, 48.75, 5.65],
+            [29.67, 59.43, 16.16],
+            [41.20, 40.92, 1.98],
+        ]
+    )
     placed = landmarks @ frame.rotation.T
     # Root tip and incisal edge are the fifth and sixth landmark, 26 mm apart along the tooth.
     assert placed[5, 2] - placed[4, 2] == pytest.approx(26.0, abs=0.5)

@@ -57,6 +57,11 @@ def test_labial_enamel_follows_the_thickness_model(incisor: Incisor) -> None:
     # Shortest distance is at most the thickness along the normal; the wall's curvature makes up to 0.05 mm of difference.
     distance = SurfaceDistance(incisor.dentin).closest(incisor.outer.vertices_mm)[1]
     height = incisor.outer.vertices_mm[:, 2] - cervix_height_mm()
-    labial = (np.abs(incisor.outer.vertices_mm[:, 0]) < 0.8) & (incisor.outer.vertices_mm[:, 1] > 0) & (height > 0.5) & (height < 8.5)
+    labial = (
+        (np.abs(incisor.outer.vertices_mm[:, 0]) < 0.8)
+        & (incisor.outer.vertices_mm[:, 1] > 0)
+        & (height > 0.5)
+        & (height < 8.5)
+    )
     assert labial.sum() > 20
     np.testing.assert_allclose(distance[labial], enamel_thickness_mm(height[labial]), atol=0.05)

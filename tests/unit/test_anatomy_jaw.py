@@ -80,7 +80,9 @@ def test_fourteen_teeth_stand_in_order(jaw: Jaw) -> None:
 
 def test_every_solid_bounds_a_medium(jaw: Jaw) -> None:
     jaw.cavity.require_surface("cavity")
-    solids = {"gums": jaw.gums} | {f"{part} {tooth.fdi}": getattr(tooth, part) for tooth in jaw.teeth for part in ("outer", "dentin")}
+    solids = {"gums": jaw.gums} | {
+        f"{part} {tooth.fdi}": getattr(tooth, part) for tooth in jaw.teeth for part in ("outer", "dentin")
+    }
     for name, mesh in solids.items():
         mesh.require_solid(name)
         assert mesh.vertices_mm.dtype == np.float64
@@ -146,9 +148,25 @@ def test_the_table_is_the_references() -> None:
     assert [f"maxillary {d.name}" for d in UPPER_TEETH] == [row["tooth"] for row in rows]
     assert [f"1{d.position} 2{d.position}" for d in UPPER_TEETH] == [row["fdi"] for row in rows]
     assert [d.status for d in UPPER_TEETH] == [row["status"] for row in rows]
-    columns = ("crown_length", "md_crown", "md_cervix", "ll_crown", "ll_cervix", "cervical_curvature_mesial", "cervical_curvature_distal")
+    columns = (
+        "crown_length",
+        "md_crown",
+        "md_cervix",
+        "ll_crown",
+        "ll_cervix",
+        "cervical_curvature_mesial",
+        "cervical_curvature_distal",
+    )
     for d, row in zip(UPPER_TEETH, rows, strict=True):
-        table = [d.crown_length_mm, d.md_crown_mm, d.md_cervix_mm, d.ll_crown_mm, d.ll_cervix_mm, d.curvature_mesial_mm, d.curvature_distal_mm]
+        table = [
+            d.crown_length_mm,
+            d.md_crown_mm,
+            d.md_cervix_mm,
+            d.ll_crown_mm,
+            d.ll_cervix_mm,
+            d.curvature_mesial_mm,
+            d.curvature_distal_mm,
+        ]
         assert table == [float(row[f"{column}_mm"]) for column in columns], d.name
 
 
@@ -186,7 +204,9 @@ def test_gums_are_higher_between_the_front_teeth(average: Jaw) -> None:
     # At the midline, between the central incisors, against the middle of the right one.
     x, y, z = average.gums.vertices_mm.T
     front = y > 15
-    between, middle = (float(z[front & (np.abs(x - at) < 0.5)].max()) for at in (0.0, average.tooth(11).jaw_from_tooth[0, 3]))
+    between, middle = (
+        float(z[front & (np.abs(x - at) < 0.5)].max()) for at in (0.0, average.tooth(11).jaw_from_tooth[0, 3])
+    )
     assert 2.0 < between - middle < 4.0
 
 
@@ -255,7 +275,9 @@ def test_the_engine_takes_the_whole_jaw(subject: Jaw) -> None:
     crowns = np.array([subject.tooth(fdi).jaw_from_tooth[:3, 3] + [0, 0, 2] for fdi in (11, 12, 13)])
     pixels = np.floor(camera.project(np.concatenate([crowns, crowns - [0, 0, 8]]))[0]).astype(np.int32)
     tissue = Tissue(Medium(4.5, 0.997, g1=0.8), Medium(12.0, 0.9945, g1=0.75))
-    images = Engine(recipe).images(Mouth((tissue,) * len(teeth), Medium(9.0, 0.9, g1=0.8), 0.2), View(camera, pixels), samples=16, seed=1)
+    images = Engine(recipe).images(
+        Mouth((tissue,) * len(teeth), Medium(9.0, 0.9, g1=0.8), 0.2), View(camera, pixels), samples=16, seed=1
+    )
     assert np.isfinite(images.mean).all()
     # By the first light, from the front, teeth are brighter than gums that absorb thirty times as much.
     assert images.mean[0, :3].min() > 0

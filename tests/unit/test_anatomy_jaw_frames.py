@@ -68,7 +68,9 @@ def test_a_phantom_jaw_is_known_whole_or_in_part_in_any_pose(subject: Jaw, numbe
 def test_a_tooth_with_another_kinds_number_is_told(subject: Jaw) -> None:
     premolar, incisor = subject.tooth(24), subject.tooth(11)
     sentence = number_told(Tooth(11, premolar.outer))
-    assert sentence.startswith("Tooth 11 is shaped like a first premolar and not like a central incisor; give its right FDI number")
+    assert sentence.startswith(
+        "Tooth 11 is shaped like a first premolar and not like a central incisor; give its right FDI number"
+    )
     assert number_told(Tooth(24, premolar.outer)) == number_told(Tooth(11, incisor.outer)) == ""
 
 
@@ -123,9 +125,13 @@ def real_axes(numbers: list[int], meshes: list[Mesh]) -> list[Axes]:
 
 def test_real_bare_crowns_of_both_jaws_are_known_by_their_arches() -> None:
     numbers = [11, 14, 16, 25, 31, 36, 34, 45]
-    meshes = [read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={number}.obj")) for number in numbers]
+    meshes = [
+        read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={number}.obj")) for number in numbers
+    ]
     turn = Rotation.random(random_state=8).as_matrix()
-    frames = jaw_frames([Tooth(number, moved(mesh, turn)) for number, mesh in zip(numbers, meshes, strict=True)], SHIFT_MM[None])
+    frames = jaw_frames(
+        [Tooth(number, moved(mesh, turn)) for number, mesh in zip(numbers, meshes, strict=True)], SHIFT_MM[None]
+    )
     errors = errors_deg(frames, real_axes(numbers, meshes), turn)
     assert errors[1:, 2].max() < LEAN_DEG
     # The upper incisor leans to the front, as it should.
@@ -147,7 +153,9 @@ def test_a_whole_real_incisor_is_seen_by_its_landmarks() -> None:
 def test_an_arch_of_middles_is_turned_onto_the_average() -> None:
     nominal, axes = nominal_places((17, 14, 11, 23, 26))
     turn = Rotation.random(random_state=4).as_matrix()
-    np.testing.assert_allclose(arch_from_middles((17, 14, 11, 23, 26), nominal @ turn.T + SHIFT_MM) @ turn, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(
+        arch_from_middles((17, 14, 11, 23, 26), nominal @ turn.T + SHIFT_MM) @ turn, np.eye(3), atol=1e-9
+    )
     np.testing.assert_allclose(np.linalg.det(axes), 1)
     # Lower teeth point up, so that their arch frame has x on the patient's right: the place of 36 is that of 16.
     np.testing.assert_array_equal(nominal_places((36,))[0], nominal_places((16,))[0])

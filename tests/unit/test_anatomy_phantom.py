@@ -70,7 +70,9 @@ def test_given_meshes_are_moved_to_the_origin(tmp_path: Path) -> None:
     tooth = build_incisor(24)
     for name, mesh in (("outer", tooth.outer), ("dentin", tooth.dentin)):
         write_mesh(tmp_path / f"{name}.ply", type(mesh)(mesh.vertices_mm + np.array([5.0, -3.0, 20.0]), mesh.faces))
-    write_phantom(tmp_path / "out", **SMALL | {"lights": 1}, outer=tmp_path / "outer.ply", dentin=tmp_path / "dentin.ply", fdi=21)
+    write_phantom(
+        tmp_path / "out", **SMALL | {"lights": 1}, outer=tmp_path / "outer.ply", dentin=tmp_path / "dentin.ply", fdi=21
+    )
     moved = read_mesh(tmp_path / "out/teeth/21/dentin.ply")
     np.testing.assert_allclose(np.sort(moved.vertices_mm, axis=0), np.sort(tooth.dentin.vertices_mm, axis=0), atol=1e-5)
     assert images(tmp_path / "out").max() > 0.05

@@ -33,7 +33,9 @@ def test_an_average_jaw_has_one_tissue() -> None:
     assert mouth.gums == gums_medium("blue")
 
 
-@pytest.mark.parametrize(("channel", "reduced", "absorption"), [("red", 1.39, 0.05), ("green", 1.71, 1.2), ("blue", 1.99, 0.6)])
+@pytest.mark.parametrize(
+    ("channel", "reduced", "absorption"), [("red", 1.39, 0.05), ("green", 1.71, 1.2), ("blue", 1.99, 0.6)]
+)
 def test_gums_have_the_tables_optics(channel: str, reduced: float, absorption: float) -> None:
     medium = gums_medium(channel)
     assert medium.sigma_s_reduced == pytest.approx(reduced)
@@ -63,7 +65,11 @@ def test_a_tooth_is_the_same_in_all_channels_and_whatever_stands_beside_it() -> 
         return [medium.sigma / average.sigma, (1 - medium.alpha) / (1 - average.alpha), medium.g1 - average.g1]
 
     for one, other in zip(green.teeth, blue.teeth, strict=True):
-        np.testing.assert_allclose(character(one.dentin, TRUE_TISSUE["green"].dentin), character(other.dentin, TRUE_TISSUE["blue"].dentin), rtol=1e-9)
+        np.testing.assert_allclose(
+            character(one.dentin, TRUE_TISSUE["green"].dentin),
+            character(other.dentin, TRUE_TISSUE["blue"].dentin),
+            rtol=1e-9,
+        )
     assert jaw_mouth((21,), "green", 4).teeth[0] == green.teeth[3]
 
 
@@ -82,7 +88,16 @@ def test_a_scanned_jaw_is_the_same_by_both_renderers(tmp_path: Path) -> None:
     renderers: tuple[Renderer, ...] = ("engine", "mitsuba")
     for renderer in renderers:
         out = tmp_path / renderer
-        write_jaw_phantom(out, subject=3, scan=tmp_path / "scan.vtp", pixel_mm=1.5, cameras=1, lights=2, samples=1024, renderer=renderer)
+        write_jaw_phantom(
+            out,
+            subject=3,
+            scan=tmp_path / "scan.vtp",
+            pixel_mm=1.5,
+            cameras=1,
+            lights=2,
+            samples=1024,
+            renderer=renderer,
+        )
         images = read_record(out / "capture.json", FolderCapture).images
         brightness.append([np.load(out / entry.file).astype(float).sum() for entry in images])
         noise.append([np.load(out / str(entry.variance_file)).astype(float).sum() for entry in images])

@@ -29,7 +29,9 @@ def test_reflection_equals_mitsubas_rough_dielectric(roughness: float) -> None:
     import mitsuba as mi
 
     to_light, to_eye = hemisphere(4000, 0), hemisphere(4000, 1)
-    bsdf = mi.load_dict({"type": "roughdielectric", "distribution": "ggx", "alpha": roughness, "int_ior": 1.631, "ext_ior": 1.0})
+    bsdf = mi.load_dict(
+        {"type": "roughdielectric", "distribution": "ggx", "alpha": roughness, "int_ior": 1.631, "ext_ior": 1.0}
+    )
     si = dr.zeros(mi.SurfaceInteraction3f, len(to_eye))
     si.wi = mi.Vector3f(to_eye.T.astype(np.float32))
     value = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(to_light.T.astype(np.float32)))
@@ -62,7 +64,11 @@ def test_gums_hide_the_root_and_scatter_diffusely() -> None:
     (camera,) = dome_cameras(1, 1.0, (tooth.outer,))
     lights = dome_lights(2, ("red", "green", "blue"), seed=1)
     seen = reflect(tooth.outer, tooth.gums, camera, lights, ("red", "green", "blue"), 1.631)
-    rows = np.where(seen.enamel_pixels.any(axis=1), np.nanmin(np.where(seen.enamel_pixels, seen.enamel_share, np.nan), axis=1, initial=1), 1)
+    rows = np.where(
+        seen.enamel_pixels.any(axis=1),
+        np.nanmin(np.where(seen.enamel_pixels, seen.enamel_share, np.nan), axis=1, initial=1),
+        1,
+    )
     # The root stub is the upper fifth of the picture, the incisal third is free.
     assert rows[2] == 0
     assert (rows[2 * len(rows) // 3 :] == 1).all()
@@ -74,11 +80,17 @@ def test_gums_hide_the_root_and_scatter_diffusely() -> None:
 
 def test_a_light_that_no_visible_point_faces_reflects_nothing() -> None:
     # Such as a grazing light and a tooth of which the gums leave little to see: no shadow ray is left to trace.
-    incisor, (camera,), (light,) = build_incisor(), dome_cameras(1, 1.0, (build_incisor().outer,)), dome_lights(1, ("green",), 1)
+    incisor, (camera,), (light,) = (
+        build_incisor(),
+        dome_cameras(1, 1.0, (build_incisor().outer,)),
+        dome_lights(1, ("green",), 1),
+    )
     behind = light.model_copy(update={"position_mm": (0.0, -1000.0, 0.0)})
     seen = reflect(incisor.outer, None, camera, (behind,), ("green",), 1.631)
     assert seen.enamel_pixels.any()
-    assert seen.highlight.max() < 1e-3 * reflect(incisor.outer, None, camera, (light,), ("green",), 1.631).highlight.max()
+    assert (
+        seen.highlight.max() < 1e-3 * reflect(incisor.outer, None, camera, (light,), ("green",), 1.631).highlight.max()
+    )
 
 
 def test_no_ray_hits_nothing() -> None:

@@ -47,7 +47,12 @@ def test_a_labelled_ply_reads_the_same(tmp_path: Path) -> None:
 
 
 def test_universal_numbers_run_from_upper_right_to_lower_right() -> None:
-    assert [fdi_from_universal(n) for n in range(1, 33)] == [*range(18, 10, -1), *range(21, 29), *range(38, 30, -1), *range(41, 49)]
+    assert [fdi_from_universal(n) for n in range(1, 33)] == [
+        *range(18, 10, -1),
+        *range(21, 29),
+        *range(38, 30, -1),
+        *range(41, 49),
+    ]
     with pytest.raises(InputError, match="permanent teeth are 1 to 32"):
         fdi_from_universal(33)
 

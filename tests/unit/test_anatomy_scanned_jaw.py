@@ -111,7 +111,10 @@ def test_lower_teeth_have_x_to_the_patients_right() -> None:
 
 def test_neighbours_bend_the_arch() -> None:
     jaw = jaw_from_scan(FOUR)
-    middles = {tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
+    middles = {
+        tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0]
+        for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)
+    }
     buccal = {tooth.fdi: frame.axes[1] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
     assert middles[12][0] < middles[11][0] < middles[21][0] < middles[22][0]
     assert middles[11][1] > middles[12][1]
@@ -125,7 +128,11 @@ def test_a_moved_scan_gives_the_same_jaw() -> None:
     pair = jaw_from_scan(replace(PAIR, mesh=Mesh(points, PAIR.mesh.faces)))
     turn, shift = Rotation.from_rotvec([0.7, -1.9, 0.4]).as_matrix(), np.array([150.0, -80.0, 420.0])
     moved = jaw_from_scan(LabelledScan(Mesh(points @ turn.T + shift, PAIR.mesh.faces), PAIR.fdi))
-    for one, two in zip((*(tooth.outer for tooth in pair.teeth), pair.gums), (*(tooth.outer for tooth in moved.teeth), moved.gums), strict=True):
+    for one, two in zip(
+        (*(tooth.outer for tooth in pair.teeth), pair.gums),
+        (*(tooth.outer for tooth in moved.teeth), moved.gums),
+        strict=True,
+    ):
         assert SurfaceDistance(one, 0.2).closest(two.vertices_mm)[1].max() < 1e-6
     point = np.array([[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(in_arch(moved, point @ turn.T + shift), in_arch(pair, point), atol=1e-6)
@@ -142,8 +149,12 @@ def test_dirt_in_the_scan_does_not_show(pair: ScannedJaw) -> None:
     count = len(PAIR.mesh.vertices_mm)
     fin, island = [faces[top + 300, 0], faces[top + 300, 1], count], [count + 1, count + 2, count + 3]
     extra = np.array([fin, faces[40], island], dtype=np.int32)
-    points = np.concatenate([PAIR.mesh.vertices_mm, PAIR.mesh.vertices_mm[faces[top + 300, 0]] + [[0, 0, 1]], np.eye(3) + 12.0])
-    dirty = jaw_from_scan(LabelledScan(Mesh(points, np.concatenate([faces[kept], extra])), np.concatenate([fdi[kept], [0, 0, 11]])))
+    points = np.concatenate(
+        [PAIR.mesh.vertices_mm, PAIR.mesh.vertices_mm[faces[top + 300, 0]] + [[0, 0, 1]], np.eye(3) + 12.0]
+    )
+    dirty = jaw_from_scan(
+        LabelledScan(Mesh(points, np.concatenate([faces[kept], extra])), np.concatenate([fdi[kept], [0, 0, 11]]))
+    )
     for tooth, clean in zip(dirty.teeth, pair.teeth, strict=True):
         require_tidy(tooth.outer, "dirty")
         # Borders may move by a triangle, of a crown that is 12 mm across at most.
@@ -155,7 +166,9 @@ def test_dirt_in_the_scan_does_not_show(pair: ScannedJaw) -> None:
 def test_a_tooth_in_pieces_is_refused() -> None:
     corner = (PAIR.mesh.vertices_mm[PAIR.mesh.faces].mean(axis=1)[:, :2] > 6.0).all(axis=1)
     labels = np.select([corner, PAIR.fdi == 21], [21, 11], PAIR.fdi)
-    with pytest.raises(CaptureInputError, match=r"label of tooth 11 is in 2 pieces, the largest \d\d% of its area; relabel the scan"):
+    with pytest.raises(
+        CaptureInputError, match=r"label of tooth 11 is in 2 pieces, the largest \d\d% of its area; relabel the scan"
+    ):
         jaw_from_scan(replace(PAIR, fdi=labels))
 
 
@@ -217,7 +230,9 @@ def test_a_real_arch_becomes_solids(arch: LabelledScan, jaw: ScannedJaw) -> None
     assert np.abs(jaw.gums.vertices_mm).max() < 40
 
 
-def test_real_crowns_and_gingiva_are_the_scan(arch: LabelledScan, jaw: ScannedJaw, gums_distance: SurfaceDistance) -> None:
+def test_real_crowns_and_gingiva_are_the_scan(
+    arch: LabelledScan, jaw: ScannedJaw, gums_distance: SurfaceDistance
+) -> None:
     vertices, faces = in_arch(jaw, arch.mesh.vertices_mm), arch.mesh.faces
     pieces = touching_pieces(faces)
     whole = pieces == np.bincount(pieces).argmax()
@@ -237,7 +252,13 @@ def test_real_crowns_and_gingiva_are_the_scan(arch: LabelledScan, jaw: ScannedJa
 
 def test_landmarks_lie_on_the_real_incisor(jaw: ScannedJaw) -> None:
     path = shared_path("data/intraoral-arch/Example_01_UR1.fcsv")
-    points = np.array([[float(value) for value in line.split(",")[1:4]] for line in path.read_text().splitlines() if not line.startswith("#")])
+    points = np.array(
+        [
+            [float(value) for value in line.split(",")[1:4]]
+            for line in path.read_text().splitlines()
+            if not line.startswith("#")
+        ]
+    )
     # The data's description: 0.16 to 0.28 mm from points of the label, so not farther from its surface.
     assert points.shape == (4, 3)
     assert SurfaceDistance(jaw.teeth[0].outer).closest(in_arch(jaw, points))[1].max() < 0.28
@@ -263,7 +284,10 @@ def test_real_frames_follow_the_arch(jaw: ScannedJaw) -> None:
         middle = frame.world_from_canonical(np.zeros((1, 3)))[0]
         # Away from a point inside the arch; the scan's teeth lie 20 mm and more from it.
         assert frame.axes[1] @ (middle - np.array([0.0, -5.0, middle[2]])) > 10
-    sides = {tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0, 0] for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)}
+    sides = {
+        tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0, 0]
+        for tooth, frame in zip(jaw.teeth, jaw.frames, strict=True)
+    }
     assert all((x > 0) == (fdi > 20) for fdi, x in sides.items())
 
 

@@ -29,7 +29,9 @@ def looked_up(mesh: Mesh, layout: StainLayout, count: int = 20_000) -> tuple[np.
     face = rng.integers(0, len(mesh.faces), count)
     weights = rng.dirichlet(np.ones(3), count)
     places = np.einsum("sc,scd->sd", weights, mesh.vertices_mm[mesh.faces[face]])
-    texels, shares = bilinear_texels(np.einsum("sc,scd->sd", weights, layout.corners_uv[face]), (layout.index.shape[0], layout.index.shape[1]))
+    texels, shares = bilinear_texels(
+        np.einsum("sc,scd->sd", weights, layout.corners_uv[face]), (layout.index.shape[0], layout.index.shape[1])
+    )
     return places, layout.index.reshape(-1)[texels], shares
 
 

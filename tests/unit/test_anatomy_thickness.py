@@ -19,7 +19,9 @@ from tests.support.small_tooth import SEMI_AXES_MM, dentin_shape, ellipsoid, sph
 
 def test_the_real_incisors_figures() -> None:
     folder = shared_path("data/tooth-ur1")
-    thickness = enamel_thickness_mm(read_mesh(folder / "UR1_enamel.ply").vertices_mm, read_mesh(folder / "UR1_dentin.ply"))
+    thickness = enamel_thickness_mm(
+        read_mesh(folder / "UR1_enamel.ply").vertices_mm, read_mesh(folder / "UR1_dentin.ply")
+    )
     # Published to three digits; a candidate triangle missed near an edge costs up to spacing^2 / 2d = 0.005 mm.
     assert thickness.mean() == pytest.approx(0.653, abs=0.002)
     assert np.percentile(thickness, 95) == pytest.approx(1.066, abs=0.003)
@@ -98,4 +100,7 @@ def test_a_camera_sees_thickness_and_its_error_at_the_same_pixels() -> None:
         assert plain.errors_mm is None
         assert plain.mean.determined is is_known
         np.testing.assert_array_equal(plain.image_mm, thickness_image(outer, inside, camera))
-    assert thickness_map(Mesh(outer.vertices_mm + np.array([0.0, 500.0, 0.0]), outer.faces), shape, (0.3,), None, camera) is None
+    assert (
+        thickness_map(Mesh(outer.vertices_mm + np.array([0.0, 500.0, 0.0]), outer.faces), shape, (0.3,), None, camera)
+        is None
+    )

@@ -12,12 +12,20 @@ from services.bench.fits.jaw import Judge, mouth_of, picture, tooth_off
 from services.fit.checks.evaluate import ErrorSums
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
-TRUTH = Mouth((Tissue(Medium(4.0, 0.99, g1=0.8), Medium(12.0, 0.98, g1=0.75)), Tissue(Medium(5.0, 0.98), Medium(5.0, 0.98))), Medium(7.0, 0.95, g1=0.8), 0.4)
+TRUTH = Mouth(
+    (Tissue(Medium(4.0, 0.99, g1=0.8), Medium(12.0, 0.98, g1=0.75)), Tissue(Medium(5.0, 0.98), Medium(5.0, 0.98))),
+    Medium(7.0, 0.95, g1=0.8),
+    0.4,
+)
 
 
 def parameters(mouth: Mouth, parts: tuple[str, ...]) -> dict[str, float]:
     """As a fit reports them, with what it derives."""
-    values = {f"{part}.{leaf}": float(getattr(mouth.medium(part), leaf)) for part in parts for leaf in (*MEDIUM_FIELDS, "sigma_s_reduced")}
+    values = {
+        f"{part}.{leaf}": float(getattr(mouth.medium(part), leaf))
+        for part in parts
+        for leaf in (*MEDIUM_FIELDS, "sigma_s_reduced")
+    }
     return values | {"cavity.reflectance": mouth.value("cavity.reflectance")}
 
 

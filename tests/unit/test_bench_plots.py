@@ -26,12 +26,19 @@ ROWS: list[dict[str, Any]] = [
 
 def points(axes: Any) -> dict[str, list[tuple[float, float]]]:
     """By label, those with a marker."""
-    return {line.get_label(): sorted(map(tuple, line.get_xydata().tolist())) for line in axes.get_lines() if line.get_marker() == "o"}
+    return {
+        line.get_label(): sorted(map(tuple, line.get_xydata().tolist()))
+        for line in axes.get_lines()
+        if line.get_marker() == "o"
+    }
 
 
 def test_everyone_measured_is_in_the_picture() -> None:
     race, hurdles = error_against_time(ROWS).axes
-    assert points(race) == {"dentine": [(1.0, 0.1), (4.0, 0.05)], "another, 50 times our cost": [(2.0, 0.5), (2.0, 0.5)]}
+    assert points(race) == {
+        "dentine": [(1.0, 0.1), (4.0, 0.05)],
+        "another, 50 times our cost": [(2.0, 0.5), (2.0, 0.5)],
+    }
     assert points(hurdles) == {"dentine": [(3.0, 0.2)]}
     assert race.get_xscale() == race.get_yscale() == "log"
 
@@ -47,7 +54,9 @@ def test_lines_follow_equal_efficiency() -> None:
 
 
 def test_lights_and_pixels_have_panels_of_their_own(tmp_path: Path) -> None:
-    def row(benchmark: str, lights: int, pixels: int, seconds: float, cost: float | None, peer: str = "dentine") -> dict[str, Any]:
+    def row(
+        benchmark: str, lights: int, pixels: int, seconds: float, cost: float | None, peer: str = "dentine"
+    ) -> dict[str, Any]:
         return LightsRow(
             benchmark=benchmark, peer=peer, seconds=seconds, error=0.1, lights=lights, pixels=pixels, samples=8, seconds_per_path=0.1, relative_cost=cost
         ).model_dump()  # fmt: skip

@@ -41,12 +41,22 @@ def test_ratio_at_the_error_that_the_peer_ended_with_is_no_bound() -> None:
 
 
 def test_our_time_ends_when_no_later_start_is_worse() -> None:
-    ours = [row("dentine", 2.0, 0.02), row("dentine", 5.0, 0.2), row("dentine", 9.0, 0.0225), row("dentine", 12.0, 0.02)]
+    ours = [
+        row("dentine", 2.0, 0.02),
+        row("dentine", 5.0, 0.2),
+        row("dentine", 9.0, 0.0225),
+        row("dentine", 12.0, 0.02),
+    ]
     assert summary(ours, [row(PEER, 90.0, 0.02)], target=0.022).efficiency_ratio == 90.0 / 9.0
 
 
 def test_picture_shows_every_rate_and_the_bound() -> None:
-    peers = [row(PEER, 10.0, 0.3, 0.02), row(PEER, 50.0, 0.3, 0.02), row(PEER, 10.0, 0.4, 0.05), row(PEER, 90.0, 0.1, 0.05)]
+    peers = [
+        row(PEER, 10.0, 0.3, 0.02),
+        row(PEER, 50.0, 0.3, 0.02),
+        row(PEER, 10.0, 0.4, 0.05),
+        row(PEER, 90.0, 0.1, 0.05),
+    ]
     rows = [*OURS, *peers, summary(OURS, peers[2:], target=0.022)]
     axes: Any = picture([one.model_dump() for one in rows]).axes[0]
     labels = {line.get_label(): len(line.get_xydata()) for line in axes.get_lines()}

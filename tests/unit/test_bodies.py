@@ -16,7 +16,14 @@ from services.core.settings import ServerSettings, UploadLimits
 
 def manifest_of(files: int) -> bytes:
     """A manifest of so many files."""
-    return json.dumps({"files": [{"path": f"images/camera-1/light-{number:05d}.png", "bytes": 1, "sha256": "0" * 64} for number in range(files)]}).encode()
+    return json.dumps(
+        {
+            "files": [
+                {"path": f"images/camera-1/light-{number:05d}.png", "bytes": 1, "sha256": "0" * 64}
+                for number in range(files)
+            ]
+        }
+    ).encode()
 
 
 @pytest.mark.parametrize("item", ["0", "[]", "{}", '""', "[[[]]]", '{"a": 0}'])
@@ -41,6 +48,10 @@ def test_a_manifest_of_as_many_files_as_the_settings_allow_is_parsed(files: int)
 def test_every_route_with_a_body_in_json_bounds_it(tmp_path: Path) -> None:
     app = create_app(ServerSettings(data=tmp_path), lambda *_: None)
     contexts = iter_route_contexts(app.routes)
-    found = [context.original_route for context in contexts if getattr(context.original_route, "body_field", None) is not None]
+    found = [
+        context.original_route
+        for context in contexts
+        if getattr(context.original_route, "body_field", None) is not None
+    ]
     assert len(found) == 10
     assert [route for route in found if not isinstance(route, BodyRoute)] == []

@@ -18,7 +18,9 @@ def fault(root: Path, told: dict[str, Any], names: frozenset[str] | None = None)
     """What is wrong with a description among some files, by default with all that it names."""
     path = root / "slab.json"
     path.write_text(json.dumps(told))
-    return content_fault(path, "slab.json", UploadLimits(), names or frozenset(image["file"] for image in told["images"]))
+    return content_fault(
+        path, "slab.json", UploadLimits(), names or frozenset(image["file"] for image in told["images"])
+    )
 
 
 def test_a_folder_with_a_slabs_description_is_a_capture(tmp_path: Path) -> None:

@@ -36,7 +36,10 @@ OPERATIONS = st.one_of(
     st.tuples(st.just("all"), st.none()),
     st.tuples(st.just("off"), st.none()),
     st.tuples(st.just("reset"), st.none()),
-    st.tuples(st.just("fault"), st.sampled_from([FaultKind.NONE, FaultKind.WATCHDOG_TRIP, FaultKind.INTERLOCK_OPEN, FaultKind.STUCK_LIGHT])),
+    st.tuples(
+        st.just("fault"),
+        st.sampled_from([FaultKind.NONE, FaultKind.WATCHDOG_TRIP, FaultKind.INTERLOCK_OPEN, FaultKind.STUCK_LIGHT]),
+    ),
 )
 
 
@@ -59,7 +62,11 @@ def test_no_light_without_a_fed_watchdog_and_a_closed_interlock(operations: list
         elif what == "fault":
             model.write("holding", reg.FAULT_ORDER.address, [int(argument), 3, 1, reg.ANY_SPACE, 0])  # type: ignore[call-overload]
         model.advance(now_s)
-        if now_s >= fed_at_s + WATCHDOG_S or model.values(reg.INTERLOCK_CLOSED) == [0] or model.values(reg.FAULTS) != [0]:
+        if (
+            now_s >= fed_at_s + WATCHDOG_S
+            or model.values(reg.INTERLOCK_CLOSED) == [0]
+            or model.values(reg.FAULTS) != [0]
+        ):
             assert not any(model.outputs())
 
 

@@ -9,7 +9,9 @@ from services.capture.cameras.motion import SubjectMotion, resample
 
 
 @given(motion_px=st.floats(0.1, 5.0), seed=st.integers(0, 1000), frame=st.integers(0, 40), camera=st.integers(0, 3))
-def test_displacement_is_bounded_and_zero_at_the_reference(motion_px: float, seed: int, frame: int, camera: int) -> None:
+def test_displacement_is_bounded_and_zero_at_the_reference(
+    motion_px: float, seed: int, frame: int, camera: int
+) -> None:
     motion = SubjectMotion(motion_px, reference=2, last=40, seed=seed)
     length = np.linalg.norm(motion.flow_px(frame, camera, 17, 23), axis=-1)
     assert length.max() <= motion_px

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from services.client.capture_paths import MAX_PARTS, MAX_PATH_BYTES, path_fault, require_paths
 from services.client.errors import UploadError
 
-names = st.text(st.sampled_from(["a", "B", "ß", "é", "\u0301", ".", " ", "/", "\\", "\0", "\n", "\u202e", "\u2028", "~", "c", "0"]), max_size=8)
+names = st.text(
+    st.sampled_from(["a", "B", "ß", "é", "\u0301", ".", " ", "/", "\\", "\0", "\n", "\u202e", "\u2028", "~", "c", "0"]),
+    max_size=8,
+)
 any_path = st.one_of(
     st.text(max_size=30),
     st.lists(names, min_size=1, max_size=4).map("/".join),
@@ -36,7 +39,14 @@ def test_an_accepted_path_is_plain_relative_and_visible(path: str) -> None:
     assert Path("/data/captures/x", path).resolve().is_relative_to("/data/captures/x")
 
 
-@given(st.lists(st.lists(st.sampled_from(["a", "A", "ß", "ss", "a.npy", "b"]), min_size=1, max_size=3).map(lambda parts: "/".join(parts) + ".npy"), max_size=6))
+@given(
+    st.lists(
+        st.lists(st.sampled_from(["a", "A", "ß", "ss", "a.npy", "b"]), min_size=1, max_size=3).map(
+            lambda parts: "/".join(parts) + ".npy"
+        ),
+        max_size=6,
+    )
+)
 def test_accepted_sets_keep_their_files_apart(paths: list[str]) -> None:
     everything = [*paths, "capture.json"]
     try:
@@ -50,7 +60,16 @@ def test_accepted_sets_keep_their_files_apart(paths: list[str]) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["capture.json", "teeth/11/outer.ply", "c0_l0.NPY", "photo 1.png", "Zähne/é.exr", "capture.zarr/zarr.json", "capture.zarr/c/0/12/0/0/0", "x/a.zarr/g/c/3"],
+    [
+        "capture.json",
+        "teeth/11/outer.ply",
+        "c0_l0.NPY",
+        "photo 1.png",
+        "Zähne/é.exr",
+        "capture.zarr/zarr.json",
+        "capture.zarr/c/0/12/0/0/0",
+        "x/a.zarr/g/c/3",
+    ],
 )
 def test_files_of_captures_are_accepted(path: str) -> None:
     assert path_fault(path) is None
@@ -82,7 +101,9 @@ def test_files_of_captures_are_accepted(path: str) -> None:
         ("capture.zarr/c/0/x", "no file of a capture"),
     ],
 )
-@pytest.mark.attack("traversal", "a file of a capture that is absolute, leads upwards, is hidden or has control characters")
+@pytest.mark.attack(
+    "traversal", "a file of a capture that is absolute, leads upwards, is hidden or has control characters"
+)
 def test_other_paths_are_refused_for_a_reason(path: str, named: str) -> None:
     assert named in (path_fault(path) or "")
 

@@ -17,7 +17,9 @@ LEVELS = st.floats(0.01, 1.0)
 
 
 def rig(**options: object) -> RigSpec:
-    return RigSpec.model_validate({"mouth": Path("mouth"), "light_exposure_limit_s": 1e9, "total_exposure_limit_s": 1e9} | options)
+    return RigSpec.model_validate(
+        {"mouth": Path("mouth"), "light_exposure_limit_s": 1e9, "total_exposure_limit_s": 1e9} | options
+    )
 
 
 @given(lights=st.integers(1, MAX_LIGHTS), every=st.integers(0, 200), black=st.integers(1, 5), level=LEVELS)
@@ -47,8 +49,16 @@ def test_levels_are_whole_register_steps_and_tracking_spreads_one_light_over_all
         assert abs(frame.level - wanted) <= 0.5 / FULL_SCALE + 1e-12
 
 
-@given(lights=st.integers(1, 60), level=LEVELS, exposure_s=st.floats(0.001, 2.0), settle_s=st.floats(0, 0.1), limit_s=st.floats(0.001, 3.0))
-def test_a_plan_exists_exactly_when_no_light_passes_its_limit(lights: int, level: float, exposure_s: float, settle_s: float, limit_s: float) -> None:
+@given(
+    lights=st.integers(1, 60),
+    level=LEVELS,
+    exposure_s=st.floats(0.001, 2.0),
+    settle_s=st.floats(0, 0.1),
+    limit_s=st.floats(0.001, 3.0),
+)
+def test_a_plan_exists_exactly_when_no_light_passes_its_limit(
+    lights: int, level: float, exposure_s: float, settle_s: float, limit_s: float
+) -> None:
     asked = rig(level=level, exposure_s=exposure_s, settle_s=settle_s, tracking_every=0, light_exposure_limit_s=limit_s)
     dose_s = round(level * FULL_SCALE) / FULL_SCALE * (exposure_s + settle_s)
     if dose_s > limit_s:
@@ -61,7 +71,10 @@ def test_a_plan_exists_exactly_when_no_light_passes_its_limit(lights: int, level
 @given(lights=st.integers(2, 60), margin=st.sampled_from([0.99, 1.01]))
 def test_the_total_limit_counts_every_light_and_tracking_frame(lights: int, margin: float) -> None:
     generous = rig(tracking_every=3, level=1.0, exposure_s=0.1, settle_s=0.0)
-    total_s = sum(frame.level * frame.on_s * (lights if frame.kind == "tracking" else 1) for frame in plan_capture(generous, lights))
+    total_s = sum(
+        frame.level * frame.on_s * (lights if frame.kind == "tracking" else 1)
+        for frame in plan_capture(generous, lights)
+    )
     limited = generous.model_copy(update={"total_exposure_limit_s": total_s * margin})
     if margin < 1:
         with pytest.raises(ExposureLimitError, match="All lights together"):
@@ -82,13 +95,16 @@ def test_an_exposure_that_the_controller_cannot_time_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("lights", "every"), [(1, 0), (5, 0), (5, 2)])
-def test_a_dose_of_which_the_preflight_leaves_too_little_is_refused_before_any_light(lights: int, every: int, tmp_path: Path) -> None:
+def test_a_dose_of_which_the_preflight_leaves_too_little_is_refused_before_any_light(
+    lights: int, every: int, tmp_path: Path
+) -> None:
     write_mouth(tmp_path, lights)
     generous = rig(mouth=tmp_path, tracking_every=every, level=0.5, exposure_s=0.1, settle_s=0.0)
     plan = PlannedRig.read(generous).plan
     # The last light has the most: without tracking frames the preflight's whole frame is its.
     planned_s, glimpsed_s = (
-        sum(frame.level * frame.on_s for frame in frames if frame.light in {lights - 1, None}) for frames in (plan, preflight_frames(plan))
+        sum(frame.level * frame.on_s for frame in frames if frame.light in {lights - 1, None})
+        for frames in (plan, preflight_frames(plan))
     )
     with pytest.raises(ExposureLimitError, match="would reach"):
         PlannedRig.read(generous.model_copy(update={"light_exposure_limit_s": planned_s + 0.99 * glimpsed_s}))

@@ -11,5 +11,11 @@ ASK = "import dask, distributed, json, sys; print(json.dumps([dask.config.get(na
 
 
 def test_dask_reads_from_the_environment_what_it_is_told() -> None:
-    answer = subprocess.run([sys.executable, "-c", ASK, *DASK_CONFIG], env=os.environ | as_environment(), capture_output=True, check=True, text=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", ASK, *DASK_CONFIG],
+        env=os.environ | as_environment(),
+        capture_output=True,
+        check=True,
+        text=True,
+    )
     assert json.loads(answer.stdout) == list(DASK_CONFIG.values())

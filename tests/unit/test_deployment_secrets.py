@@ -42,7 +42,9 @@ def test_keys_are_their_owners_alone(tmp_path: Path) -> None:
     assert not (tmp_path / "tls" / "ca.key").exists()
 
 
-def test_a_certificate_is_renewed_before_it_ends_by_the_same_authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_certificate_is_renewed_before_it_ends_by_the_same_authority(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as short:
         short.setattr(deployment_secrets, "CERTIFICATE_LIFE", deployment_secrets.RENEW_BEFORE - timedelta(days=1))
         make_missing(tmp_path)
@@ -54,7 +56,10 @@ def test_a_certificate_is_renewed_before_it_ends_by_the_same_authority(tmp_path:
     Certificates.of(tmp_path / "tls")
 
 
-@pytest.mark.parametrize(("path", "reason"), [("authority/ca.key", "no plain elliptic-curve key"), ("authority/ca.crt", "no PEM certificate")])
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [("authority/ca.key", "no plain elliptic-curve key"), ("authority/ca.crt", "no PEM certificate")],
+)
 def test_a_damaged_file_is_named_and_nothing_is_made(tmp_path: Path, path: str, reason: str) -> None:
     make_missing(tmp_path)
     (tmp_path / path).chmod(0o600)

@@ -38,7 +38,9 @@ def test_nothing_is_left_and_the_receipt_tells_what_was_there(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_removal_that_was_cut_short_counts_from_its_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removal_that_was_cut_short_counts_from_its_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "job"
     digest = write_job(folder)
 
@@ -68,7 +70,9 @@ def test_a_job_that_never_ran_is_deleted_before_there_is_any_folder_of_jobs(tmp_
     service.repository.close()
 
 
-def test_a_file_that_cannot_be_read_or_noted_is_told_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_cannot_be_read_or_noted_is_told_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_job(folder := tmp_path / "job")
 
     def refuse(*_: object) -> None:
@@ -82,7 +86,9 @@ def test_a_file_that_cannot_be_read_or_noted_is_told_by_its_name(tmp_path: Path,
     assert erase(folder).files == 2
 
 
-def test_a_round_goes_on_after_a_job_that_cannot_be_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_round_goes_on_after_a_job_that_cannot_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     service = Jobs(ServerSettings(data=tmp_path / "data", keep_days=1), lambda *_: None)
     broken, refused, sound = (service.repository.create(JobSpec(capture=tmp_path), key=None).job.id for _ in range(3))
     for job in (broken, refused, sound):
@@ -100,7 +106,10 @@ def test_a_round_goes_on_after_a_job_that_cannot_be_deleted(tmp_path: Path, monk
     service._tidy()
     assert service.repository.deletion(sound).files == 0
     assert [service.repository.get(job).state for job in (broken, refused)] == [JobState.DELETING] * 2
-    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == jobs.__name__] == [f"job {broken}", f"job {refused}"]
+    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == jobs.__name__] == [
+        f"job {broken}",
+        f"job {refused}",
+    ]
     service.repository.close()
 
 

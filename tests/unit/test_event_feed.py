@@ -70,7 +70,10 @@ def test_every_stream_is_told_everything_once_and_in_order_however_slow_it_is(re
 
     async def watch() -> list[str]:
         async with running(repository) as one, asyncio.TaskGroup() as group:
-            tasks = [group.create_task(listen(one.follow(lease.job.id, 0), 0.001 * (number % 7))) for number in range(STREAMS)]
+            tasks = [
+                group.create_task(listen(one.follow(lease.job.id, 0), 0.001 * (number % 7)))
+                for number in range(STREAMS)
+            ]
             for leased in (other, lease):
                 threading.Thread(target=work, args=(repository, leased)).start()
         return [task.result() for task in tasks]
@@ -84,12 +87,16 @@ def test_every_stream_is_told_everything_once_and_in_order_however_slow_it_is(re
 
 def events_in(text: str) -> list[tuple[str, str]]:
     """Kind and data of each event of a stream."""
-    told = [dict(line.split(": ", 1) for line in one.splitlines() if not line.startswith(":")) for one in text.split("\n\n")]
+    told = [
+        dict(line.split(": ", 1) for line in one.splitlines() if not line.startswith(":")) for one in text.split("\n\n")
+    ]
     return [(one.get("event", "message"), one["data"]) for one in told if "data" in one]
 
 
 @pytest.mark.parametrize("most", [1000, 7])
-def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(repository: Repository, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
     monkeypatch.setattr(feed, "MAX_EVENTS", most)
     monkeypatch.setattr(feed, "PING_S", 0.05)
     leases = [start(repository, seed) for seed in range(3)]
@@ -106,7 +113,9 @@ def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(repositor
     told = events_in(asyncio.run(watch()))
     for lease, after in ((leases[0], 0), (leases[2], known)):
         events = [json.loads(data) for kind, data in told if kind == "message"]
-        assert [event["id"] for event in events if event["job"] == lease.job.id] == [one.id for one in repository.events_of(lease.job.id).read(after)]
+        assert [event["id"] for event in events if event["job"] == lease.job.id] == [
+            one.id for one in repository.events_of(lease.job.id).read(after)
+        ]
     ends = {json.loads(data)["job"]: json.loads(data)["state"] for kind, data in told if kind == "end"}
     assert ends == {leases[0].job.id: "SUCCEEDED", leases[2].job.id: "SUCCEEDED", "absent": None}
     assert leases[1].job.id not in {json.loads(data)["job"] for _, data in told}
@@ -125,7 +134,9 @@ def test_streams_that_are_equally_far_share_a_read(repository: Repository, monke
     assert len(reads) == 1
 
 
-def test_what_does_not_fit_into_one_read_follows_in_others(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_fit_into_one_read_follows_in_others(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(feed, "MAX_EVENTS", 16)
     lease = start(repository)
     work(repository, lease)
@@ -169,7 +180,9 @@ def test_a_stream_of_a_job_that_is_deleted_ends(repository: Repository, monkeypa
     assert forgotten == ""
 
 
-def test_a_stalled_stream_keeps_little_and_is_told_everything_later(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stalled_stream_keeps_little_and_is_told_everything_later(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(feed, "PERIOD_S", 0.0)
     monkeypatch.setattr(feed, "MAX_TURNS", 4)
     lease = start(repository)
@@ -196,7 +209,9 @@ def test_a_stalled_stream_keeps_little_and_is_told_everything_later(repository: 
     assert ids_of(asyncio.run(stall())) == [event.id for event in log.read()]
 
 
-def test_a_stream_outlasts_a_database_that_is_away_for_a_while(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_outlasts_a_database_that_is_away_for_a_while(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(feed, "PING_S", 0.01)
     lease, read, answers = start(repository), feed._read, iter([True, False, False])
 

@@ -8,11 +8,26 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.fit.export.pictures import DIVERGING, MASKED, Picture, colour_map, enlarge, png_bytes, scalar_map, signed_map, tone_map, white_level
+from services.fit.export.pictures import (
+    DIVERGING,
+    MASKED,
+    Picture,
+    colour_map,
+    enlarge,
+    png_bytes,
+    scalar_map,
+    signed_map,
+    tone_map,
+    white_level,
+)
 
 
 def luminance(rgb: tuple[int, int, int] | np.ndarray) -> float:
-    linear = np.where(np.asarray(rgb) / 255 <= 0.04045, np.asarray(rgb) / 255 / 12.92, ((np.asarray(rgb) / 255 + 0.055) / 1.055) ** 2.4)
+    linear = np.where(
+        np.asarray(rgb) / 255 <= 0.04045,
+        np.asarray(rgb) / 255 / 12.92,
+        ((np.asarray(rgb) / 255 + 0.055) / 1.055) ** 2.4,
+    )
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 

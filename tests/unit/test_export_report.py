@@ -60,20 +60,30 @@ def report(**changes: Any) -> FitReport:
         "enamel.sigma_s_reduced": Estimate(value=0.9021, se=0.0243, unit="1/mm", determined=True),
         "shape.1": Estimate(value=0.4, se=0.1, unit="1", determined=True),
     }
-    whole = {"converged": True, "advice": "", "parameters": {"green": table}, "fit_error": {"green": 0.0234}, "held_out_error": {"green": 0.0412}}
+    whole = {
+        "converged": True,
+        "advice": "",
+        "parameters": {"green": table},
+        "fit_error": {"green": 0.0234},
+        "held_out_error": {"green": 0.0412},
+    }
     return FitReport(**whole | {"steps": 12, "seconds": 421.0} | changes)
 
 
 def pictures(**changes: Any) -> ReportPictures:
     photo = np.random.default_rng(0).uniform(0.1, 0.2, (6, 5, 1))
     valid = np.ones((6, 5), dtype=bool)
-    shown = tuple(Picture("c0", light, held_out, photo, 1.1 * photo, valid) for light, held_out in (("l1", False), ("l3", True)))
+    shown = tuple(
+        Picture("c0", light, held_out, photo, 1.1 * photo, valid) for light, held_out in (("l1", False), ("l3", True))
+    )
     return ReportPictures(**{"channels": ("green",), "pictures": shown} | changes)
 
 
 def thickness(**changes: Any) -> ThicknessMap:
     mean = Estimate(value=0.7, se=0.06, unit="mm", determined=True)
-    return ThicknessMap(**{"image_mm": np.full((6, 5), 0.7), "errors_mm": np.full((6, 5), 0.08), "mean": mean} | changes)
+    return ThicknessMap(
+        **{"image_mm": np.full((6, 5), 0.7), "errors_mm": np.full((6, 5), 0.08), "mean": mean} | changes
+    )
 
 
 def page(path: Path, fit: FitReport, shown: ReportPictures, **context: Any) -> Page:
@@ -134,8 +144,13 @@ def test_numbers_carry_error_unit_and_flag(tmp_path: Path) -> None:
 
 
 def test_what_is_told_and_what_goes_together_are_shown(tmp_path: Path) -> None:
-    found = Correlation(names=("enamel.sigma", "enamel.alpha", "shape.1"), matrix=((1.0, -0.92, 0.1), (-0.92, 1.0, 0.0), (0.1, 0.0, 1.0)))
-    fit = report(told="This capture tells a lot.", next_capture="A light above would help most.", correlations={"green": found})
+    found = Correlation(
+        names=("enamel.sigma", "enamel.alpha", "shape.1"),
+        matrix=((1.0, -0.92, 0.1), (-0.92, 1.0, 0.0), (0.1, 0.0, 1.0)),
+    )
+    fit = report(
+        told="This capture tells a lot.", next_capture="A light above would help most.", correlations={"green": found}
+    )
     text = " ".join(page(tmp_path, fit, pictures()).text.split())
     assert text.index("This capture tells a lot. A light above would help most.") < text.index("Parameters")
     assert "greenenamel σenamel αc proximal enamel σ1−0.92+0.10 enamel α−0.921+0.00" in text
@@ -148,7 +163,13 @@ def test_the_thin_boundarys_bias_is_told(tmp_path: Path, boundary: str, expected
 
 
 def test_names_from_outside_cannot_inject_markup(tmp_path: Path) -> None:
-    shown = page(tmp_path, report(advice="<script>a</script>", converged=False), pictures(), title="<b>T</b>", provenance={"<i>": "<img src=x>"})
+    shown = page(
+        tmp_path,
+        report(advice="<script>a</script>", converged=False),
+        pictures(),
+        title="<b>T</b>",
+        provenance={"<i>": "<img src=x>"},
+    )
     assert "script" not in shown.tags
     assert "x" not in shown.addresses
     assert "<b>T</b>" in shown.text
@@ -160,7 +181,9 @@ def test_a_picture_without_signal_still_makes_a_page(tmp_path: Path) -> None:
 
 
 def test_chart_puts_larger_losses_higher_and_leaves_out_what_has_no_logarithm() -> None:
-    chart = log_chart("Loss", "step", "loss", [Series("green", ((1, 1.0), (2, 0.1), (3, 0.0), (4, 0.01))), Series("empty", ())])
+    chart = log_chart(
+        "Loss", "step", "loss", [Series("green", ((1, 1.0), (2, 0.1), (3, 0.0), (4, 0.01))), Series("empty", ())]
+    )
     (points,) = re.findall(r'points="([^"]+)"', chart)
     heights = [float(point.split(",")[1]) for point in points.split()]
     assert len(heights) == 3

@@ -24,7 +24,9 @@ def written(tmp_path: Path) -> ET.Element:
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", (1.0, 2.0, 3.0), strict=True)]
     tissue = Tissue(Medium(4.0, 0.99, 0.9, 0.8, -0.1), Medium(12.0, 0.98, g1=0.7))
     teeth = {"11": (Path("teeth/11/outer.ply"), Path("teeth/11/dentin.ply"))}
-    scene = nested_scene(teeth, tissue, (CAMERA,), position, SceneParameter("intensity", 7.0), samples=SceneParameter("spp", 16))
+    scene = nested_scene(
+        teeth, tissue, (CAMERA,), position, SceneParameter("intensity", 7.0), samples=SceneParameter("spp", 16)
+    )
     write_scene(tmp_path / "scene.xml", scene)
     return ET.parse(tmp_path / "scene.xml").getroot()
 
@@ -42,8 +44,13 @@ def test_parameters_have_defaults_and_are_used(tmp_path: Path) -> None:
 
 def test_media_nest_by_reference(tmp_path: Path) -> None:
     root = written(tmp_path)
-    shapes = {shape.get("id"): {r.get("name"): r.get("id") for r in shape.findall("ref")} for shape in root.findall("shape")}
-    assert shapes == {"outer_11": {"interior": "medium_enamel"}, "dentin_11": {"interior": "medium_dentin", "exterior": "medium_enamel"}}
+    shapes = {
+        shape.get("id"): {r.get("name"): r.get("id") for r in shape.findall("ref")} for shape in root.findall("shape")
+    }
+    assert shapes == {
+        "outer_11": {"interior": "medium_enamel"},
+        "dentin_11": {"interior": "medium_dentin", "exterior": "medium_enamel"},
+    }
     defined = [element.get("id") for element in root]
     assert defined.index("medium_enamel") < defined.index("outer_11")
     assert defined.index("medium_dentin") < defined.index("dentin_11")

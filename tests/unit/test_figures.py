@@ -39,13 +39,18 @@ def plain(colour: tuple[int, int, int], height: int, width: int) -> np.ndarray:
 def picture(photo: float, render: float) -> Picture:
     valid = np.zeros((6, 8), dtype=bool)
     valid[2:5, 3:6] = True
-    return Picture("c0", "l0", False, np.where(valid, photo, 0.0)[..., None], np.where(valid, render, 0.0)[..., None], valid)
+    return Picture(
+        "c0", "l0", False, np.where(valid, photo, 0.0)[..., None], np.where(valid, render, 0.0)[..., None], valid
+    )
 
 
 def test_every_picture_is_found_whole_and_enlarged_in_its_place() -> None:
     red, green, blue = (plain(colour, 5, 40) for colour in ((255, 0, 0), (0, 255, 0), (0, 0, 255)))
     page = mosaic([[red, green], [None, blue]], [Column("a"), Column("b", starts_group=True)], ["x", "y"], scale=2)
-    places = {name: np.argwhere((page == colour).all(axis=-1)) for name, colour in (("red", (255, 0, 0)), ("green", (0, 255, 0)), ("blue", (0, 0, 255)))}
+    places = {
+        name: np.argwhere((page == colour).all(axis=-1))
+        for name, colour in (("red", (255, 0, 0)), ("green", (0, 255, 0)), ("blue", (0, 0, 255)))
+    }
     for name, place in places.items():
         (top, left), (bottom, right) = place.min(axis=0), place.max(axis=0)
         assert (bottom - top + 1, right - left + 1, len(place)) == (10, 80, 800), name
@@ -101,7 +106,9 @@ def test_figures_are_chosen_in_the_order_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize(("only", "words"), [("fig7", "Figure 'fig7' does not exist"), (" ,", "names no figure")])
-def test_an_unknown_figure_is_refused_before_anything_is_rendered(only: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_figure_is_refused_before_anything_is_rendered(
+    only: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["--out", str(tmp_path / "figures"), "--only", only]) == InputError.exit_status
     said = capsys.readouterr().err
     assert words in said
@@ -118,7 +125,10 @@ def test_a_figure_joins_the_page_of_those_that_are_there(tmp_path: Path) -> None
 
 
 def written(folder: Path) -> FolderCapture:
-    cameras, lights = (camera("c0"), camera("c1")), tuple(Light(name=f"l{n}", position_mm=(0.0, 0.0, float(-n - 1)), intensity=(1.0,)) for n in range(3))
+    cameras, lights = (
+        (camera("c0"), camera("c1")),
+        tuple(Light(name=f"l{n}", position_mm=(0.0, 0.0, float(-n - 1)), intensity=(1.0,)) for n in range(3)),
+    )
     images = []
     for c in cameras:
         for light in lights:
@@ -128,7 +138,9 @@ def written(folder: Path) -> FolderCapture:
             lit[1:] = 1.0
             np.save(folder / f"{stem}.npy", lit)
             np.save(folder / f"{stem}_var.npy", np.full_like(lit, 1e-6))
-            images.append(ImageEntry(camera=c.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy"))
+            images.append(
+                ImageEntry(camera=c.name, light=light.name, file=f"{stem}.npy", variance_file=f"{stem}_var.npy")
+            )
     (folder / "teeth" / "11").mkdir(parents=True)
     (folder / "teeth" / "11" / "outer.ply").write_text("ply\n")
     description = FolderCapture(units="mm", channels=("green",), cameras=cameras, lights=lights, images=tuple(images))
@@ -171,7 +183,9 @@ def test_a_case_that_its_capture_cannot_give_is_refused(changes: dict[str, Any],
         write_photographs(tmp_path / "all", tmp_path / "some", case(**changes), {})
 
 
-def test_a_finished_capture_is_used_again_and_other_options_are_another_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_capture_is_used_again_and_other_options_are_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     called = []
 
     def render(*arguments: str) -> None:
@@ -205,7 +219,9 @@ def rows() -> list[Row]:
 def test_ambient_light_is_said_by_its_strength_and_what_was_found_of_the_truth(rows: list[Row]) -> None:
     said = sentence(rows)
     assert "without it 1.05 ± 0.05, 1.05 ± 0.05, 1.05 ± 0.05, 1.05 ± 0.05, held-out error 3.0 %;" in said
-    assert said.endswith("with 5 % of the mean radiance 1.05 ± 0.05, 1.16 ± 0.05, 1.26 ± 0.05, 1.37 ± 0.05, held-out error 8.0 %.")
+    assert said.endswith(
+        "with 5 % of the mean radiance 1.05 ± 0.05, 1.16 ± 0.05, 1.26 ± 0.05, 1.37 ± 0.05, held-out error 8.0 %."
+    )
     lines = table(rows).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert "| 5 % | 2 ± 0.1 | 2.2 ± 0.1 | 2.4 ± 0.1 | 2.6 ± 0.1 | 2.0 % | 8.0 % |" in lines

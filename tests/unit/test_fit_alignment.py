@@ -29,7 +29,13 @@ def ball(right_px: float = 0.0, down_px: float = 0.0, exponent: float = 1.0, flo
 
 
 def compare(
-    root: Path, photo: NDArray[np.float64], render: NDArray[np.float64], noise: float = 0.02, neighbour: float = 0.0, tooth: int | None = None, seed: int = 3
+    root: Path,
+    photo: NDArray[np.float64],
+    render: NDArray[np.float64],
+    noise: float = 0.02,
+    neighbour: float = 0.0,
+    tooth: int | None = None,
+    seed: int = 3,
 ) -> tuple[Offset | None, list[str]]:
     """Offset and sentences for one camera and one light.
 
@@ -42,7 +48,11 @@ def compare(
     camera = Camera(name="c0", size=(SIZE, SIZE), K=k, camera_from_world=pose)
     inside = ball() > 0
     photo = np.where(photo > 0, photo, neighbour) + noise * np.random.default_rng(seed).standard_normal(photo.shape)
-    arrays = {"radiance": photo[..., None], "variance": np.full((SIZE, SIZE, 1), noise**2), "valid": np.where(inside, 0, MaskBit.OUTSIDE)}
+    arrays = {
+        "radiance": photo[..., None],
+        "variance": np.full((SIZE, SIZE, 1), noise**2),
+        "valid": np.where(inside, 0, MaskBit.OUTSIDE),
+    }
     for name, values in arrays.items():
         stored = create_array(
             root / "prepared.zarr", name, (1, 1, *values.shape), (1, 1, *values.shape), "uint16" if name == "valid" else "float32",
@@ -50,16 +60,35 @@ def compare(
         )  # fmt: skip
         stored[0, 0] = values
     manifest = PreparedManifest(
-        channels=("green",), cameras=(camera,), lights=lights(1), held_out=(), fdi=(11,), dentin_known=(), median_motion_px=None, valid_fraction=1.0
+        channels=("green",),
+        cameras=(camera,),
+        lights=lights(1),
+        held_out=(),
+        fdi=(11,),
+        dentin_known=(),
+        median_motion_px=None,
+        valid_fraction=1.0,
     )
     observations = Observations(root, manifest, (Tooth(11, sphere(4.0)),), np.zeros((1, 1), dtype=bool))
     y, x = np.nonzero(inside)
     pixels = np.stack([x, y], axis=-1).astype(np.int32)
     valid, held_out = np.ones((1, len(x)), dtype=bool), np.zeros(1, dtype=bool)
     halves = (x >= SIZE // 2).astype(np.int16)
-    views = (ViewStack(camera, pixels, photo[y, x][None], np.full((1, len(x)), noise**2), valid, held_out, PixelParts(halves, halves)),)
+    views = (
+        ViewStack(
+            camera,
+            pixels,
+            photo[y, x][None],
+            np.full((1, len(x)), noise**2),
+            valid,
+            held_out,
+            PixelParts(halves, halves),
+        ),
+    )
     evaluation = Evaluation(ErrorSums(), ErrorSums(), {("c0", 0): (pixels, render[y, x])})
-    told = offsets_told({"green": evaluation}, {"green": 0.3}, observations, {"green": views}, "the mesh of tooth 11", tooth)
+    told = offsets_told(
+        {"green": evaluation}, {"green": 0.3}, observations, {"green": views}, "the mesh of tooth 11", tooth
+    )
     return clearest_offset(evaluation, observations, views, "green", tooth), told
 
 
@@ -105,7 +134,9 @@ def test_one_tooth_of_two_that_lies_elsewhere_is_told_from_the_other(tmp_path: P
     ],
     ids=["explained", "brightness", "shading", "stripes", "a fifth of a millimetre"],
 )
-def test_other_faults_are_not_called_an_offset(tmp_path: Path, photo: NDArray[np.float64], render: NDArray[np.float64]) -> None:
+def test_other_faults_are_not_called_an_offset(
+    tmp_path: Path, photo: NDArray[np.float64], render: NDArray[np.float64]
+) -> None:
     assert compare(tmp_path, photo, render) == (None, [])
 
 

@@ -11,7 +11,15 @@ import pytest
 
 from services.core.records import Device
 from services.fit.checks.evaluate import evaluate_task
-from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.execution.blocks import (
+    Block,
+    BlockTask,
+    StoredFile,
+    read_block,
+    read_recipe,
+    write_block,
+    write_recipe,
+)
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.passes import compare_task, image_task, jacobian_task, orders_task
 from services.fit.optics.parameters import Medium, Tissue
@@ -31,7 +39,9 @@ def block_with(weights: list[list[float]]) -> Block:
     ("weights", "lights"),
     [([[0, 0], [2, 0], [0, 2]], (1, 2)), ([[0, 0], [0, 3], [0, 0]], (1,)), ([[1, 1], [0, 1], [1, 0]], None)],
 )
-def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: list[list[float]], lights: tuple[int, ...] | None) -> None:
+def test_only_fitted_lights_are_rendered_for_the_fit(
+    tmp_path: Path, weights: list[list[float]], lights: tuple[int, ...] | None
+) -> None:
     block = read_block(write_block(tmp_path, block_with(weights)))
     assert block.fitted_view.lights == lights
     np.testing.assert_array_equal(block.fitted_view.pixels, block.view.pixels)
@@ -40,8 +50,13 @@ def test_only_fitted_lights_are_rendered_for_the_fit(tmp_path: Path, weights: li
 
 @pytest.mark.parametrize("device", [None, "llvm", "cuda"])
 def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) -> None:
-    teeth = (ToothSurfaces(ellipsoid(SEMI_AXES_MM), dentin_shape()), ToothSurfaces(sphere(2.0), stain_uv=np.ones((len(sphere(2.0).faces), 3, 2))))
-    scene = SceneRecipe(teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0), 0.5)
+    teeth = (
+        ToothSurfaces(ellipsoid(SEMI_AXES_MM), dentin_shape()),
+        ToothSurfaces(sphere(2.0), stain_uv=np.ones((len(sphere(2.0).faces), 3, 2))),
+    )
+    scene = SceneRecipe(
+        teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0), 0.5
+    )
     stored = read_recipe(write_recipe(tmp_path, scene))
     assert (stored.boundary, stored.ior, stored.device, stored.gums_ior) == ("thin", 1.5, device, 1.4)
     np.testing.assert_equal(asdict(stored), asdict(scene))
@@ -49,10 +64,22 @@ def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) 
 
 @pytest.mark.parametrize("missing", ["gums", "cavity", "dentin"])
 def test_what_a_scene_lacks_stays_absent(tmp_path: Path, missing: str) -> None:
-    whole = SceneRecipe((ToothSurfaces(sphere(2.0), dentin_shape()),), LIGHTS_MM, np.ones(len(LIGHTS_MM)), gums=sphere(5.0), cavity=sphere(9.0))
-    scene = replace(whole, teeth=(ToothSurfaces(sphere(2.0)),)) if missing == "dentin" else replace(whole, **{missing: None})
+    whole = SceneRecipe(
+        (ToothSurfaces(sphere(2.0), dentin_shape()),),
+        LIGHTS_MM,
+        np.ones(len(LIGHTS_MM)),
+        gums=sphere(5.0),
+        cavity=sphere(9.0),
+    )
+    scene = (
+        replace(whole, teeth=(ToothSurfaces(sphere(2.0)),))
+        if missing == "dentin"
+        else replace(whole, **{missing: None})
+    )
     stored = read_recipe(write_recipe(tmp_path, scene))
-    assert (stored.gums is None, stored.cavity is None, stored.teeth[0].dentin is None) == tuple(missing == part for part in ("gums", "cavity", "dentin"))
+    assert (stored.gums is None, stored.cavity is None, stored.teeth[0].dentin is None) == tuple(
+        missing == part for part in ("gums", "cavity", "dentin")
+    )
 
 
 class Recorder:
@@ -68,7 +95,9 @@ class Recorder:
             return StackEstimate(np.zeros(shape), np.zeros(shape))
         if method == "order_images":
             return np.zeros((len(options["bin_edges"]) - 1, *shape))
-        return JacobianEstimate(names[0], np.zeros(shape), np.zeros(shape), np.zeros((1, *shape)), np.zeros((1, *shape)))
+        return JacobianEstimate(
+            names[0], np.zeros(shape), np.zeros(shape), np.zeros((1, *shape)), np.zeros((1, *shape))
+        )
 
     def close(self) -> None:
         """Nothing to release."""

@@ -12,7 +12,17 @@ from pydantic import ValidationError
 
 from services.core.errors import SettingsError
 from services.core.records import JobSpec
-from services.fit.optics.domain import BOUNDS, HELD_G, Coordinate, Domain, kind_of, natural_derivative, similar_medium, to_dual, to_natural
+from services.fit.optics.domain import (
+    BOUNDS,
+    HELD_G,
+    Coordinate,
+    Domain,
+    kind_of,
+    natural_derivative,
+    similar_medium,
+    to_dual,
+    to_natural,
+)
 from services.fit.optics.parameters import Medium, Tissue
 
 KINDS = tuple(BOUNDS)
@@ -65,7 +75,9 @@ def test_unknown_parameter_is_named() -> None:
 
 
 @given(sigma=st.floats(0.01, 100), alpha=st.floats(0.5, 0.99999), g=st.floats(-0.5, 0.95), other=st.floats(0, 0.9))
-def test_similar_media_share_reduced_scattering_and_absorption(sigma: float, alpha: float, g: float, other: float) -> None:
+def test_similar_media_share_reduced_scattering_and_absorption(
+    sigma: float, alpha: float, g: float, other: float
+) -> None:
     medium = Medium(sigma, alpha, g1=g)
     similar = similar_medium(medium, other)
     assert similar.sigma_s_reduced == pytest.approx(medium.sigma_s_reduced, rel=1e-9)
@@ -75,14 +87,18 @@ def test_similar_media_share_reduced_scattering_and_absorption(sigma: float, alp
 
 def test_a_cosine_changes_neither_reduced_quantity_and_comes_back() -> None:
     tissue = Tissue(Medium(4.0, 0.995, g1=0.6), Medium(12.0, 0.99, g1=0.75))
-    domain = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "enamel.cosine")))
+    domain = Domain(
+        tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "enamel.cosine"))
+    )
     x = domain.x_of(tissue)
     again = domain.tissue_at(x, tissue)
     for name in ("enamel.sigma", "enamel.alpha", "enamel.g1", "dentin.sigma", "dentin.g1"):
         assert again.value(name) == pytest.approx(tissue.value(name), rel=1e-12)
     moved = domain.tissue_at(x + np.array([0, 0, 0, 0.5]), tissue).enamel
     assert moved.g1 == pytest.approx(math.tanh(math.atanh(0.6) + 0.5))
-    assert (moved.sigma_s_reduced, moved.alpha_reduced) == pytest.approx((tissue.enamel.sigma_s_reduced, tissue.enamel.alpha_reduced))
+    assert (moved.sigma_s_reduced, moved.alpha_reduced) == pytest.approx(
+        (tissue.enamel.sigma_s_reduced, tissue.enamel.alpha_reduced)
+    )
     # The other coordinates are those of the medium at the cosine that is held where none is fitted.
     assert x[0] == pytest.approx(math.log(similar_medium(tissue.enamel, HELD_G).sigma))
 

@@ -16,7 +16,13 @@ from services.phantom.dome_rig import dome_cameras
 def known(*names: str) -> Uncertainty:
     count = len(names)
     covariance = np.arange(count**2, dtype=np.float64).reshape(count, count)
-    return Uncertainty(Domain(tuple(Coordinate((name,)) for name in names)), np.zeros(count), covariance, np.zeros((count, 0)), np.eye(count))
+    return Uncertainty(
+        Domain(tuple(Coordinate((name,)) for name in names)),
+        np.zeros(count),
+        covariance,
+        np.zeros((count, 0)),
+        np.eye(count),
+    )
 
 
 def test_the_blend_weights_covariance_is_cut_out_of_the_whole() -> None:
@@ -32,7 +38,9 @@ def test_thickness_has_an_error_only_where_the_dentin_was_fitted() -> None:
     assert given is not None
     assert given.mean.se is None
     fitted = JobSpec.model_validate({"capture": "c", "dentin": "fit"})
-    spread = fitted_thickness(tooth, cameras, fitted, (0.5, 0.5, 0.5), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)))
+    spread = fitted_thickness(
+        tooth, cameras, fitted, (0.5, 0.5, 0.5), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
+    )
     assert spread is not None
     assert spread.mean.se is not None
     # Independent weights of 0.1 move the mean by some hundredths of a millimetre, and each point's by at least as much in the root mean square.

@@ -32,7 +32,9 @@ def test_lights_of_a_pixel_err_together() -> None:
     draws = []
     for _ in range(2000):
         first, second = (reference * 1.1 + 0.2 * rng.standard_normal(60) for _ in range(2))
-        draws.append(error_sums(first, second, reference, np.zeros_like(reference), np.ones_like(reference, dtype=bool)))
+        draws.append(
+            error_sums(first, second, reference, np.zeros_like(reference), np.ones_like(reference, dtype=bool))
+        )
     stated, seen = np.mean([draw.product_noise for draw in draws]), np.var([draw.product for draw in draws])
     assert stated == pytest.approx(seen, rel=0.1)
 
@@ -43,7 +45,9 @@ def test_masked_measurements_do_not_count_and_blocks_add() -> None:
     v, chosen = np.full(40, 1e-4), rng.uniform(size=40) > 0.3
     a[~chosen] = np.nan
     whole = error_sums(a, b, r, v, chosen)
-    parts = error_sums(a[:15], b[:15], r[:15], v[:15], chosen[:15]) + error_sums(a[15:], b[15:], r[15:], v[15:], chosen[15:])
+    parts = error_sums(a[:15], b[:15], r[:15], v[:15], chosen[:15]) + error_sums(
+        a[15:], b[15:], r[15:], v[15:], chosen[15:]
+    )
     assert whole.error == pytest.approx(parts.error)
     assert np.isfinite(whole.error or np.nan)
 

@@ -37,9 +37,9 @@ def test_known_and_unknown_are_told_with_unit_and_error() -> None:
 
 
 def test_a_large_error_is_not_knowledge() -> None:
-    assert "but not enamel absorption or dentin absorption" in told({"green": table(**{"dentin.sigma_a": estimate(0.03, 0.02)})}, {}).replace(
-        " (anything up to 0.05 per mm fits)", ""
-    )
+    assert "but not enamel absorption or dentin absorption" in told(
+        {"green": table(**{"dentin.sigma_a": estimate(0.03, 0.02)})}, {}
+    ).replace(" (anything up to 0.05 per mm fits)", "")
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,9 @@ def test_channels_that_tell_the_same_share_a_sentence() -> None:
     whole = table(**{"enamel.sigma_a": estimate(0.01, 0.001)})
     text = told({"red": table(), "green": table(), "blue": whole}, {})
     assert text.count("this capture tells") == 2
-    assert text.startswith("In red and green this capture tells enamel scattering (red 0.900 ± 0.050 per mm, green 0.900 ± 0.050 per mm)")
+    assert text.startswith(
+        "In red and green this capture tells enamel scattering (red 0.900 ± 0.050 per mm, green 0.900 ± 0.050 per mm)"
+    )
     assert "In blue this capture tells" in text
 
 

@@ -46,7 +46,9 @@ def test_the_wall_reflects_like_an_isotropic_half_space() -> None:
         # The fit's own error is at most 0.0021; similarity is exact for what is isotropic.
         assert half_space_reflectance(Medium(3.0, albedo)) == pytest.approx(exact, abs=0.0022)
     forward = Medium(10.0, 0.99, g1=0.9)
-    assert half_space_reflectance(forward) == pytest.approx(half_space_reflectance(Medium(1.0, forward.alpha_reduced)), rel=1e-12)
+    assert half_space_reflectance(forward) == pytest.approx(
+        half_space_reflectance(Medium(1.0, forward.alpha_reduced)), rel=1e-12
+    )
 
 
 def test_hidden_teeth_are_tied_and_faults_of_their_own_are_told() -> None:
@@ -72,7 +74,12 @@ def test_hidden_teeth_are_tied_and_faults_of_their_own_are_told() -> None:
 
 
 def test_others_follow_the_median_of_the_front_teeth() -> None:
-    starts = [fitted(11, tissue(2.0)), fitted(12, tissue(8.0)), fitted(16, tissue(100.0)), ToothStart(17, "tied", "Hidden.", 0, None)]
+    starts = [
+        fitted(11, tissue(2.0)),
+        fitted(12, tissue(8.0)),
+        fitted(16, tissue(100.0)),
+        ToothStart(17, "tied", "Hidden.", 0, None),
+    ]
     mouth = start_mouth(starts, Medium(8.0, 0.96, g1=0.8), has_cavity=True)
     # The median of two in ln sigma; the molar does not count.
     assert mouth.teeth[3].enamel.sigma == pytest.approx(4.0)
@@ -83,7 +90,9 @@ def test_others_follow_the_median_of_the_front_teeth() -> None:
     turned = similar_tissue(tissue(5.0), 0.5)
     for part in ("enamel", "dentin"):
         other, own = typical([starts[2]], [turned]).medium(part), turned.medium(part)
-        assert (other.g1, other.sigma_s_reduced, other.alpha_reduced) == pytest.approx((0.8, own.sigma_s_reduced, own.alpha_reduced))
+        assert (other.g1, other.sigma_s_reduced, other.alpha_reduced) == pytest.approx(
+            (0.8, own.sigma_s_reduced, own.alpha_reduced)
+        )
     with pytest.raises(InputError, match=r"No tooth of the jaw can be fitted.*Hidden"):
         start_mouth([starts[3]], None, has_cavity=False)
 
@@ -95,7 +104,12 @@ def test_neighbours_are_those_along_the_arch() -> None:
     names = [f"{k}.enamel.sigma" for k in range(4)] + ["gums.sigma", "cavity.reflectance"]
     domain = Domain(tuple(Coordinate((name,)) for name in names))
     # Teeth 11, 12, 21, 22 in a manifest's order stand as 12, 11, 21, 22.
-    assert Neighbours.of((11, 12, 21, 22)).near(domain) == ((0, 1, 2, 4, 5), (0, 1, 4, 5), (0, 2, 3, 4, 5), (2, 3, 4, 5))
+    assert Neighbours.of((11, 12, 21, 22)).near(domain) == (
+        (0, 1, 2, 4, 5),
+        (0, 1, 4, 5),
+        (0, 2, 3, 4, 5),
+        (2, 3, 4, 5),
+    )
     # One jaw after the other: 11 stands between 12 and 21, whatever bites on it.
     both = (12, 11, 21, 42, 41, 31)
     assert [both[k] for k in Neighbours.of(both).beside(both.index(11))] == [12, 11, 21]
@@ -107,9 +121,15 @@ def test_a_mouth_has_coordinates_like_a_tooth() -> None:
     x = domain.x_of(mouth)
     np.testing.assert_allclose(x, [math.log(6.0), -math.log10(0.04), math.log(0.3 / 0.7)])
     moved = domain.tissue_at(x + np.array([math.log(2), 1.0, 0.0]), mouth)
-    assert (moved.teeth[1].dentin.sigma, moved.value("gums.alpha"), moved.reflectance) == pytest.approx((12.0, 0.996, 0.3))
+    assert (moved.teeth[1].dentin.sigma, moved.value("gums.alpha"), moved.reflectance) == pytest.approx(
+        (12.0, 0.996, 0.3)
+    )
     assert moved.teeth[0] == mouth.teeth[0]
-    assert [kind_of(name) for name in ("3.shape.1", "0.enamel.g1", "cavity.reflectance")] == ["shape", "g1", "reflectance"]
+    assert [kind_of(name) for name in ("3.shape.1", "0.enamel.g1", "cavity.reflectance")] == [
+        "shape",
+        "g1",
+        "reflectance",
+    ]
     similar = similar_tissue(mouth, 0.0)
     assert similar.reflectance == mouth.reflectance
     for part in ("0.enamel", "1.dentin", "gums"):
@@ -118,8 +138,19 @@ def test_a_mouth_has_coordinates_like_a_tooth() -> None:
 
 
 def test_coordinates_of_one_tooth_are_related() -> None:
-    domain = Domain(tuple(Coordinate((name,)) for name in ("0.enamel.sigma", "0.dentin.alpha", "11.enamel.sigma", "gums.sigma", "cavity.reflectance")))
-    assert domain.relation.tolist() == [[0, 0, 2, 1, 1], [0, 0, 2, 1, 1], [2, 2, 0, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 1]]
+    domain = Domain(
+        tuple(
+            Coordinate((name,))
+            for name in ("0.enamel.sigma", "0.dentin.alpha", "11.enamel.sigma", "gums.sigma", "cavity.reflectance")
+        )
+    )
+    assert domain.relation.tolist() == [
+        [0, 0, 2, 1, 1],
+        [0, 0, 2, 1, 1],
+        [2, 2, 0, 1, 1],
+        [1, 1, 1, 1, 1],
+        [1, 1, 1, 1, 1],
+    ]
     alone = Domain((Coordinate(("enamel.sigma", "dentin.sigma")), Coordinate(("shape.0",))))
     assert not alone.relation.any()
 
@@ -141,7 +172,10 @@ def test_a_molars_dentin_lies_as_its_cusps_do_whatever_the_cameras_see() -> None
     plate = trimesh.creation.box(extents=(7.0, 0.15, 8.0)).subdivide().subdivide()
     thin = Mesh(np.asarray(plate.vertices) + np.array([7.5, 0.0, 0.0]), np.asarray(plate.faces, dtype=np.int32))
     (camera,) = dome_cameras(1, 2.0, (solid.outer,))
-    teeth, spec = (Tooth(16, solid.outer), Tooth(15, thin)), JobSpec.model_validate({"capture": "c", "kind": "jaw", "dentin": "fit"})
+    teeth, spec = (
+        (Tooth(16, solid.outer), Tooth(15, thin)),
+        JobSpec.model_validate({"capture": "c", "kind": "jaw", "dentin": "fit"}),
+    )
     molar, other = jaw_dentins(teeth, (camera,), spec)
     assert other is None
     assert molar is not None
@@ -159,4 +193,9 @@ def test_steps_of_a_jaw_are_told_by_fdi_numbers_and_not_by_places_in_a_list() ->
     schedule = object.__new__(JawSchedule)
     schedule.teeth = [ToothStart(fdi, "fitted", "", 100, tissue(4.0)) for fdi in (21, 12)]
     names = ("0.enamel.sigma", "1.shape.0", "gums.sigma", "cavity.reflectance")
-    assert [schedule._told_name(name) for name in names] == ["21.enamel.sigma", "12.shape.0", "gums.sigma", "cavity.reflectance"]
+    assert [schedule._told_name(name) for name in names] == [
+        "21.enamel.sigma",
+        "12.shape.0",
+        "gums.sigma",
+        "cavity.reflectance",
+    ]

@@ -30,7 +30,11 @@ def test_a_journal_of_another_fit_is_neither_continued_nor_lost(tmp_path: Path) 
         assert journal.once("x", partial(str, owner)) == (owner, True)
         kept += [] if journal.set_aside is None else [read_entries(journal.set_aside)["x"]]
     assert kept == ["a", "b"]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["journal-set-aside-1.json", "journal-set-aside-2.json", "journal.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "journal-set-aside-1.json",
+        "journal-set-aside-2.json",
+        "journal.json",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +95,9 @@ def test_a_line_that_was_cut_short_is_computed_again(tmp_path: Path) -> None:
         assert path.read_bytes() == whole
 
 
-def test_a_result_that_the_disk_does_not_take_leaves_a_journal_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_that_the_disk_does_not_take_leaves_a_journal_that_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "journal.jsonl"
     journal = Journal(path, "a")
     journal.once("x", lambda: 1)

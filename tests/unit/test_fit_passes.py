@@ -20,14 +20,21 @@ from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.scene.recipe import View
 
 TISSUE = Tissue(Medium(5.0, 0.997, g1=0.72), Medium(14.0, 0.995, g1=0.8))
-DOMAIN = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.cosine")))
+DOMAIN = Domain(
+    tuple(
+        Coordinate((name,))
+        for name in ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha", "enamel.cosine")
+    )
+)
 NOWHERE = StoredFile(Path("nowhere"), "")
 POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 CAMERA = Camera(name="c", size=(1, 1), K=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), camera_from_world=POSE)
 VIEW = View(CAMERA, np.zeros((1, 2), dtype=np.int32))
 
 
-def problem(base: Tissue | Mouth = TISSUE, domain: Domain = DOMAIN, jacobian_g: float | None = 0.0) -> StackProblem[Any]:
+def problem(
+    base: Tissue | Mouth = TISSUE, domain: Domain = DOMAIN, jacobian_g: float | None = 0.0
+) -> StackProblem[Any]:
     return StackProblem(SimpleNamespace(), domain, base, "exact", jacobian_g=jacobian_g)  # type: ignore[arg-type]
 
 
@@ -41,7 +48,17 @@ class Linear:
         logs = np.log(tissue.enamel.sigma_s_reduced) + 2 * np.log(tissue.dentin.sigma_s_reduced)
         return float(logs + 3 * tissue.enamel.mean_cosine - 5 * (1 - tissue.enamel.alpha) * tissue.enamel.sigma)
 
-    def call(self, method: str, recipe: StoredFile, tissue: Tissue, view: View, names: tuple[str, ...] = (), *, samples: int, seed: int) -> Any:  # noqa: ARG002
+    def call(
+        self,
+        method: str,
+        recipe: StoredFile,  # noqa: ARG002
+        tissue: Tissue,
+        view: View,  # noqa: ARG002
+        names: tuple[str, ...] = (),
+        *,
+        samples: int,
+        seed: int,  # noqa: ARG002
+    ) -> Any:
         self.asked.append((method, samples))
         if method == "images":
             return SimpleNamespace(mean=np.array([[self.value(tissue)]]))
@@ -86,7 +103,11 @@ def test_every_column_gets_its_share_of_the_paths_and_a_common_image_is_rendered
     rendered(how, similar, engine)
     counted = {one: engine.asked.count(one) for one in engine.asked}
     # Two ends for each sigma; for two cosines one end each and the image itself.
-    assert counted == {("images", 1024 // REACH["sigma"].share): 4, ("images", 1024 // REACH["cosine"].share): 3, ("jacobian", 1024 // SCORES_SHARE): 1}
+    assert counted == {
+        ("images", 1024 // REACH["sigma"].share): 4,
+        ("images", 1024 // REACH["cosine"].share): 3,
+        ("jacobian", 1024 // SCORES_SHARE): 1,
+    }
     assert how.parameters == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
     assert len(x) == 5
 
@@ -100,7 +121,17 @@ def test_in_exact_media_extinction_has_scores() -> None:
 class Teeth(Linear):
     """A jaw's engine: a pixel for each tooth, brightened a little by both neighbours."""
 
-    def call(self, method: str, recipe: StoredFile, tissue: Mouth, view: View, names: tuple[str, ...] = (), *, samples: int, seed: int) -> Any:  # noqa: ARG002
+    def call(
+        self,
+        method: str,
+        recipe: StoredFile,  # noqa: ARG002
+        tissue: Mouth,
+        view: View,  # noqa: ARG002
+        names: tuple[str, ...] = (),
+        *,
+        samples: int,
+        seed: int,  # noqa: ARG002
+    ) -> Any:
         self.asked.append((method, samples))
         if method != "images":
             return SimpleNamespace(jacobian=np.zeros((len(names), 1, len(tissue.teeth))))
@@ -123,7 +154,9 @@ def test_teeth_that_stand_apart_are_moved_at_once_and_told_apart() -> None:
     assert engine.asked == [("images", 1024 // REACH["cosine"].share)] * 7
     beside = np.abs(places[:, None] - places) <= 1
     slope = 3 * natural_derivative("cosine", float(x[1]))
-    np.testing.assert_allclose(rows[1::2], slope * np.where(places[:, None] == places, 1.0, np.where(beside, 0.1, 0.0)), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        rows[1::2], slope * np.where(places[:, None] == places, 1.0, np.where(beside, 0.1, 0.0)), rtol=1e-9, atol=1e-9
+    )
     assert not rows[::2].any()
 
 
@@ -141,4 +174,6 @@ def test_the_closing_measurement_takes_slopes_of_the_images_own_media() -> None:
     engine, x = Linear(), DOMAIN.x_of(TISSUE)
     slopes = problem().slopes(x)
     assert slopes.parameters == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
-    np.testing.assert_allclose(rendered(slopes, TISSUE, engine), [slope(x, k, engine) for k in range(5)], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        rendered(slopes, TISSUE, engine), [slope(x, k, engine) for k in range(5)], rtol=1e-4, atol=1e-6
+    )

@@ -17,7 +17,12 @@ class Replay:
     """Fits of steps of blocks on workers that take the ready task of the highest priority, in simulated time."""
 
     def __init__(self, block_s: Sequence[float], weights: Sequence[float]) -> None:
-        self.now_s, self._free, self._ready, self._events = 0.0, WORKERS, list[tuple[float, int, int]](), list[tuple[float, int, int]]()
+        self.now_s, self._free, self._ready, self._events = (
+            0.0,
+            WORKERS,
+            list[tuple[float, int, int]](),
+            list[tuple[float, int, int]](),
+        )
         self._block_s, self._order = block_s, 0
         self._shares = [Share(weight, lambda: self.now_s) for weight in weights]
         self._left, self._flying = [BLOCKS for _ in block_s], [0 for _ in block_s]

@@ -14,12 +14,16 @@ from services.api.jobs.forecast import MIN_OBSERVATIONS, SHARE, Observation, for
 
 SECONDS = st.floats(0.01, 1e6)
 LOGARITHMS = st.floats(-5, 15)
-PAST = st.lists(st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), min_size=MIN_OBSERVATIONS, max_size=20)
+PAST = st.lists(
+    st.builds(Observation, st.tuples(LOGARITHMS, LOGARITHMS), SECONDS), min_size=MIN_OBSERVATIONS, max_size=20
+)
 SLOPES = (0.5, 0.5)
 some = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-def range_of(past: list[Observation], features: tuple[float, ...] = (0.0, 0.0), elapsed_s: float = 0.0, share: float = SHARE) -> tuple[float, float]:
+def range_of(
+    past: list[Observation], features: tuple[float, ...] = (0.0, 0.0), elapsed_s: float = 0.0, share: float = SHARE
+) -> tuple[float, float]:
     outlook = foresee(past, features, SLOPES)
     assert outlook is not None
     left = outlook.remaining_s(elapsed_s, share)
@@ -85,7 +89,10 @@ def test_what_lasted_far_longer_than_all_others_has_no_range() -> None:
 
 def test_a_job_unlike_the_others_gets_a_wider_range() -> None:
     chance = np.random.default_rng(3)
-    past = [Observation((x, 0.0), math.exp(0.8 * x + 0.1 * chance.standard_normal())) for x in (0.0, 0.3, 0.5, 0.8, 1.0, 1.1)]
+    past = [
+        Observation((x, 0.0), math.exp(0.8 * x + 0.1 * chance.standard_normal()))
+        for x in (0.0, 0.3, 0.5, 0.8, 1.0, 1.1)
+    ]
     widths = [math.log(high / low) for low, high in (range_of(past, (x, 0.0)) for x in (0.6, 5.0, 10.0))]
     assert widths[0] < widths[1] < widths[2]
 
@@ -98,6 +105,8 @@ def test_ranges_hold_the_truth_as_often_as_they_say(count: int, noise: float) ->
     for _ in range(cases):
         x = chance.normal(0.0, 1.0, count + 1)
         seconds = (0.5 + np.exp(x)) * np.exp(noise * chance.standard_normal(count + 1))
-        low, high = range_of([Observation((a, 0.0), b) for a, b in zip(x[:-1], seconds[:-1], strict=True)], (x[-1], 0.0))
+        low, high = range_of(
+            [Observation((a, 0.0), b) for a, b in zip(x[:-1], seconds[:-1], strict=True)], (x[-1], 0.0)
+        )
         held += low <= seconds[-1] <= high
     assert 0.65 < held / cases < 0.92

@@ -22,7 +22,11 @@ def log(tmp_path: Path) -> Iterator[EventLog]:
 
 
 def step(number: int, channel: str = "green", loss: float = 1.0, **data: object) -> StageEvent:
-    return StageEvent(stage="fit", kind="step", data={"channel": channel, "step": number, "loss": loss, "parameters": {"enamel.sigma": float(number)}} | data)
+    return StageEvent(
+        stage="fit",
+        kind="step",
+        data={"channel": channel, "step": number, "loss": loss, "parameters": {"enamel.sigma": float(number)}} | data,
+    )
 
 
 def test_columns_hold_what_steps_tell(log: EventLog) -> None:
@@ -49,7 +53,9 @@ def test_a_later_attempt_replaces_the_steps_that_it_repeats(log: EventLog) -> No
 
 def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = []
-    monkeypatch.setattr("services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked))
+    monkeypatch.setattr(
+        "services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked)
+    )
     histories = Histories(most_bytes=2000)
     for number in range(3):
         log.append(1, step(number))
@@ -75,8 +81,14 @@ def test_names_of_channels_that_nothing_is_known_of_count_as_what_they_take(log:
 def test_thinned_columns_are_even_and_keep_both_ends(log: EventLog, first: int, count: int, points: int) -> None:
     with log._engine.begin() as connection:
         connection.execute(event_table.delete())
-        rows = [{"job": "local", "attempt": 1, "time_s": 0.0, "stage": "fit", "kind": "step", "message": ""} for _ in range(count)]
-        connection.execute(event_table.insert(), [row | {"data": step(first + k).model_dump_json(include={"data"})[8:-1]} for k, row in enumerate(rows)])
+        rows = [
+            {"job": "local", "attempt": 1, "time_s": 0.0, "stage": "fit", "kind": "step", "message": ""}
+            for _ in range(count)
+        ]
+        connection.execute(
+            event_table.insert(),
+            [row | {"data": step(first + k).model_dump_json(include={"data"})[8:-1]} for k, row in enumerate(rows)],
+        )
     steps = read_history(log, points).series[0].step
     assert (steps[0], steps[-1]) == (first, first + count - 1)
     assert len(steps) <= points

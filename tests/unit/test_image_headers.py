@@ -25,7 +25,13 @@ def exr(*parts: dict[str, tuple[str, bytes]]) -> bytes:
     """The head of an OpenEXR file with these attributes."""
     head = struct.pack("<II", 20000630, 2 | (0x1000 if len(parts) > 1 else 0))
     for part in parts:
-        head += b"".join(name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value for name, (kind, value) in part.items()) + b"\0"
+        head += (
+            b"".join(
+                name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+                for name, (kind, value) in part.items()
+            )
+            + b"\0"
+        )
     return head + b"\0"
 
 
@@ -49,7 +55,9 @@ def tiff(width: int, height: int, order: str = "<", *, big: bool = False) -> byt
         if len(packed) > room:
             tail, packed = tail + packed, struct.pack(f"{order}{wide}", at + len(tail))
         entries += struct.pack(f"{order}HH{wide}", tag, kind, len(values)) + packed.ljust(room, b"\0")
-    mark = (b"II" if order == "<" else b"MM") + (struct.pack(f"{order}HHHQ", 43, 8, 0, 16) if big else struct.pack(f"{order}HI", 42, 8))
+    mark = (b"II" if order == "<" else b"MM") + (
+        struct.pack(f"{order}HHHQ", 43, 8, 0, 16) if big else struct.pack(f"{order}HI", 42, 8)
+    )
     return mark + struct.pack(f"{order}{count}", len(rows)) + entries + bytes(room) + tail
 
 
@@ -60,7 +68,12 @@ HEADS = [
     (".tiff", tiff(40, 30, ">"), "40 x 30 pixels of 3 channels", 7200),
     (".tif", tiff(40, 30, big=True), "40 x 30 pixels of 3 channels", 7200),
     (".exr", exr(exr_part(40, 30, "BGR")), "40 x 30 pixels of 3 channels", 7200),
-    (".exr", exr(exr_part(40, 30, "Z", 2), exr_part(4, 3, "Y")), "40 x 30 pixels of 1 channels; 4 x 3 pixels of 1 channels", 4824),
+    (
+        ".exr",
+        exr(exr_part(40, 30, "Z", 2), exr_part(4, 3, "Y")),
+        "40 x 30 pixels of 1 channels; 4 x 3 pixels of 1 channels",
+        4824,
+    ),
 ]
 
 
@@ -84,7 +97,9 @@ def test_headers_of_another_writer_are_read(tmp_path: Path, mode: str, suffix: s
     assert found.decoded_bytes == 7 * 5 * {"L": 1, "RGB": 3, "RGBA": 4, "I;16": 2}[mode]
 
 
-@pytest.mark.parametrize("array", [np.zeros((6, 8, 3), np.float32), np.zeros((6, 8), np.float64, order="F"), np.zeros((), np.uint16)])
+@pytest.mark.parametrize(
+    "array", [np.zeros((6, 8, 3), np.float32), np.zeros((6, 8), np.float64, order="F"), np.zeros((), np.uint16)]
+)
 def test_arrays_state_the_size_of_their_file(tmp_path: Path, array: Any) -> None:
     path = tmp_path / "a.npy"
     np.save(path, array)
@@ -101,7 +116,12 @@ def fault(tmp_path: Path, name: str, content: bytes, names: frozenset[str] = fro
 
 @pytest.mark.parametrize(
     ("suffix", "bomb"),
-    [(".png", png(60_000, 60_000)), (".tif", tiff(60_000, 60_000)), (".exr", exr(exr_part(60_000, 60_000, "BGR"))), (".png", png(2**32 - 1, 2**32 - 1))],
+    [
+        (".png", png(60_000, 60_000)),
+        (".tif", tiff(60_000, 60_000)),
+        (".exr", exr(exr_part(60_000, 60_000, "BGR"))),
+        (".png", png(2**32 - 1, 2**32 - 1)),
+    ],
 )
 @pytest.mark.attack("uploads", "an image that decodes to more than memory")
 def test_bombs_are_refused_by_name(tmp_path: Path, suffix: str, bomb: bytes) -> None:
@@ -131,18 +151,24 @@ def test_python_objects_are_refused(tmp_path: Path) -> None:
 @settings(deadline=None)
 @given(st.sampled_from(HEADS), st.integers(0, 60), st.binary(max_size=8))
 @pytest.mark.attack("uploads", "a damaged header")
-def test_damaged_headers_are_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: Any, at: int, noise: bytes) -> None:
+def test_damaged_headers_are_a_sentence_or_harmless(
+    tmp_path_factory: pytest.TempPathFactory, row: Any, at: int, noise: bytes
+) -> None:
     suffix, head = row[0], row[1]
     damaged = (head[:at] + noise + head[at + len(noise) :]) if noise else head[:at]
     detail = fault(tmp_path_factory.mktemp("damaged"), f"image{suffix}", damaged)
-    assert detail is None or detail.startswith((f"image{suffix} cannot be read", f"Image image{suffix} declares", f"Image image{suffix} carries metadata"))
+    assert detail is None or detail.startswith(
+        (f"image{suffix} cannot be read", f"Image image{suffix} declares", f"Image image{suffix} carries metadata")
+    )
 
 
 @settings(deadline=None)
 @given(st.sampled_from([".npy", ".png", ".tif", ".exr"]), st.binary(max_size=200))
 @pytest.mark.attack("uploads", "noise for an image")
 def test_noise_is_no_image(tmp_path_factory: pytest.TempPathFactory, suffix: str, noise: bytes) -> None:
-    assert (fault(tmp_path_factory.mktemp("noise"), f"image{suffix}", noise) or "").startswith(f"image{suffix} cannot be read")
+    assert (fault(tmp_path_factory.mktemp("noise"), f"image{suffix}", noise) or "").startswith(
+        f"image{suffix} cannot be read"
+    )
 
 
 def test_a_description_is_checked_against_the_files(tmp_path: Path) -> None:
@@ -150,15 +176,23 @@ def test_a_description_is_checked_against_the_files(tmp_path: Path) -> None:
     text, names = contents["capture.json"], frozenset(contents)
     assert fault(tmp_path, "capture.json", text, names) is None
     assert "names image file c0_l1.npy" in (fault(tmp_path, "capture.json", text, names - {"c0_l1.npy"}) or "")
-    assert "camera c0 has 8000000 x 6" in (fault(tmp_path, "capture.json", text.replace(b"[8, 6]", b"[8000000, 6]"), names) or "")
+    assert "camera c0 has 8000000 x 6" in (
+        fault(tmp_path, "capture.json", text.replace(b"[8, 6]", b"[8000000, 6]"), names) or ""
+    )
     assert "units" in (fault(tmp_path, "capture.json", text.replace(b'"mm"', b'"inch"'), names) or "")
     assert "cannot be read" in (fault(tmp_path, "zarr.json", b"[" * 100_000, names) or "")
 
 
 def test_chunks_of_arrays_are_limited(tmp_path: Path) -> None:
-    array: dict[str, Any] = {"node_type": "array", "data_type": "uint16", "chunk_grid": {"configuration": {"chunk_shape": [1, 1, 50, 50, 2]}}}
+    array: dict[str, Any] = {
+        "node_type": "array",
+        "data_type": "uint16",
+        "chunk_grid": {"configuration": {"chunk_shape": [1, 1, 50, 50, 2]}},
+    }
     assert fault(tmp_path, "capture.zarr/zarr.json", json.dumps(array).encode()) is None
     array["chunk_grid"]["configuration"]["chunk_shape"][0] = 2
-    assert "2 x 1 x 50 x 50 x 2 numbers" in (fault(tmp_path, "capture.zarr/zarr.json", json.dumps(array).encode()) or "")
+    assert "2 x 1 x 50 x 50 x 2 numbers" in (
+        fault(tmp_path, "capture.zarr/zarr.json", json.dumps(array).encode()) or ""
+    )
     assert "cannot be read" in (fault(tmp_path, "capture.zarr/zarr.json", b"{}") or "")
     assert "cannot be read" in (fault(tmp_path, "manifest.json", b"[]") or "")

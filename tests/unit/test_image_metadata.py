@@ -37,7 +37,11 @@ def text(value: bytes) -> tuple[str, bytes]:
         (".tif", written(".tif", exif=exif()), "EXIF, GPS, Make"),
         (".tif", written(".tif", tiffinfo={700: XMP.encode()}), "XMP"),
         (".tif", written(".tif", tiffinfo={50735: "0123456"}), "tag 50735"),
-        (".exr", exr(exr_part(4, 3, "BGR") | {"owner": text(b"A name"), "latitude": ("float", bytes(4))}), "latitude, owner"),
+        (
+            ".exr",
+            exr(exr_part(4, 3, "BGR") | {"owner": text(b"A name"), "latitude": ("float", bytes(4))}),
+            "latitude, owner",
+        ),
         (".exr", exr(exr_part(4, 3, "Z"), exr_part(4, 3, "Y") | {"capDate": text(b"2026:11:22")}), "capDate"),
     ],
 )
@@ -68,7 +72,12 @@ def test_a_small_tiff_of_many_long_directories_is_refused_before_all_are_read(tm
 @pytest.mark.attack("uploads", "a TIFF that names one list again and again")
 def test_a_small_tiff_that_names_one_long_list_of_directories_again_and_again_is_refused(tmp_path: Path) -> None:
     entries, list_at = 1000, 8 + 2 + 12 * 1000 + 4
-    head = b"II" + struct.pack("<HI", 42, 8) + struct.pack("<H", entries) + struct.pack("<HHII", 330, 4, 200_000, list_at) * entries
+    head = (
+        b"II"
+        + struct.pack("<HI", 42, 8)
+        + struct.pack("<H", entries)
+        + struct.pack("<HHII", 330, 4, 200_000, list_at) * entries
+    )
     with pytest.raises(ValueError, match="more than 250000 directories and entries"):
         fault(tmp_path, ".tif", head + bytes(4) + bytes(4 * 200_000))
 
@@ -78,21 +87,36 @@ def test_a_small_tiff_that_names_one_long_list_of_directories_again_and_again_is
 def test_plain_images_pass(tmp_path: Path, suffix: str, mode: str) -> None:
     software = PngInfo()
     software.add_text("Software", "a program")
-    options: dict[str, Any] = {"pnginfo": software} if suffix == ".png" else {"software": "a program", "compression": "tiff_lzw"}
+    options: dict[str, Any] = (
+        {"pnginfo": software} if suffix == ".png" else {"software": "a program", "compression": "tiff_lzw"}
+    )
     assert fault(tmp_path, suffix, written(suffix, mode, **options)) is None
 
 
 def test_a_plain_exr_passes(tmp_path: Path) -> None:
-    assert fault(tmp_path, ".exr", exr(exr_part(4, 3, "BGR") | {"pixelAspectRatio": ("float", struct.pack("<f", 1))})) is None
+    assert (
+        fault(tmp_path, ".exr", exr(exr_part(4, 3, "BGR") | {"pixelAspectRatio": ("float", struct.pack("<f", 1))}))
+        is None
+    )
     assert metadata_fault(tmp_path / "absent", "a.npy", ".npy") is None
 
 
 @settings(deadline=None)
-@given(st.sampled_from([(".png", told_png()), (".tif", written(".tif", exif=exif()))]), st.integers(0, 400), st.binary(max_size=8))
-def test_damage_is_a_sentence_or_harmless(tmp_path_factory: pytest.TempPathFactory, row: tuple[str, bytes], at: int, noise: bytes) -> None:
+@given(
+    st.sampled_from([(".png", told_png()), (".tif", written(".tif", exif=exif()))]),
+    st.integers(0, 400),
+    st.binary(max_size=8),
+)
+def test_damage_is_a_sentence_or_harmless(
+    tmp_path_factory: pytest.TempPathFactory, row: tuple[str, bytes], at: int, noise: bytes
+) -> None:
     suffix, content = row
     try:
-        told = fault(tmp_path_factory.mktemp("damaged"), suffix, content[:at] + noise + content[at + len(noise) :] if noise else content[:at])
+        told = fault(
+            tmp_path_factory.mktemp("damaged"),
+            suffix,
+            content[:at] + noise + content[at + len(noise) :] if noise else content[:at],
+        )
     except ValueError as problem:
         told = str(problem)
     assert told is None or told
@@ -108,5 +132,9 @@ def test_a_png_is_stripped_and_shows_the_same(tmp_path: Path) -> None:
 def test_pictures_made_here_say_nothing(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     write_picture(tmp_path / "quality.png", rng.random((12, 8, 3), dtype=np.float32), np.zeros((12, 8), np.uint16))
-    for content in (png_bytes(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)), png16_bytes(rng.random((6, 8))), (tmp_path / "quality.png").read_bytes()):
+    for content in (
+        png_bytes(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)),
+        png16_bytes(rng.random((6, 8))),
+        (tmp_path / "quality.png").read_bytes(),
+    ):
         assert fault(tmp_path, ".png", content) is None

@@ -11,7 +11,18 @@ import pytest
 from services.core.files.meshes import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from tests.support.jaw_truth import CAMERAS, HELD_OUT, LIGHTS, NOISE_FLOOR, NOISE_RELATIVE, JawTruth, _of_neighbours, pack, read_jaw_truth, write_jaw_capture
+from tests.support.jaw_truth import (
+    CAMERAS,
+    HELD_OUT,
+    LIGHTS,
+    NOISE_FLOOR,
+    NOISE_RELATIVE,
+    JawTruth,
+    _of_neighbours,
+    pack,
+    read_jaw_truth,
+    write_jaw_capture,
+)
 
 PASSES, SIZE = 8, (12, 30)
 SPREAD = 0.05
@@ -40,7 +51,9 @@ def test_means_and_their_variances_come_back(truth: JawTruth) -> None:
     assert truth.mean[0].shape == truth.variance[0].shape == (LIGHTS, *SIZE)
     assert truth.mean[0][:, 0].mean() == pytest.approx(1, abs=0.01)
     # 3,780 variances with 7 degrees of freedom: the mean's relative error is sqrt(2 / 7 / 3780) = 0.9 %.
-    assert np.mean([variance[:, :6].mean() for variance in truth.variance]) == pytest.approx(SPREAD**2 / PASSES, rel=0.04)
+    assert np.mean([variance[:, :6].mean() for variance in truth.variance]) == pytest.approx(
+        SPREAD**2 / PASSES, rel=0.04
+    )
     assert len(truth.mouth.teeth) == len(truth.jaw.teeth) == 14
 
 
@@ -59,7 +72,9 @@ def test_the_capture_has_the_sensors_noise(truth: JawTruth, tmp_path: Path) -> N
     assert len(capture.images) == CAMERAS * LIGHTS
     assert len({entry.light for entry in capture.images if entry.held_out}) == HELD_OUT
     assert all(tooth.dentin is None for tooth in read_teeth(tmp_path))
-    assert set(json.loads((tmp_path / "truth.json").read_text())["channels"]["green"]["teeth"]) == {str(tooth.fdi) for tooth in truth.jaw.teeth}
+    assert set(json.loads((tmp_path / "truth.json").read_text())["channels"]["green"]["teeth"]) == {
+        str(tooth.fdi) for tooth in truth.jaw.teeth
+    }
     scores = []
     for entry in capture.images:
         camera, light = int(entry.camera[1:]), int(entry.light[1:])

@@ -36,7 +36,9 @@ def test_only_a_queued_job_waits_for_something(service: Jobs, tmp_path: Path) ->
     assert service.waits_for(service.cancel(job.id)) is None
 
 
-def test_a_capture_that_takes_long_to_measure_holds_up_no_other_submission(service: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_capture_that_takes_long_to_measure_holds_up_no_other_submission(
+    service: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (slow := tmp_path / "slow").mkdir()
     measuring, go_on = threading.Event(), threading.Event()
 
@@ -113,10 +115,16 @@ def test_a_job_is_told_to_stop_while_the_database_keeps_writers_waiting(service:
     assert service.repository.get(job.id).state is JobState.CANCELLING
 
 
-def test_why_a_job_waits_is_told_as_an_event_once_and_without_the_servers_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_a_job_waits_is_told_as_an_event_once_and_without_the_servers_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = tmp_path / "data"
     service = Jobs(ServerSettings(data=data, job_roots=str(tmp_path)), lambda *_: None)
-    reasons = [f"Waits for disk: The disk was full at {data}/jobs/x; free some space.", "Waits for disk: 0.1 GiB are free.", "Waits for a place: job 1 runs."]
+    reasons = [
+        f"Waits for disk: The disk was full at {data}/jobs/x; free some space.",
+        "Waits for disk: 0.1 GiB are free.",
+        "Waits for a place: job 1 runs.",
+    ]
     try:
         job = service.submit(JobSpec(capture=tmp_path)).job
         monkeypatch.setattr(service._admission, "holds", lambda *_, **__: True)

@@ -64,7 +64,9 @@ def test_success_comes_from_work_alone(sequence: list[Trigger]) -> None:
 
 
 def test_every_unfinished_state_survives_a_crash_and_every_state_is_reachable() -> None:
-    assert {state for state, trigger in TABLE if trigger is Trigger.LOSE} == {state for state in JobState if not state.is_final}
+    assert {state for state, trigger in TABLE if trigger is Trigger.LOSE} == {
+        state for state in JobState if not state.is_final
+    }
     assert {transition.state for transition in TABLE.values()} | {JobState.SUBMITTED} == set(JobState)
 
 
@@ -74,14 +76,17 @@ def test_the_refusal_names_what_the_state_takes() -> None:
 
 
 def test_the_docstring_draws_the_table() -> None:
-    header, *rows = [line.split("  ") for line in lifecycle.__doc__.splitlines() if line[:1].isupper() and "  " in line] or [[]]
+    header, *rows = [
+        line.split("  ") for line in lifecycle.__doc__.splitlines() if line[:1].isupper() and "  " in line
+    ] or [[]]
     columns = [Trigger.CANCEL, Trigger.START, Trigger.SUCCEED, Trigger.FAIL, Trigger.LOSE]
     drawn = {}
     for row in [header, *rows]:
         state, *cells = [cell.strip() for cell in row if cell.strip()]
         drawn |= {(state, trigger): cell for trigger, cell in zip(columns, cells, strict=True) if cell != "-"}
     told = {
-        (state, trigger): transition.state + (f", {transition.instruction}" if transition.instruction is not Instruction.NOTHING else "")
+        (state, trigger): transition.state
+        + (f", {transition.instruction}" if transition.instruction is not Instruction.NOTHING else "")
         for (state, trigger), transition in TABLE.items()
         if trigger in columns
     }

@@ -18,13 +18,21 @@ AHEAD = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0,
 
 
 def camera(side: int) -> Camera:
-    return Camera(name="c0", size=(side, side), K=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), camera_from_world=AHEAD)
+    return Camera(
+        name="c0", size=(side, side), K=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), camera_from_world=AHEAD
+    )
 
 
 def png(side: int, *packed: bytes) -> bytes:
     """A grey PNG whose pixels are packed in these parts."""
-    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)), *((b"IDAT", part) for part in packed), (b"IEND", b"")]
-    return PNG_SIGNATURE + b"".join(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)
+    parts = [
+        (b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)),
+        *((b"IDAT", part) for part in packed),
+        (b"IEND", b""),
+    ]
+    return PNG_SIGNATURE + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    )
 
 
 @pytest.mark.attack("uploads", "a mask that inflates a thousandfold")

@@ -17,7 +17,9 @@ from tests.support.shared_data import shared_path
 
 def test_the_table_is_the_references() -> None:
     with (shared_path("reference/tooth_optics.csv")).open() as file:
-        rows = [row for row in csv.DictReader(file) if row["tissue"] in {"enamel", "dentin"} and row["mu_s_reduced_per_mm"]]
+        rows = [
+            row for row in csv.DictReader(file) if row["tissue"] in {"enamel", "dentin"} and row["mu_s_reduced_per_mm"]
+        ]
     assert len(rows) == len(LITERATURE_TABLE)
     rows.sort(key=lambda row: row["tissue"] == "dentin")
     for row, ours in zip(rows, LITERATURE_TABLE, strict=True):
@@ -43,7 +45,10 @@ def test_teeth_that_agree_give_no_narrower_a_prior_than_stated() -> None:
     medium = Medium(4.5, 0.997, g1=0.8)
     for media in ([medium], [medium, medium]):
         prior = towards("3.enamel", media)
-        assert prior["3.enamel.sigma"] == (pytest.approx(math.log(similar_medium(medium, HELD_G).sigma)), MIN_SD["sigma"])
+        assert prior["3.enamel.sigma"] == (
+            pytest.approx(math.log(similar_medium(medium, HELD_G).sigma)),
+            MIN_SD["sigma"],
+        )
         assert prior["3.enamel.alpha"][1] == MIN_SD["alpha"]
 
 

@@ -26,8 +26,19 @@ SIZE = JobSize(pixels=1000, samples=64, steps=12)
 CLASS = "Some processor, 2 cores, 8 GiB"
 
 
-def event(time_s: float, kind: str, stage: str | None = None, done: float | None = None, attempt: int = 1, **data: Any) -> JobEvent:
-    values = {"id": 1, "job": "j", "time_s": time_s, "attempt": attempt if stage else 0, "stage": stage, "kind": kind, "message": "", "done": done}
+def event(
+    time_s: float, kind: str, stage: str | None = None, done: float | None = None, attempt: int = 1, **data: Any
+) -> JobEvent:
+    values = {
+        "id": 1,
+        "job": "j",
+        "time_s": time_s,
+        "attempt": attempt if stage else 0,
+        "stage": stage,
+        "kind": kind,
+        "message": "",
+        "done": done,
+    }
     return JobEvent.model_validate(values | {"data": data})
 
 
@@ -58,13 +69,33 @@ def test_a_course_tells_when_each_tenth_was_reached() -> None:
     "spoiled",
     [
         lambda events: events[:-1],
-        lambda events: [*events[:-1], event(151, "state", state="QUEUED", trigger="lose"), event(152, "state", state="RUNNING", trigger="start"), events[-1]],
-        lambda events: [event(107, "started", "fit", attempt=2, machine=CLASS) if one.kind == "started" and one.stage == "fit" else one for one in events],
+        lambda events: [
+            *events[:-1],
+            event(151, "state", state="QUEUED", trigger="lose"),
+            event(152, "state", state="RUNNING", trigger="start"),
+            events[-1],
+        ],
+        lambda events: [
+            event(107, "started", "fit", attempt=2, machine=CLASS)
+            if one.kind == "started" and one.stage == "fit"
+            else one
+            for one in events
+        ],
         lambda events: [one for one in events if one.kind != "started"],
-        lambda events: [event(102, "finished", "fit", 1.0) if one.kind == "finished" and one.stage == "fit" else one for one in events],
+        lambda events: [
+            event(102, "finished", "fit", 1.0) if one.kind == "finished" and one.stage == "fit" else one
+            for one in events
+        ],
         lambda events: [one for one in events if not (one.kind == "finished" and one.stage == "fit")],
     ],
-    ids=["not ended", "lost meanwhile", "second attempt", "unknown machine", "clock stepped back", "stage never finished"],
+    ids=[
+        "not ended",
+        "lost meanwhile",
+        "second attempt",
+        "unknown machine",
+        "clock stepped back",
+        "stage never finished",
+    ],
 )
 def test_nothing_is_learned_from_a_broken_run(spoiled: Any) -> None:
     assert course_of(run_of_a_job()) is not None
@@ -79,7 +110,9 @@ def past(factor: float) -> PastRun:
     """A run that takes 10 s to prepare and 100 s to fit, evenly, all times a factor."""
     reached = {"prepare": (1.0, *[10.0] * 9), "fit": tuple(10.0 + 10.0 * k for k in range(10))}
     scaled = {stage: tuple(factor * one for one in times) for stage, times in reached.items()}
-    return PastRun(size=SIZE, course=Course.model_validate({"machine": CLASS, "reached_s": scaled, "total_s": 110 * factor}))
+    return PastRun(
+        size=SIZE, course=Course.model_validate({"machine": CLASS, "reached_s": scaled, "total_s": 110 * factor})
+    )
 
 
 RUNS = [past(factor) for factor in (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2)]
@@ -94,7 +127,12 @@ def limits(position: Position) -> tuple[float, float]:
 
 
 def test_what_remains_shrinks_with_the_position() -> None:
-    for position, truth in ((Position(), 110), (Position("fit"), 100), (Position("fit", 5), 50), (Position("fit", 9), 10)):
+    for position, truth in (
+        (Position(), 110),
+        (Position("fit"), 100),
+        (Position("fit", 5), 50),
+        (Position("fit", 9), 10),
+    ):
         low, high = limits(position)
         assert low < truth < high < 2 * truth
 
@@ -133,8 +171,12 @@ def test_a_range_begins_when_a_place_is_free() -> None:
     short, long, last = lasting(1, 2), lasting(10, 20), lasting(100, 200)
     assert last.after([long], [], places=2) == last  # the second place is free
     assert last.after([short, long], [], places=2) == lasting(101, 202)
-    assert last.after([short, long], [long], places=2) == lasting(110, 220)  # the one ahead takes the first free place, for 11 to 22 s
-    assert last.after([short, short, long], [], places=2) == lasting(101, 202)  # one of them captures beside two in their places
+    assert last.after([short, long], [long], places=2) == lasting(
+        110, 220
+    )  # the one ahead takes the first free place, for 11 to 22 s
+    assert last.after([short, short, long], [], places=2) == lasting(
+        101, 202
+    )  # one of them captures beside two in their places
     assert last.after([], [long, short], places=1) == lasting(111, 222)
 
 
@@ -154,7 +196,9 @@ def test_size_is_read_from_the_description_of_the_capture(tmp_path: Path) -> Non
     capture = write_capture(tmp_path / "mine", images=3)
     whole = size_of(JobSpec(capture=capture, samples_per_pixel=32, max_steps=5))
     assert whole == JobSize(pixels=3 * 48, samples=32, steps=5)
-    assert size_of(JobSpec(capture=capture, pixel_step=2, solver="adam", adam_steps=70)) == JobSize(pixels=36, samples=64, steps=70)
+    assert size_of(JobSpec(capture=capture, pixel_step=2, solver="adam", adam_steps=70)) == JobSize(
+        pixels=36, samples=64, steps=70
+    )
     assert size_of(JobSpec(rig=RigSpec(mouth=capture))) == JobSize(pixels=3 * 48, samples=64, steps=12)
     (capture / "capture.json").write_text("[" * 100_000)
     assert size_of(JobSpec(capture=capture)) is None

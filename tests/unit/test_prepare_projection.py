@@ -82,5 +82,7 @@ def test_incisor_pixels(camera: int, hit: int, whole: int) -> None:
     description = read_record(folder / "capture.json", FolderCapture)
     view = project(description.cameras[camera], [read_teeth(folder)[0].outer])
     assert (np.count_nonzero(view.mesh >= 0), np.count_nonzero(view.covered)) == (hit, whole)
-    light = np.max([np.load(folder / entry.file)[..., 0] for entry in description.images if entry.camera == f"c{camera}"], axis=0)
+    light = np.max(
+        [np.load(folder / entry.file)[..., 0] for entry in description.images if entry.camera == f"c{camera}"], axis=0
+    )
     assert (light[view.mesh >= 0] > 0).all()

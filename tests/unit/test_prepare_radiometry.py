@@ -12,9 +12,19 @@ BLACK, BITS, PER_COUNT = 64, 12, 2e-3
 
 
 def manifest() -> CaptureManifest:
-    camera = {"name": "c", "size": (200, 200), "K": ((1, 0, 0), (0, 1, 0), (0, 0, 1)), "camera_from_world": np.eye(4).tolist()}
+    camera = {
+        "name": "c",
+        "size": (200, 200),
+        "K": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        "camera_from_world": np.eye(4).tolist(),
+    }
     return CaptureManifest(
-        description=FolderCapture(units="mm", channels=("green",), cameras=(camera,), lights=({"name": "l", "position_mm": (0, 0, 1), "intensity": (1.0,)},)),
+        description=FolderCapture(
+            units="mm",
+            channels=("green",),
+            cameras=(camera,),
+            lights=({"name": "l", "position_mm": (0, 0, 1), "intensity": (1.0,)},),
+        ),
         frames=(),
         bits=BITS,
         black_level=BLACK,
@@ -26,7 +36,9 @@ def manifest() -> CaptureManifest:
 
 
 def frame(exposure_s: float = 0.05, level: float = 0.5) -> FrameRecord:
-    return FrameRecord(index=3, kind="light", light="l", exposure_s=exposure_s, level=level, time_s=0, readback=(0, 0, 0))
+    return FrameRecord(
+        index=3, kind="light", light="l", exposure_s=exposure_s, level=level, time_s=0, readback=(0, 0, 0)
+    )
 
 
 def expose(truth: np.ndarray, frame: FrameRecord, rng: np.random.Generator) -> np.ndarray:

@@ -18,7 +18,9 @@ from tests.support.shared_data import shared_path
 
 def footprint(seen: np.ndarray, depth_mm: np.ndarray | None = None) -> Footprint:
     depth = np.full(seen.shape, 1000.0) if depth_mm is None else depth_mm
-    return Footprint(np.where(seen, 0, -1).astype(np.int16), depth.astype(np.float32), np.zeros((*seen.shape, 3), np.float32), seen)
+    return Footprint(
+        np.where(seen, 0, -1).astype(np.int16), depth.astype(np.float32), np.zeros((*seen.shape, 3), np.float32), seen
+    )
 
 
 def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -43,7 +45,10 @@ def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np
 
     # Made at twice the size, so that interpolation leaves no trace at the size used
     rng = np.random.default_rng(seed)
-    half = [cv2.resize(image.astype(np.float32), (width // 2, height // 2), interpolation=cv2.INTER_AREA) for image in (linear, moved * gain)]
+    half = [
+        cv2.resize(image.astype(np.float32), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+        for image in (linear, moved * gain)
+    ]
     noisy = [image + rng.normal(size=image.shape) * np.hypot(0.01 * image, 0.002 * image.max()) for image in half]
     truth = cv2.resize(displacement.astype(np.float32), (width // 2, height // 2), interpolation=cv2.INTER_AREA) / 2
     return noisy[0].astype(np.float32), noisy[1].astype(np.float32), truth
@@ -65,14 +70,20 @@ def test_known_warp_of_an_intraoral_photograph_under_changed_light(view: int) ->
 def test_parallax_of_a_real_stereo_pair() -> None:
     """With the true relief given, displacement follows it; a median of 0.42 px is what dense flow (DIS medium) reaches on this pair."""
     folder = shared_path("data/flow-pairs")
-    left, right = ((cv2.imread(str(folder / f"motorcycle_{side}.png")).astype(np.float32).mean(axis=-1) / 255) ** 2.2 for side in ("left", "right"))
+    left, right = (
+        (cv2.imread(str(folder / f"motorcycle_{side}.png")).astype(np.float32).mean(axis=-1) / 255) ** 2.2
+        for side in ("left", "right")
+    )
     with np.load(folder / "motorcycle_disp.npz") as stored:
         disparity = stored[stored.files[0]]
     known = np.isfinite(disparity) & (disparity > 0)
     # Displacement by a sideways step is inverse depth, so disparity itself stands for the relief
     flow = SurfaceFlow(footprint(known, np.where(known, disparity, 0)), [0])
     found = flow.field(Aligner(flow, left, "texture").solve(right))
-    assert np.median(np.linalg.norm(found + np.stack([disparity, np.zeros_like(disparity)], axis=-1), axis=-1)[known]) < 0.42
+    assert (
+        np.median(np.linalg.norm(found + np.stack([disparity, np.zeros_like(disparity)], axis=-1), axis=-1)[known])
+        < 0.42
+    )
 
 
 def test_cubic_motion_is_interpolated_exactly_and_its_error_is_not_underrated() -> None:
@@ -82,7 +93,11 @@ def test_cubic_motion_is_interpolated_exactly_and_its_error_is_not_underrated() 
     assert value == pytest.approx(1 + 3.6 - 2.88 + 4e-4 * 1728, rel=1e-12)
     assert error > 0
     smooth = np.sin(times / 8)
-    found = [(abs(value - np.sin(time / 8)), error) for time in np.arange(2, 30, 0.5) for value, error in [interpolate(times, smooth, time)]]
+    found = [
+        (abs(value - np.sin(time / 8)), error)
+        for time in np.arange(2, 30, 0.5)
+        for value, error in [interpolate(times, smooth, time)]
+    ]
     true, estimated = np.max(found, axis=0)
     assert true < estimated
 
@@ -113,7 +128,10 @@ def textured(rng: np.random.Generator) -> np.ndarray:
 
 
 def frames(count: int) -> list[FrameRecord]:
-    return [FrameRecord(index=k, kind="tracking", light=None, exposure_s=0.05, level=0.1, time_s=k, readback=(0, 0, 0)) for k in range(count)]
+    return [
+        FrameRecord(index=k, kind="tracking", light=None, exposure_s=0.05, level=0.1, time_s=k, readback=(0, 0, 0))
+        for k in range(count)
+    ]
 
 
 def test_each_jaw_gets_its_own_motion() -> None:
@@ -138,7 +156,9 @@ def test_too_much_motion_is_refused_by_name() -> None:
     seen = np.zeros((90, 120), dtype=bool)
     seen[20:70, 30:90] = True
     moved = warp(texture, np.broadcast_to(np.array([-11, 0], np.float32), (90, 120, 2)))
-    with pytest.raises(CaptureInputError, match=r"moved 1\d\.\d px by frame 1 \(camera front, light all\).*head supported\.$"):
+    with pytest.raises(
+        CaptureInputError, match=r"moved 1\d\.\d px by frame 1 \(camera front, light all\).*head supported\.$"
+    ):
         ViewMotion(footprint(seen), [[0]], frames(2), lambda frame: moved if frame.index else texture, "front")
 
 

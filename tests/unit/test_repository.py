@@ -150,7 +150,9 @@ def test_many_servers_at_once_never_lease_one_job_twice(opened: Callable[[], Rep
 
 def test_submissions_of_one_key_at_once_make_one_job(opened: Callable[[], Repository]) -> None:
     repositories, made = [opened() for _ in range(4)], []
-    threads = [threading.Thread(target=lambda one=one: made.append(one.create(SPEC, "key").job.id)) for one in repositories]
+    threads = [
+        threading.Thread(target=lambda one=one: made.append(one.create(SPEC, "key").job.id)) for one in repositories
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -165,7 +167,11 @@ def test_every_job_under_way_is_lost_when_the_only_server_died(repository: Repos
         repository.lease(job, "dead", 3600)
     repository.apply(cancelling, Trigger.CANCEL)
     assert repository.lose() == [running, cancelling]
-    assert [repository.get(job).state for job in (running, cancelling, queued)] == [JobState.QUEUED, JobState.CANCELLED, JobState.QUEUED]
+    assert [repository.get(job).state for job in (running, cancelling, queued)] == [
+        JobState.QUEUED,
+        JobState.CANCELLED,
+        JobState.QUEUED,
+    ]
 
 
 def test_a_deleted_job_leaves_its_receipt_alone(repository: Repository, clock: Clock) -> None:
@@ -211,13 +217,20 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
         while True:
             ended = done.is_set()
             with repositories[0].engine.connect() as connection:
-                new = list(connection.scalars(sql.select(event_table.c.id).where(event_table.c.id > last).order_by(event_table.c.id)))
+                new = list(
+                    connection.scalars(
+                        sql.select(event_table.c.id).where(event_table.c.id > last).order_by(event_table.c.id)
+                    )
+                )
             seen.extend(new)
             last = new[-1] if new else last
             if ended:
                 return
 
-    reader, writers = threading.Thread(target=read), [threading.Thread(target=write, args=(one,)) for one in repositories]
+    reader, writers = (
+        threading.Thread(target=read),
+        [threading.Thread(target=write, args=(one,)) for one in repositories],
+    )
     reader.start()
     for writer in writers:
         writer.start()
@@ -231,7 +244,13 @@ def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Re
 
 
 def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository) -> None:
-    known = (webhook_tables.webhook_table, tokens.token_table, audit.audit_table, capture_table.capture_table, data_folder.data_folder_table)
+    known = (
+        webhook_tables.webhook_table,
+        tokens.token_table,
+        audit.audit_table,
+        capture_table.capture_table,
+        data_folder.data_folder_table,
+    )
     for table in (*known, setup_links.setup_link_table, ended_sessions.ended_session_table):
         assert table.metadata is metadata
     with repository.engine.connect() as connection:
@@ -241,7 +260,14 @@ def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository
 def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock) -> None:
     engine = open_database(url)
     upgrade(engine, FIRST)
-    row = {"id": "old", "key": None, "state": "RUNNING", "created_s": 1.0, "changed_s": 2.0, "spec": SPEC.model_dump_json()}
+    row = {
+        "id": "old",
+        "key": None,
+        "state": "RUNNING",
+        "created_s": 1.0,
+        "changed_s": 2.0,
+        "spec": SPEC.model_dump_json(),
+    }
     with engine.begin() as connection:
         connection.execute(job_table.insert().values(row))
         connection.execute(sql.text("DROP TABLE alembic_version"))
@@ -259,7 +285,9 @@ def test_other_databases_are_refused_by_name(bad: str) -> None:
         open_database(bad)
 
 
-def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(
+    server: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.pipeline.database.POSTGRES_SILENCE_S", 1)
     silent, other = open_database(server.url("postgres")), open_database(server.url("postgres"))
     tries: list[int] = []
@@ -278,7 +306,9 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(server: Postg
         engine.dispose()
 
 
-def test_writers_of_one_process_take_turns_before_they_ask_sqlite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writers_of_one_process_take_turns_before_they_ask_sqlite(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("services.pipeline.database.BUSY_MS", 0)  # so that whoever asks out of turn is refused at once
     engine = open_database(sqlite_url(tmp_path / "jobs.sqlite"))
     upgrade(engine)

@@ -34,7 +34,10 @@ def test_a_good_image_says_nothing(noise: float) -> None:
 @pytest.mark.parametrize(
     ("image", "sentence"),
     [
-        (np.minimum(spot(noise=0.01), 0.3), "Image b0 under l0 looks saturated: 12 pixels hold its largest value, 0.3; "),
+        (
+            np.minimum(spot(noise=0.01), 0.3),
+            "Image b0 under l0 looks saturated: 12 pixels hold its largest value, 0.3; ",
+        ),
         (spot(y_mm=1.5), "In image b0 under l0 the light lies 1.5 mm off the plane y = 0; "),
         (np.zeros((16, 16)), "Image b0 under l0 holds no light; "),
         (np.full((16, 16), np.nan), "Image b0 under l0 holds no light; "),
@@ -55,11 +58,19 @@ def test_pixels_that_lie_beside_the_beam_are_told() -> None:
     [
         (1.0, 0.05, ()),
         (0.04, 0.001, ("The sample is too thin: σt·w is about 0.041",)),
-        (20.0, 0.0, ("The sample is too thick: σt·w is about 20, and images tell a phase function from 0.1 to 10; dilute it 10-fold",)),
+        (
+            20.0,
+            0.0,
+            (
+                "The sample is too thick: σt·w is about 20, and images tell a phase function from 0.1 to 10; dilute it 10-fold",
+            ),
+        ),
         (0.1, 0.9, ("The sample absorbs too much: about 90 % ",)),
     ],
 )
-def test_a_sample_that_tells_nothing_is_told_with_what_to_measure(sigma_s: float, sigma_a: float, sentences: tuple[str, ...]) -> None:
+def test_a_sample_that_tells_nothing_is_told_with_what_to_measure(
+    sigma_s: float, sigma_a: float, sentences: tuple[str, ...]
+) -> None:
     found = sample_faults(henyey_greenstein(sigma_s, 0.5, sigma_a), width_mm=1.0)
     assert len(found) == len(sentences)
     assert all(told.startswith(sentence) for told, sentence in zip(found, sentences, strict=True))

@@ -67,7 +67,9 @@ def test_glass_bends_reflects_twice_and_displaces() -> None:
     face = Interface(1.33, 1.0, 1.52, 1.25)
     sine = face.inside_sine(25.0)
     near, far = face.reflections(sine)
-    assert face.transmittance(0.0) == pytest.approx((1 - fresnel(1, 1.52 / 1.33)) * 0.96 / (1 - fresnel(1, 1.52 / 1.33) * 0.04), rel=5e-3)
+    assert face.transmittance(0.0) == pytest.approx(
+        (1 - fresnel(1, 1.52 / 1.33)) * 0.96 / (1 - fresnel(1, 1.52 / 1.33) * 0.04), rel=5e-3
+    )
     assert near.shift_mm == 0
     glass_angle = math.asin(math.sin(math.radians(25)) / 1.52)
     assert far.shift_mm == pytest.approx(2 * 1.25 * math.tan(glass_angle))

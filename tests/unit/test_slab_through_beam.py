@@ -26,7 +26,9 @@ def peak_mm(index: float, angle_deg: float, glass: dict[str, float] | None) -> f
     return WIDTH_MM * sine / math.sqrt(1 - sine**2) + 2 * faces.glass_shift_mm(sine)
 
 
-def folder(shifts_mm: dict[str, float], se_mm: float = 0.002, glass: dict[str, float] | None = None, **beam: Any) -> SlabFolder:
+def folder(
+    shifts_mm: dict[str, float], se_mm: float = 0.002, glass: dict[str, float] | None = None, **beam: Any
+) -> SlabFolder:
     """A cell of unknown index with these peaks."""
     cell = {"width_mm": WIDTH_MM, "index": None, "glass": glass}
     lights = [{"name": name, "side": "front", "angle_deg": angle} for name, angle in LIGHTS.items()]
@@ -58,7 +60,10 @@ def test_a_given_index_has_no_error() -> None:
 @pytest.mark.parametrize(
     ("shifts_mm", "sentence"),
     [
-        ({"l0": -0.1}, "peaks at x = -0.1 mm, with which the beam would be bent to the other side; correct its peak_x_mm"),
+        (
+            {"l0": -0.1},
+            "peaks at x = -0.1 mm, with which the beam would be bent to the other side; correct its peak_x_mm",
+        ),
         ({"l1": -5.0}, "with which the sample's index would be 0.382; correct its peak_x_mm"),
         ({"l0": peak_mm(1.33, 5.0, None), "l1": peak_mm(1.5, -20.0, None)}, "measure its peak_x_mm again"),
     ],
@@ -72,7 +77,10 @@ def test_shifts_that_belong_to_no_index_are_refused(shifts_mm: dict[str, float],
 @pytest.mark.parametrize(
     ("beam", "sentence"),
     [
-        ({"wavelength_nm": 700.0}, "cell.index is null, and no through_beam at 532 nm tells it; add one, or give the sample's index"),
+        (
+            {"wavelength_nm": 700.0},
+            "cell.index is null, and no through_beam at 532 nm tells it; add one, or give the sample's index",
+        ),
         ({"light": "l7"}, "a through_beam names light l7, which is not among the lights; correct the name"),
         ({"se_mm": 0.0}, "greater than 0"),
     ],

@@ -29,7 +29,9 @@ class NoisyQuadratic:
     def gradient(self, x: np.ndarray, *, samples: int, step: int) -> Gradient:
         rng = np.random.default_rng([self.seed, step, samples])
         slope = self.a @ (x - BEST)
-        return Gradient(slope + self.noise / np.sqrt(samples) * rng.standard_normal(len(x)), float(0.5 * (x - BEST) @ slope))
+        return Gradient(
+            slope + self.noise / np.sqrt(samples) * rng.standard_normal(len(x)), float(0.5 * (x - BEST) @ slope)
+        )
 
 
 def solve(problem: NoisyQuadratic, options: Options, start: np.ndarray, domain: Domain = DOMAIN) -> State:

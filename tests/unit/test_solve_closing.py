@@ -27,7 +27,9 @@ class Linear:
         rng = np.random.default_rng(1)
         count = LIGHTS * PIXELS
         self.similar = 0.1 * rng.standard_normal((3, count)) + 0.1 * rng.standard_normal(count)
-        self.exact = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]]) @ self.similar + 0.03 * rng.standard_normal((3, count))
+        self.exact = np.array(
+            [[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]]
+        ) @ self.similar + 0.03 * rng.standard_normal((3, count))
         self.direction = held * (0.02 * rng.standard_normal(count) + 0.1 * self.similar[0])
         self.rng = np.random.default_rng([seed, 2])
         self.weight = np.full(count, 1 / SENSOR**2)
@@ -51,7 +53,16 @@ class Linear:
     def closing(self, x: np.ndarray, photo: np.ndarray, transform: np.ndarray) -> ClosingSums:
         residuals = self.pair(x @ self.exact - photo, IMAGE)
         moved = np.array([self.pair(self.direction, IMAGE)])
-        return closing_sums(transform, self.pair(self.similar, SLOPE), self.pair(self.exact, SLOPE), FLAT, residuals, moved, self.weight, LIGHTS)
+        return closing_sums(
+            transform,
+            self.pair(self.similar, SLOPE),
+            self.pair(self.exact, SLOPE),
+            FLAT,
+            residuals,
+            moved,
+            self.weight,
+            LIGHTS,
+        )
 
 
 def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarray, Uncertainty]:
@@ -138,7 +149,11 @@ def test_the_stated_noise_of_a_response_is_what_is_seen() -> None:
         problem = Linear(seed)
         nothing = np.zeros((0, 2, LIGHTS * PIXELS))
         similar, exact = problem.pair(problem.similar, SLOPE), problem.pair(problem.exact, SLOPE)
-        draws.append(closing_sums(transform, similar, exact, borrowed, (np.zeros(400), np.zeros(400)), nothing, problem.weight, LIGHTS))
+        draws.append(
+            closing_sums(
+                transform, similar, exact, borrowed, (np.zeros(400), np.zeros(400)), nothing, problem.weight, LIGHTS
+            )
+        )
     stated = np.mean([draw.response_variance for draw in draws], axis=0)
     seen = np.var([draw.response for draw in draws], axis=0)
     np.testing.assert_allclose(stated, seen, rtol=0.2)
@@ -147,7 +162,14 @@ def test_the_stated_noise_of_a_response_is_what_is_seen() -> None:
 def test_a_response_that_noise_explains_is_not_believed() -> None:
     rng = np.random.default_rng(3)
     noise = np.full((3, 3), 0.09)
-    sums = ClosingSums(np.zeros(3), np.eye(3), np.eye(3) + 0.1 * rng.standard_normal((3, 3)), noise, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    sums = ClosingSums(
+        np.zeros(3),
+        np.eye(3),
+        np.eye(3) + 0.1 * rng.standard_normal((3, 3)),
+        noise,
+        np.zeros((0, 3)),
+        np.zeros((0, 3, 3)),
+    )
     found = response(sums, np.zeros((3, 3)), DOMAIN.relation)
     np.testing.assert_allclose(found.inverse, np.eye(3))
     np.testing.assert_allclose(found.variance, 0.0)
@@ -156,7 +178,9 @@ def test_a_response_that_noise_explains_is_not_believed() -> None:
 def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
     truth = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]])
     sums = ClosingSums(np.zeros(3), np.eye(3), truth, np.full((3, 3), 1e-8), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    np.testing.assert_allclose(response(sums, np.zeros((3, 3)), DOMAIN.relation).inverse, np.linalg.inv(truth), atol=1e-5)
+    np.testing.assert_allclose(
+        response(sums, np.zeros((3, 3)), DOMAIN.relation).inverse, np.linalg.inv(truth), atol=1e-5
+    )
 
 
 def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
@@ -168,7 +192,10 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
     excess = np.where(own, 0.3 * rng.standard_normal(own.shape), 0.0)
     measured = np.eye(24) + excess + noise * rng.standard_normal(own.shape)
     sums = ClosingSums(np.zeros(24), np.eye(24), measured, noise**2, np.zeros((0, 24)), np.zeros((0, 24, 24)))
-    told, alike = (response(sums, np.zeros((24, 24)), relation).excess for relation in (domain.relation, np.zeros_like(domain.relation)))
+    told, alike = (
+        response(sums, np.zeros((24, 24)), relation).excess
+        for relation in (domain.relation, np.zeros_like(domain.relation))
+    )
     # Shrinking by 0.3^2 / (0.3^2 + 0.1^2) leaves an rms error of 0.095; one scatter for all entries shrinks the teeth's own by more than half.
     assert np.sqrt(np.mean((told - excess)[own] ** 2)) < 0.12
     assert np.sqrt(np.mean((alike - excess)[own] ** 2)) > 0.15

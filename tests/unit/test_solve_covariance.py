@@ -17,7 +17,9 @@ DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",)), C
 
 def _equations(hessian: np.ndarray, noise: float = 0.0, monte_carlo: float = 0.0) -> NormalEquations:
     count = len(hessian)
-    return NormalEquations(hessian, np.zeros(count), isotropic(count, noise**2), monte_carlo * hessian, hessian, 100.0, 100.0)
+    return NormalEquations(
+        hessian, np.zeros(count), isotropic(count, noise**2), monte_carlo * hessian, hessian, 100.0, 100.0
+    )
 
 
 def test_well_posed_fit_has_the_inverse_curvature_as_covariance() -> None:
@@ -50,8 +52,12 @@ def test_sigma_and_g_along_a_valley_are_flagged_but_the_reduced_scattering_is_no
 
 def test_direction_below_its_noise_is_undetermined() -> None:
     h = np.diag([1e4, 1e4, 1e4])
-    assert estimates(TISSUE, ("enamel",), uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), _equations(h, noise=1e3)))["enamel.sigma"].determined
-    assert not estimates(TISSUE, ("enamel",), uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), _equations(h, noise=1e5)))["enamel.sigma"].determined
+    assert estimates(TISSUE, ("enamel",), uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), _equations(h, noise=1e3)))[
+        "enamel.sigma"
+    ].determined
+    assert not estimates(TISSUE, ("enamel",), uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), _equations(h, noise=1e5)))[
+        "enamel.sigma"
+    ].determined
 
 
 def test_indefinite_curvature_still_gives_finite_errors() -> None:
@@ -61,7 +67,9 @@ def test_indefinite_curvature_still_gives_finite_errors() -> None:
         h = root + root.T
         equations = NormalEquations(h, rng.standard_normal(3), isotropic(3, 1.0), root @ root.T, h, 1.0, 0.0)
         known = uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), equations)
-        assert all(e.se is None or (np.isfinite(e.se) and e.se >= 0) for e in estimates(TISSUE, ("enamel",), known).values())
+        assert all(
+            e.se is None or (np.isfinite(e.se) and e.se >= 0) for e in estimates(TISSUE, ("enamel",), known).values()
+        )
 
 
 def test_misfit_widens_the_errors() -> None:
@@ -69,7 +77,9 @@ def test_misfit_widens_the_errors() -> None:
     exact, poor = _equations(h), NormalEquations(h, np.zeros(3), isotropic(3, 0.0), np.zeros((3, 3)), h, 900.0, 100.0)
     flat = Domain(tuple(Coordinate(c.targets) for c in DOMAIN.coordinates))
     x = flat.x_of(TISSUE)
-    np.testing.assert_allclose(uncertainty(flat, x, poor).covariance, 9 * uncertainty(flat, x, exact).covariance, rtol=1e-8)
+    np.testing.assert_allclose(
+        uncertainty(flat, x, poor).covariance, 9 * uncertainty(flat, x, exact).covariance, rtol=1e-8
+    )
 
 
 def test_a_bound_is_never_determined() -> None:

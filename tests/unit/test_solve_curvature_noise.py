@@ -21,12 +21,19 @@ def whole_covariance(mean: np.ndarray, difference: np.ndarray, weight: np.ndarra
 
 def random_estimates(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.standard_normal((COUNT, MEASUREMENTS)), rng.standard_normal((COUNT, MEASUREMENTS)), rng.uniform(0.5, 2, MEASUREMENTS)
+    return (
+        rng.standard_normal((COUNT, MEASUREMENTS)),
+        rng.standard_normal((COUNT, MEASUREMENTS)),
+        rng.uniform(0.5, 2, MEASUREMENTS),
+    )
 
 
 def test_one_part_is_the_whole() -> None:
     mean, difference, weight = random_estimates(1)
-    whole, noise = whole_covariance(mean, difference, weight), CurvatureNoise((curvature_noise(mean, difference, weight, range(COUNT)),))
+    whole, noise = (
+        whole_covariance(mean, difference, weight),
+        CurvatureNoise((curvature_noise(mean, difference, weight, range(COUNT)),)),
+    )
     directions = np.random.default_rng(2).standard_normal((COUNT, 7))
     pairs = np.einsum("ak,bk->kab", directions, directions).reshape(7, -1)
     np.testing.assert_allclose(noise.variance(directions), np.einsum("ka,ab,kb->k", pairs, whole, pairs), rtol=1e-12)
@@ -46,7 +53,9 @@ def test_parts_of_measurements_that_know_few_coordinates_add_up_to_the_whole() -
     whole = CurvatureNoise((curvature_noise(mean, difference, weight, range(COUNT)),))
     directions = np.random.default_rng(4).standard_normal((COUNT, 7))
     np.testing.assert_allclose(parts.variance(directions), whole.variance(directions), rtol=1e-12)
-    np.testing.assert_allclose(parts.of_product(directions[:, 0]), whole.of_product(directions[:, 0]), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(
+        parts.of_product(directions[:, 0]), whole.of_product(directions[:, 0]), rtol=1e-11, atol=1e-12
+    )
     # A second block of the same coordinates adds to the part there is.
     assert len((parts + parts).parts) == 2
     np.testing.assert_allclose((parts + parts).variance(directions), parts.scaled(2.0).variance(directions), rtol=1e-12)
@@ -56,7 +65,9 @@ def test_a_record_holds_the_same_numbers() -> None:
     mean, difference, weight = random_estimates(5)
     regions = [((0, 1, 2), np.arange(MEASUREMENTS) < 20), ((2, 3, 4), np.arange(MEASUREMENTS) >= 20)]
     residual, ones = np.zeros(MEASUREMENTS), np.ones(MEASUREMENTS)
-    equations = normal_equations(mean + difference / 2, mean - difference / 2, residual, residual, ones, weight, 1, regions)
+    equations = normal_equations(
+        mean + difference / 2, mean - difference / 2, residual, residual, ones, weight, 1, regions
+    )
     stored = NormalEquations.of(json.loads(json.dumps(equations.record())))
     assert [part.coordinates for part in stored.hessian_noise.parts] == [(0, 1, 2), (2, 3, 4)]
     for one, other in zip(stored.hessian_noise.parts, equations.hessian_noise.parts, strict=True):

@@ -46,7 +46,11 @@ class Quadratic:
     def compare(self, x_old: np.ndarray, x_new: np.ndarray, *, samples: int, step: int, trial: int) -> LossChange:
         self.calls.append(("compare", samples))
         noise = self.loss_noise / np.sqrt(samples)
-        change = self.loss(x_new) - self.loss(x_old) + noise * np.random.default_rng([self.seed, step, trial, samples, 1]).standard_normal()
+        change = (
+            self.loss(x_new)
+            - self.loss(x_old)
+            + noise * np.random.default_rng([self.seed, step, trial, samples, 1]).standard_normal()
+        )
         return LossChange(change, noise**2)
 
 
@@ -90,7 +94,9 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
     # comparisons give at most 10 on average, and more than 22 with probability 1e-3 (Poisson).
     accepted = 0
     for case in range(500):
-        problem = Quadratic(np.zeros((4, 4)), np.zeros(4), gradient_noise=1.0, hessian_noise=1.0, loss_noise=1.0, seed=case)
+        problem = Quadratic(
+            np.zeros((4, 4)), np.zeros(4), gradient_noise=1.0, hessian_noise=1.0, loss_noise=1.0, seed=case
+        )
         domain = _domain(4)
         low, high = domain.bounds
         solver = GaussNewton(domain, Options(max_steps=5, max_samples=1024))
@@ -189,7 +195,9 @@ def test_not_finite_input_is_an_error_not_a_number() -> None:
 
 
 def test_state_survives_the_journal_exactly() -> None:
-    problem = Quadratic(np.diag([4.0, 1.0]), np.array([1.0, 2.0]), gradient_noise=1.0, hessian_noise=0.3, loss_noise=0.1)
+    problem = Quadratic(
+        np.diag([4.0, 1.0]), np.array([1.0, 2.0]), gradient_noise=1.0, hessian_noise=0.3, loss_noise=0.1
+    )
     solver = GaussNewton(_domain(2), Options(max_steps=4))
     state = solver.step(problem, solver.init(np.array([2.0, 3.0]), 64))
     again = state_from(json.loads(json.dumps(state_record(state))))

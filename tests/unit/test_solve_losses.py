@@ -22,7 +22,10 @@ def test_weights_are_positive_and_in_units_of_the_noise(loss: Loss) -> None:
     reference, variance = measured()
     residual = np.random.default_rng(2).standard_normal(len(reference)) * 0.1
     residual[:3] = 0.0, 1e-30, 50.0
-    for found in (first_weights(loss, reference, variance), weights(loss, reference, variance, residual, 0.1 * variance)):
+    for found in (
+        first_weights(loss, reference, variance),
+        weights(loss, reference, variance, residual, 0.1 * variance),
+    ):
         assert (found > 0).all()
         assert np.isfinite(found).all()
         assert found @ variance == pytest.approx(len(reference))

@@ -21,7 +21,13 @@ def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
         return np.sqrt(0.5) * (shared + rng.standard_normal((*shape, MEASUREMENTS)))
 
     return tuple(
-        normal_equations(*(j + 0.8 * noise(3) for _ in range(2)), *(r + np.sqrt(0.6) * noise() for _ in range(2)), reference, weight, LIGHTS)
+        normal_equations(
+            *(j + 0.8 * noise(3) for _ in range(2)),
+            *(r + np.sqrt(0.6) * noise() for _ in range(2)),
+            reference,
+            weight,
+            LIGHTS,
+        )
         for _ in range(ROUNDS)
     )
 

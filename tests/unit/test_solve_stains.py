@@ -125,7 +125,12 @@ def test_sums_of_any_size_give_finite_steps_of_a_stated_length(value: float) -> 
 
 def test_a_state_survives_the_journal_exactly() -> None:
     toy = Toy.of(truth(), noise=0.1)
-    state = SOLVER.exact_step(SOLVER.ratio_step(clean(TEXELS), toy.sums(np.zeros(TEXELS))), toy.sums(np.zeros(TEXELS)), 0)
+    state = SOLVER.exact_step(
+        SOLVER.ratio_step(clean(TEXELS), toy.sums(np.zeros(TEXELS))), toy.sums(np.zeros(TEXELS)), 0
+    )
     again = StainState.of(json.loads(json.dumps(state.record())))
     assert again.record() == state.record()
-    assert (SOLVER.exact_step(again, toy.sums(again.depth), 1).depth == SOLVER.exact_step(state, toy.sums(state.depth), 1).depth).all()
+    assert (
+        SOLVER.exact_step(again, toy.sums(again.depth), 1).depth
+        == SOLVER.exact_step(state, toy.sums(state.depth), 1).depth
+    ).all()

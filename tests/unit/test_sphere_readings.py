@@ -42,7 +42,13 @@ PLAIN: dict[str, Any] = {
 }
 FEW = 12
 """Nodes where the same model makes the readings and reads them, so that its own error cancels."""
-SPHERE = {"diameter_mm": 100, "sample_port_mm": 20, "third_port_mm": 10, "detector_port_mm": 5, "wall_reflectance": 0.97}
+SPHERE = {
+    "diameter_mm": 100,
+    "sample_port_mm": 20,
+    "third_port_mm": 10,
+    "detector_port_mm": 5,
+    "wall_reflectance": 0.97,
+}
 
 
 def rxt(folder: Path, rows: str, spheres: float = 0, columns: float = 3) -> Path:
@@ -116,7 +122,9 @@ def test_standard_errors_are_those_of_repeated_readings() -> None:
         step = getattr(first, f"{name}_se")
         changed = first.model_copy(update={name: getattr(first, name) + step})
         (other,) = fit_readings(file.model_copy(update={"totals": (changed,)}), FEW)
-        moved.append([other.fit.sigma_a.value - fit.sigma_a.value, other.fit.sigma_s_reduced.value - fit.sigma_s_reduced.value])
+        moved.append(
+            [other.fit.sigma_a.value - fit.sigma_a.value, other.fit.sigma_s_reduced.value - fit.sigma_s_reduced.value]
+        )
     expected_se = np.sqrt(np.square(moved).sum(axis=0))
     # Readings move by one standard error, over which the coefficients bend by less than 3 %.
     assert [fit.sigma_a.se, fit.sigma_s_reduced.se] == pytest.approx(expected_se, rel=3e-2)
@@ -127,13 +135,17 @@ def test_an_error_of_the_collimated_reading_reaches_g() -> None:
     file = written(PLAIN, optics)
     through = slab_totals(optics, 2, interface_of(file.cell)).transmittance_unscattered
     told = [through, through * 1.02]
-    readings = [file.totals[0].model_copy(update={"T_unscattered": t, "T_unscattered_se": 0.02 * through}) for t in told]
+    readings = [
+        file.totals[0].model_copy(update={"T_unscattered": t, "T_unscattered_se": 0.02 * through}) for t in told
+    ]
     plain, other = (fit_readings(file.model_copy(update={"totals": (reading,)}), FEW)[0].fit for reading in readings)
     assert plain.g.value == pytest.approx(0.7, abs=1e-5)
     assert plain.sigma_t is not None
     assert other.sigma_t is not None
     assert plain.sigma_t.se == pytest.approx(plain.sigma_t.value - other.sigma_t.value, rel=3e-2)
-    from_readings = fit_readings(file.model_copy(update={"totals": (readings[0].model_copy(update={"T_unscattered_se": 1e-9}),)}), FEW)[0].fit.g.se
+    from_readings = fit_readings(
+        file.model_copy(update={"totals": (readings[0].model_copy(update={"T_unscattered_se": 1e-9}),)}), FEW
+    )[0].fit.g.se
     assert plain.g.se**2 - from_readings**2 == pytest.approx((other.g.value - plain.g.value) ** 2, rel=6e-2)
 
 
@@ -148,7 +160,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"colour": "red"}, "colour"),
     "no readings": ({"totals": []}, "totals"),
     "no index": ({"cell": {"width_mm": 1, "index": None}}, "give the sample's index"),
-    "a sample thinner than its surroundings": ({"cell": {"width_mm": 1, "index": 1.2, "index_outside": 1.33}}, "below index_outside"),
+    "a sample thinner than its surroundings": (
+        {"cell": {"width_mm": 1, "index": 1.2, "index_outside": 1.33}},
+        "below index_outside",
+    ),
     "a wavelength twice": ({"totals": 2 * PLAIN["totals"]}, "550 nm is listed twice"),
     "a reading above all light": ({"totals": [{"R": 3, "T": 0.1}]}, "totals.0.R"),
     "a port larger than its sphere": ({"reflection_sphere": SPHERE | {"sample_port_mm": 120}}, "below diameter_mm"),

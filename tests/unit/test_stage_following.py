@@ -47,7 +47,9 @@ def follow(monkeypatch: pytest.MonkeyPatch, folder: Path, task: Task, stage: Sta
     stages._follow_stage(client, lambda: None, described, watch)
 
 
-def test_a_task_that_no_worker_takes_on_is_given_up_after_a_cancel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_task_that_no_worker_takes_on_is_given_up_after_a_cancel(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     stages.request_cancel(tmp_path)
     with pytest.raises(JobCancelledError):
         follow(monkeypatch, tmp_path, Task("pending"))
@@ -58,7 +60,9 @@ def test_a_capture_is_awaited_after_a_cancel(monkeypatch: pytest.MonkeyPatch, tm
     follow(monkeypatch, tmp_path, Task("pending", "pending", "pending", "finished"), "capture")
 
 
-def test_a_result_that_dies_with_its_worker_is_waited_for_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_result_that_dies_with_its_worker_is_waited_for_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     task = Task("finished", silent=2)
     follow(monkeypatch, tmp_path, task)
     assert task.asked == 3

@@ -50,7 +50,9 @@ def test_what_cannot_be_written_leaves_nothing_behind(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
-def test_the_newer_of_two_attempts_that_start_at_once_has_the_lease(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newer_of_two_attempts_that_start_at_once_has_the_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     newer: list[threading.Thread] = []
 
     def write_late(path: Path, content: bytes) -> None:
@@ -68,7 +70,9 @@ def test_the_newer_of_two_attempts_that_start_at_once_has_the_lease(tmp_path: Pa
         older.require_lease()
 
 
-def test_an_attempt_that_is_overtaken_while_it_publishes_does_not_replace_the_newer_ones_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_attempt_that_is_overtaken_while_it_publishes_does_not_replace_the_newer_ones_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     older, newer = StageWriter(tmp_path, "fit", 1), list[threading.Thread]()
     require_lease = StageWriter.require_lease
 

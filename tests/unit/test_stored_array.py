@@ -41,7 +41,11 @@ def test_an_index_beyond_the_end_is_not_called_damage(path: Path) -> None:
         StoredArray(path)[7]
 
 
-@pytest.mark.parametrize(("selection", "kind"), [(np.s_[::0], ValueError), (np.s_[0, 0, 0], IndexError), ("row", IndexError)])
-def test_a_selection_that_cannot_be_is_the_readers_own_error(path: Path, selection: object, kind: type[Exception]) -> None:
+@pytest.mark.parametrize(
+    ("selection", "kind"), [(np.s_[::0], ValueError), (np.s_[0, 0, 0], IndexError), ("row", IndexError)]
+)
+def test_a_selection_that_cannot_be_is_the_readers_own_error(
+    path: Path, selection: object, kind: type[Exception]
+) -> None:
     with pytest.raises(kind):
         StoredArray(path)[selection]

@@ -24,7 +24,11 @@ class Walk:
         return [self.random.normal(count, self.spread * np.sqrt(count), (batches, PIXELS, 1))]
 
     def until(self, effort: Effort) -> StackEstimate:
-        return trace_until(self.trace, lambda tables: StackEstimate(tables[0].mean(axis=0).T, tables[0].var(axis=0, ddof=1).T / len(tables[0])), effort)
+        return trace_until(
+            self.trace,
+            lambda tables: StackEstimate(tables[0].mean(axis=0).T, tables[0].var(axis=0, ddof=1).T / len(tables[0])),
+            effort,
+        )
 
 
 def test_rounds_follow_on_and_grow_within_bounds() -> None:

@@ -18,7 +18,9 @@ def report(**changes: Any) -> FitReport:
         "held_out_error": {"red": 0.05, "green": 0.07},
         "held_out_error_se": {"red": 0.003, "green": 0.004},
     }
-    return FitReport(**told | {"converged": True, "advice": "", "parameters": {}, "steps": 12, "seconds": 1.0} | changes)
+    return FitReport(
+        **told | {"converged": True, "advice": "", "parameters": {}, "steps": 12, "seconds": 1.0} | changes
+    )
 
 
 def test_the_error_is_the_mean_over_channels_with_its_standard_error() -> None:
@@ -32,10 +34,14 @@ def test_the_error_is_the_mean_over_channels_with_its_standard_error() -> None:
 def test_the_standard_error_of_the_mean_is_that_of_independent_channels() -> None:
     drawn = np.random.default_rng(1).normal([0.05, 0.07], [0.003, 0.004], (40_000, 2)).mean(axis=1)
     found = mean_figure({"red": 0.05, "green": 0.07}, {"red": 0.003, "green": 0.004})
-    assert found.se == pytest.approx(drawn.std(), rel=4 / np.sqrt(2 * len(drawn)))  # four standard errors of a standard deviation
+    assert found.se == pytest.approx(
+        drawn.std(), rel=4 / np.sqrt(2 * len(drawn))
+    )  # four standard errors of a standard deviation
 
 
-@pytest.mark.parametrize("errors", [{"held_out_error": {"red": 0.02, "green": 0.336}}, {"fit_error": {"red": 0.02, "green": 0.336}}])
+@pytest.mark.parametrize(
+    "errors", [{"held_out_error": {"red": 0.02, "green": 0.336}}, {"fit_error": {"red": 0.02, "green": 0.336}}]
+)
 def test_an_error_above_the_limit_leads_whatever_the_solver_says(errors: dict[str, Any]) -> None:
     verdict = verdict_of(report(**errors))
     assert (verdict.converged, verdict.is_above_limit, verdict.limit) == (False, True, MAX_ERROR)
@@ -69,7 +75,13 @@ def test_a_report_of_an_earlier_version_is_judged_without_standard_errors() -> N
 
 @pytest.mark.parametrize(
     ("value", "se", "told"),
-    [(0.204, 0.204, "20.4 ± 20.4 %"), (0.0741, 0.0042, "7.41 ± 0.42 %"), (0.05, 0.0, "5.00 ± 0.00 %"), (0.074, None, "7.4 %"), (0.004, None, "0.40 %")],
+    [
+        (0.204, 0.204, "20.4 ± 20.4 %"),
+        (0.0741, 0.0042, "7.41 ± 0.42 %"),
+        (0.05, 0.0, "5.00 ± 0.00 %"),
+        (0.074, None, "7.4 %"),
+        (0.004, None, "0.40 %"),
+    ],
 )
 def test_a_figure_has_as_many_digits_as_its_standard_error_allows(value: float, se: float | None, told: str) -> None:
     assert percent(Figure(value=value, se=se)) == told

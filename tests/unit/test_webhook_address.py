@@ -69,7 +69,9 @@ def test_other_spellings_are_refused_once_they_are_resolved(host: str) -> None:
 @pytest.mark.attack("webhooks", "a name with an address inside beside public ones")
 def test_one_hidden_address_among_public_ones_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def answer(*_: Any, **__: Any) -> list[Any]:
-        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 443)) for address in ("93.184.216.34", "10.0.0.1")]
+        return [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 443)) for address in ("93.184.216.34", "10.0.0.1")
+        ]
 
     monkeypatch.setattr(socket, "getaddrinfo", answer)
     with pytest.raises(WebhookAddressError, match=r"10\.0\.0\.1"):

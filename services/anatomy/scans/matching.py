@@ -78,11 +78,15 @@ class CrownMatch:
         from scipy.spatial import cKDTree
 
         average = build_tooth(upper_tooth(fdi % 10))
-        crown = average.outer.faces[average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm]
+        crown = average.outer.faces[
+            average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm
+        ]
         # x is mesial on the patient's right above and on the left below; on the other sides the average is a mirror image.
         self._mirror = np.array([-float(side_of_front(fdi)), 1.0, 1.0])
         self._crown = Mesh(average.outer.vertices_mm, crown)
-        self._middle = (average.outer.vertices_mm[crown].min(axis=(0, 1)) + average.outer.vertices_mm[crown].max(axis=(0, 1))) / 2
+        self._middle = (
+            average.outer.vertices_mm[crown].min(axis=(0, 1)) + average.outer.vertices_mm[crown].max(axis=(0, 1))
+        ) / 2
         self._mesh, self._average = _sampled(outer, MESH_POINTS), self._crown_points(CROWN_POINTS)
         self._mesh_tree, self._average_tree = cKDTree(self._mesh.features), cKDTree(self._average.features)
 
@@ -128,7 +132,10 @@ class CrownMatch:
 
     def _closest(self, placed: Placements, crown: SurfacePoints) -> tuple[Array, Array]:
         # The mesh's point closest to each of the crown's (G, N, 3), and its distance (G, N).
-        points = placed.scales[:, None, None] * np.einsum("gkj,nk->gnj", placed.axes, crown.points_mm) + placed.centres_mm[:, None]
+        points = (
+            placed.scales[:, None, None] * np.einsum("gkj,nk->gnj", placed.axes, crown.points_mm)
+            + placed.centres_mm[:, None]
+        )
         normals = np.einsum("gkj,nk->gnj", placed.axes, crown.normals)
         distance, nearest = self._mesh_tree.query(np.concatenate([points, NORMAL_MM * normals], axis=2).reshape(-1, 6))
         return self._mesh.points_mm[nearest].reshape(points.shape), np.asarray(distance.reshape(points.shape[:2]))
@@ -145,7 +152,9 @@ class CrownMatch:
         signs[:, 2] = np.sign(np.linalg.det(left @ right))
         axes = np.einsum("gik,gk,gkj->gij", left, signs, right)
         scales = np.clip((size * signs).sum(axis=1) / (weight * offset**2).sum(axis=(1, 2)), *SCALES)
-        return Placements(axes, to_middle - scales[:, None] * np.einsum("gkj,gk->gj", axes, from_middle), scales, placed.misfits_mm)
+        return Placements(
+            axes, to_middle - scales[:, None] * np.einsum("gkj,gk->gj", axes, from_middle), scales, placed.misfits_mm
+        )
 
 
 def _sampled(mesh: Mesh, count: int) -> SurfacePoints:

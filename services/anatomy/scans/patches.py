@@ -62,7 +62,13 @@ def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
 def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
     """Vertices of each boundary loop of a manifold piece in the direction of its faces' edges, the loop of most vertices first."""
     open_edge = (neighbours(faces) < 0).reshape(-1)
-    following = dict(zip(faces.reshape(-1)[open_edge].tolist(), np.roll(faces, -1, axis=1).reshape(-1)[open_edge].tolist(), strict=True))
+    following = dict(
+        zip(
+            faces.reshape(-1)[open_edge].tolist(),
+            np.roll(faces, -1, axis=1).reshape(-1)[open_edge].tolist(),
+            strict=True,
+        )
+    )
     loops = []
     while following:
         first, vertex = following.popitem()
@@ -103,7 +109,10 @@ def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], s
     count = len(first_mm)
     rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(1, count) / count))
     row = np.arange(1, steps + 1)[:, None]
-    from_first, from_last = 1 - np.broadcast_to(row, (steps, count)) / steps, np.broadcast_to(row, (steps, count)) / steps
+    from_first, from_last = (
+        1 - np.broadcast_to(row, (steps, count)) / steps,
+        np.broadcast_to(row, (steps, count)) / steps,
+    )
     # sinh(rate n) / sinh(rate steps) without overflow.
     from_first[:, 1:] = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
     from_last[:, 1:] = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
@@ -115,7 +124,10 @@ def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> ND
     """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads split along their shorter diagonal."""
     a, b = rings[:-1], np.roll(rings[:-1], -1, axis=1)
     c, d = rings[1:], np.roll(rings[1:], -1, axis=1)
-    falling = (np.linalg.norm(vertices_mm[b] - vertices_mm[c], axis=-1) <= np.linalg.norm(vertices_mm[a] - vertices_mm[d], axis=-1))[..., None]
+    falling = (
+        np.linalg.norm(vertices_mm[b] - vertices_mm[c], axis=-1)
+        <= np.linalg.norm(vertices_mm[a] - vertices_mm[d], axis=-1)
+    )[..., None]
     one = np.where(falling, np.stack([b, a, c], -1), np.stack([b, a, d], -1))
     two = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
     return np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
@@ -164,14 +176,18 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
     moving = np.flatnonzero(degree > 1)
     vertices = mesh.vertices_mm.copy()
     for _ in range(rounds):
-        total = np.stack([np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1)
+        total = np.stack(
+            [np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1
+        )
         vertices[moving] = (vertices[moving] + total[moving] / degree[moving, None]) / 2
     vertices[moving] = SurfaceDistance(mesh).closest(vertices[moving])[0]
 
     normals, area = _crosses(mesh), 2 * areas_mm2(mesh)
     for _ in range(20):
         moved = _crosses(Mesh(vertices, mesh.faces))
-        bad = np.einsum("ij,ij->i", normals, moved) < np.maximum(0.5 * area * np.linalg.norm(moved, axis=1), 0.1 * area**2)
+        bad = np.einsum("ij,ij->i", normals, moved) < np.maximum(
+            0.5 * area * np.linalg.norm(moved, axis=1), 0.1 * area**2
+        )
         if not bad.any() or np.array_equal(vertices[mesh.faces[bad]], mesh.vertices_mm[mesh.faces[bad]]):
             break
         vertices[mesh.faces[bad]] = mesh.vertices_mm[mesh.faces[bad]]
@@ -187,7 +203,10 @@ def _components(one: NDArray[np.int64], two: NDArray[np.int64], count: int) -> N
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    return np.asarray(connected_components(coo_matrix((np.ones(len(one)), (one, two)), shape=(count, count)), directed=False)[1], dtype=np.int64)
+    return np.asarray(
+        connected_components(coo_matrix((np.ones(len(one)), (one, two)), shape=(count, count)), directed=False)[1],
+        dtype=np.int64,
+    )
 
 
 def _largest(number: NDArray[np.int64], weight: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -211,7 +230,9 @@ def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
         _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
         return np.asarray(counts[index.reshape(-1, 3)].max(axis=1))
 
-    return (shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2) & (shared_by(start * count + end) == 1)
+    return (shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2) & (
+        shared_by(start * count + end) == 1
+    )
 
 
 def _largest_fans(faces: Faces) -> NDArray[np.bool_]:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.anatomy.scans.patches import boundary_loops, compact, fill_holes, harmonic_rows, manifold_piece, neighbours, ring_faces, vector_area_mm2
+from services.anatomy.scans.patches import (
+    boundary_loops,
+    compact,
+    fill_holes,
+    harmonic_rows,
+    manifold_piece,
+    neighbours,
+    ring_faces,
+    vector_area_mm2,
+)
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
@@ -37,10 +46,14 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
     """
     crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
     if not boundary_loops(crown.faces):
-        raise MeshError(f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is.")
+        raise MeshError(
+            f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is."
+        )
     crown, _ = fill_holes(_without_spikes(crown))
     if vector_area_mm2(crown) @ occlusal <= 0:
-        raise MeshError(f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles.")
+        raise MeshError(
+            f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles."
+        )
 
     crown = _bridge_contacts(crown, occlusal)
     loop = boundary_loops(crown.faces)[0]
@@ -80,7 +93,9 @@ def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
             # The shorter of the two next chords.
             steps = [(before - 1, after), (before, after + 1)] if before or after else [(-1, 1)]
             steps = [(i, j) for i, j in steps if tuple(sorted((int(loop[i]), int(loop[j])))) not in edges]
-            chord, i, j = min(((float(np.linalg.norm(position[i] - position[j])), i, j) for i, j in steps), default=(np.inf, 0, 0))
+            chord, i, j = min(
+                ((float(np.linalg.norm(position[i] - position[j])), i, j) for i, j in steps), default=(np.inf, 0, 0)
+            )
             if chord > WIDEST_BRIDGE_MM:
                 break
             strip.append((loop[j], loop[after] if j > after else loop[before], loop[i]))
@@ -110,10 +125,14 @@ def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
     between = start + np.linspace(0, 1, pieces + 1)[1:-1, None] * (end - start)
     chord = np.array([i, *(len(crown.vertices_mm) + np.arange(pieces - 1)), j])
     fan = np.stack([chord[1:], np.full(pieces, k), chord[:-1]], axis=1)
-    return Mesh(np.concatenate([crown.vertices_mm, between]), np.concatenate([crown.faces, strip[:-1], fan]).astype(np.int32))
+    return Mesh(
+        np.concatenate([crown.vertices_mm, between]), np.concatenate([crown.faces, strip[:-1], fan]).astype(np.int32)
+    )
 
 
-def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _stub_rows(
+    loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Columns run from the cervical line to a smooth ring across the axis, and on over a rounded end to a pole.
     height = loop_mm @ occlusal
     flat = loop_mm - np.outer(height, occlusal)
@@ -124,7 +143,12 @@ def _stub_rows(loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub
     steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
     wall = harmonic_rows(loop_mm, end + end_height * occlusal, steps)
     bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
-    lid = np.stack([centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal for bend in bends])
+    lid = np.stack(
+        [
+            centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal
+            for bend in bends
+        ]
+    )
     return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
 
 

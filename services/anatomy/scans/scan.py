@@ -59,24 +59,36 @@ def read_scan(path: Path, numbering: Numbering = "universal", array: str = "Labe
     found = next((values for name, values in arrays.items() if name.lower() == array.lower()), None)
     if found is None:
         held = ", ".join(sorted(arrays)) or "none"
-        raise CaptureInputError(f"Scan {path} has no label per triangle named {array} (it has: {held}); export it with its segmentation.")
+        raise CaptureInputError(
+            f"Scan {path} has no label per triangle named {array} (it has: {held}); export it with its segmentation."
+        )
     values = np.asarray(found, dtype=np.float64)
     if values.shape != (len(mesh.faces),):
-        raise CaptureInputError(f"Scan {path} has labels {array} of shape {values.shape} for {len(mesh.faces)} triangles; export one label per triangle.")
+        raise CaptureInputError(
+            f"Scan {path} has labels {array} of shape {values.shape} for {len(mesh.faces)} triangles; export one label per triangle."
+        )
     mesh.require_surface(f"of scan {path}", EXTENT_MM)
     scan = LabelledScan(mesh, _fdi_numbers(values, numbering, path))
     if not (scan.fdi == GINGIVA).any():
-        raise CaptureInputError(f"Scan {path} has no gingiva (label {GINGIVA}); export it with the gums around the teeth.")
+        raise CaptureInputError(
+            f"Scan {path} has no gingiva (label {GINGIVA}); export it with the gums around the teeth."
+        )
     if len(scan.teeth) < 2:
-        raise CaptureInputError(f"Scan {path} has {len(scan.teeth)} labelled teeth; export at least two, which tell left from right.")
+        raise CaptureInputError(
+            f"Scan {path} has {len(scan.teeth)} labelled teeth; export at least two, which tell left from right."
+        )
     if len({number // 10 in (1, 2) for number in scan.teeth}) > 1:
-        raise CaptureInputError(f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend the labels.")
+        raise CaptureInputError(
+            f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend the labels."
+        )
     return scan
 
 
 def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) -> NDArray[np.int64]:
     names = {fdi_from_universal(n): n for n in range(1, 33)}
-    number_of = {float(GINGIVA): GINGIVA} | {float(n if numbering == "universal" else fdi): fdi for fdi, n in names.items()}
+    number_of = {float(GINGIVA): GINGIVA} | {
+        float(n if numbering == "universal" else fdi): fdi for fdi, n in names.items()
+    }
     labels, index = np.unique(values, return_inverse=True)
     unknown = [f"{label:g}" for label in labels if float(label) not in number_of]
     if unknown:

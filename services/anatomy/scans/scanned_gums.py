@@ -77,7 +77,9 @@ def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
     crossing = start[:, 0] + (y[:, None] - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
     triangles = triangles[np.count_nonzero(spans & (crossing > x[:, None]), axis=1) % 2 == 1]
     if len(triangles) != len(outline) - 2:
-        raise MeshError("The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again.")
+        raise MeshError(
+            "The scan's rim crosses itself when seen along the teeth; trim the scan's border and export it again."
+        )
     return triangles
 
 

@@ -55,7 +55,12 @@ def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
     _require_whole_teeth(scan)
     surface, labels = _clean(scan)
     crowns = {number: compact(Mesh(surface.vertices_mm, surface.faces[labels == number])) for number in scan.teeth}
-    middles = np.array([np.average(crown.vertices_mm[crown.faces].mean(axis=1), axis=0, weights=areas_mm2(crown)) for crown in crowns.values()])
+    middles = np.array(
+        [
+            np.average(crown.vertices_mm[crown.faces].mean(axis=1), axis=0, weights=areas_mm2(crown))
+            for crown in crowns.values()
+        ]
+    )
     rotation = _arch_axes(scan.teeth, surface, middles)
     turned = surface.vertices_mm @ rotation.T
     shift = -(turned.min(axis=0) + turned.max(axis=0)) / 2
@@ -64,7 +69,9 @@ def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
     surface = Mesh(turned + shift, surface.faces)
     crowns = {number: Mesh(crown.vertices_mm @ rotation.T + shift, crown.faces) for number, crown in crowns.items()}
     axes = _tooth_axes(scan.teeth, crowns, middles @ rotation.T + shift)
-    teeth = tuple(Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}")) for number in scan.teeth)
+    teeth = tuple(
+        Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}")) for number in scan.teeth
+    )
     deepest = min(float(tooth.outer.vertices_mm[:, 2].min()) for tooth in teeth)
     gums = gums_solid(surface, labels == GINGIVA, np.array([0.0, 0.0, 1.0]), deepest)
     frames = tuple(ToothFrame.centred(axes[tooth.fdi], tooth.outer) for tooth in teeth)
@@ -90,7 +97,9 @@ def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:
     lost = set(scan.teeth) - set(labels.tolist())
     if lost or not (labels == GINGIVA).any():
         what = f"tooth {min(lost)}" if lost else "the gingiva"
-        raise CaptureInputError(f"In the scan {what} hangs together with nothing else; export one connected surface of the jaw.")
+        raise CaptureInputError(
+            f"In the scan {what} hangs together with nothing else; export one connected surface of the jaw."
+        )
     surface, sources = fill_holes(compact(Mesh(scan.mesh.vertices_mm, scan.mesh.faces[kept])))
     labels = np.concatenate([labels, labels[sources]])
     labels = without_specks(surface, smooth_labels(surface.faces, labels))
@@ -114,13 +123,17 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     seen_plane, nominal_plane = seen @ (1, 1j), nominal @ (1, 1j)
     match, mirrored = np.vdot(nominal_plane, seen_plane), np.vdot(nominal_plane.conj(), seen_plane)
     if abs(mirrored) > abs(match) * (1 + 1e-3) and len(teeth) > 2 and plane:
-        raise CaptureInputError("The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the scan back.")
+        raise CaptureInputError(
+            "The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the scan back."
+        )
     front = match / abs(match)
     x = front.real * across[0] + front.imag * across[1]
     return np.stack([x, np.cross(occlusal, x), occlusal])
 
 
-def _tooth_axes(teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArray[np.float64]) -> dict[int, NDArray[np.float64]]:
+def _tooth_axes(
+    teeth: tuple[int, ...], crowns: dict[int, Mesh], middles: NDArray[np.float64]
+) -> dict[int, NDArray[np.float64]]:
     order = sorted(range(len(teeth)), key=lambda k: side_of_front(teeth[k]) * (teeth[k] % 10))
     tangents = np.gradient(middles[order], axis=0)
     upward, axes = np.array([0.0, 0.0, 1.0]), {}

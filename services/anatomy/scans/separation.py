@@ -50,7 +50,9 @@ def separate(teeth: tuple[Tooth, ...], gums: Mesh | None) -> SeparateSurfaces:
             remaining[j] -= first.body
     together = Manifold.batch_boolean([outer.body for outer in outers], OpType.Add)
     if gums is None:
-        return SeparateSurfaces(tuple(outer.faces_in(together) for outer in outers), (_EMPTY,) * len(teeth), _EMPTY, contacts)
+        return SeparateSurfaces(
+            tuple(outer.faces_in(together) for outer in outers), (_EMPTY,) * len(teeth), _EMPTY, contacts
+        )
     holder = _Solid(gums, "gums.ply")
     outside, within = together + holder.body, together ^ holder.body
     crowns, roots = (tuple(outer.faces_in(body) for outer in outers) for body in (outside, within))
@@ -66,10 +68,15 @@ class _Solid:
     def __init__(self, mesh: Mesh, name: str) -> None:
         from manifold3d import Error, Manifold, Mesh64
 
-        vertices, faces = (np.ascontiguousarray(array, dtype=kind) for array, kind in ((mesh.vertices_mm, np.float64), (mesh.faces, np.uint64)))
+        vertices, faces = (
+            np.ascontiguousarray(array, dtype=kind)
+            for array, kind in ((mesh.vertices_mm, np.float64), (mesh.faces, np.uint64))
+        )
         self.body: Any = Manifold(Mesh64(vertices, faces))
         if self.body.status() != Error.NoError:
-            raise MeshError(f"Mesh {name} cannot be cut where it meets others ({self.body.status().name}); repair it so that it is one closed surface.")
+            raise MeshError(
+                f"Mesh {name} cannot be cut where it meets others ({self.body.status().name}); repair it so that it is one closed surface."
+            )
         self._number = int(self.body.to_mesh64().run_original_id[0])
         self._low, self._high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
 
@@ -82,12 +89,19 @@ class _Solid:
         cut = body.to_mesh64()
         ends = np.asarray(cut.run_index, dtype=np.int64) // 3
         own: list[NDArray[Any]] = [
-            cut.tri_verts[first:last] for number, first, last in zip(cut.run_original_id, ends[:-1], ends[1:], strict=True) if number == self._number
+            cut.tri_verts[first:last]
+            for number, first, last in zip(cut.run_original_id, ends[:-1], ends[1:], strict=True)
+            if number == self._number
         ]
         faces = np.concatenate([np.zeros((0, 3), dtype=np.int32), *own]).astype(np.int32)
         return compact(Mesh(cut.vert_properties[:, :3].astype(np.float64), faces))
 
 
 def _require_whole_dentin(tooth: Tooth, outer: _Solid, other: Tooth) -> None:
-    if other.dentin is not None and not (outer.body ^ _Solid(other.dentin, f"teeth/{other.fdi}/dentin.ply").body).is_empty():
-        raise MeshError(f"Tooth {tooth.fdi} reaches into the dentin of tooth {other.fdi}, so no surface between them is known; move them apart.")
+    if (
+        other.dentin is not None
+        and not (outer.body ^ _Solid(other.dentin, f"teeth/{other.fdi}/dentin.ply").body).is_empty()
+    ):
+        raise MeshError(
+            f"Tooth {tooth.fdi} reaches into the dentin of tooth {other.fdi}, so no surface between them is known; move them apart."
+        )

@@ -25,7 +25,9 @@ class Arch:
 
     def __init__(self) -> None:
         angle = np.linspace(0, np.pi / 2, STEPS)
-        radius = ((np.sin(angle) / HALF_WIDTH_MM) ** EXPONENT + (np.cos(angle) / DEPTH_MM) ** EXPONENT) ** (-1 / EXPONENT)
+        radius = ((np.sin(angle) / HALF_WIDTH_MM) ** EXPONENT + (np.cos(angle) / DEPTH_MM) ** EXPONENT) ** (
+            -1 / EXPONENT
+        )
         x = np.append(radius * np.sin(angle), HALF_WIDTH_MM)
         y = np.append(radius * np.cos(angle), -STRAIGHT_MM) - DEPTH_MM + FORWARD_MM
         self._x, self._y = x, y
@@ -37,7 +39,10 @@ class Arch:
     def points_mm(self, length_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 2), x and y, at signed arc lengths (N,)."""
         away = np.abs(length_mm)
-        return np.stack([np.sign(length_mm) * np.interp(away, self._length, self._x), np.interp(away, self._length, self._y)], axis=-1)
+        return np.stack(
+            [np.sign(length_mm) * np.interp(away, self._length, self._x), np.interp(away, self._length, self._y)],
+            axis=-1,
+        )
 
     def tangents(self, length_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit directions (N, 2) of growing arc length; turned left by a right angle they point out of the mouth."""

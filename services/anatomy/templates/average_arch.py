@@ -8,7 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-NOMINAL_MM = np.array([(4.2, 0.0), (11.6, -2.0), (18.0, -6.5), (22.0, -12.5), (24.5, -19.5), (27.0, -28.0), (29.5, -37.5), (31.0, -47.0)])
+NOMINAL_MM = np.array(
+    [(4.2, 0.0), (11.6, -2.0), (18.0, -6.5), (22.0, -12.5), (24.5, -19.5), (27.0, -28.0), (29.5, -37.5), (31.0, -47.0)]
+)
 """Middles of the teeth 1 to 8 of a quadrant; they serve to tell front from back and left from right."""
 UPPER = (1, 2, 5, 6)
 """Quadrants of the upper jaw."""
@@ -29,7 +31,9 @@ def nominal_places(teeth: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray
     line = np.concatenate([NOMINAL_MM[::-1] * (-1, 1), NOMINAL_MM])
     steps = np.gradient(line, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    places = np.array([len(NOMINAL_MM) + (number % 10 - 1 if side_of_front(number) > 0 else -(number % 10)) for number in teeth])
+    places = np.array(
+        [len(NOMINAL_MM) + (number % 10 - 1 if side_of_front(number) > 0 else -(number % 10)) for number in teeth]
+    )
     axes = np.zeros((len(teeth), 3, 3))
     axes[:, 0, :2] = steps[places]
     axes[:, 1, :2] = np.stack([-steps[places, 1], steps[places, 0]], axis=-1)

@@ -157,13 +157,21 @@ def build_tooth(dimensions: ToothDimensions, enamel_scale: float = 1.0) -> Tooth
 
     # The same maps for both, then exactly the crown's diameter and length.
     outer, dentin = (Mesh(_shaped(mesh.vertices_mm, form, dimensions), mesh.faces) for mesh in (outer, dentin))
-    stretch = np.array([dimensions.md_crown_mm / np.ptp(outer.vertices_mm[:, 0]), 1.0, length / outer.vertices_mm[:, 2].max()])
+    stretch = np.array(
+        [dimensions.md_crown_mm / np.ptp(outer.vertices_mm[:, 0]), 1.0, length / outer.vertices_mm[:, 2].max()]
+    )
     outer, dentin = (_stretched_above_cervix(mesh, stretch) for mesh in (outer, dentin))
     middle = (outer.vertices_mm.min(axis=0) + outer.vertices_mm.max(axis=0)) / 2
-    return ToothSolid(Mesh(outer.vertices_mm - middle, outer.faces), Mesh(dentin.vertices_mm - middle, dentin.faces), -float(middle[2]))
+    return ToothSolid(
+        Mesh(outer.vertices_mm - middle, outer.faces),
+        Mesh(dentin.vertices_mm - middle, dentin.faces),
+        -float(middle[2]),
+    )
 
 
-def enamel_thickness_mm(form: CrownForm, crown_length_mm: float, height_mm: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+def enamel_thickness_mm(
+    form: CrownForm, crown_length_mm: float, height_mm: NDArray[np.float64], scale: float
+) -> NDArray[np.float64]:
     """Enamel along the normal at a height above the cervical line; fades to the root's cover below it."""
     cervix, tip = form.enamel_mm
     crown = scale * (cervix + (tip - cervix) * np.clip(height_mm / crown_length_mm, 0.0, 1.0))
@@ -210,7 +218,9 @@ def _dentin_profile(form: CrownForm, crown_length_mm: float, outer: Profile, sca
 def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, scale: float) -> float:
     # Below the tip by the enamel's thickness, and where the walls leave room for it.
     heights = np.linspace(0.0, crown_length_mm, 1000)
-    room = (dentin(heights)[1] >= DENTIN_EDGE_MM) & (heights + enamel_thickness_mm(form, crown_length_mm, heights, scale) <= crown_length_mm)
+    room = (dentin(heights)[1] >= DENTIN_EDGE_MM) & (
+        heights + enamel_thickness_mm(form, crown_length_mm, heights, scale) <= crown_length_mm
+    )
     return float(heights[room].max())
 
 
@@ -220,7 +230,11 @@ def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[fl
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
         half_x, half_y, _ = (float(value[0]) for value in profile(np.array([end])))
         thin.append(half_y - rounding < THIN_LID_MM)
-        rings_of_lid = 1 if thin[-1] else round((half_x + half_y - 2 * rounding) / 2 / (ROOT_LID_STEP_MM if sign < 0 else LID_STEP_MM))
+        rings_of_lid = (
+            1
+            if thin[-1]
+            else round((half_x + half_y - 2 * rounding) / 2 / (ROOT_LID_STEP_MM if sign < 0 else LID_STEP_MM))
+        )
         rim = [(end, rounding, k / rings_of_lid) for k in range(1, rings_of_lid)]
         angle = np.linspace(np.pi / 2, 0, max(3, round(np.pi / 2 * rounding / CROWN_STEP_MM)) + 1)[:-1]
         rim += [(end - sign * rounding * (1 - float(np.sin(a))), rounding * (1 - float(np.cos(a))), 1.0) for a in angle]
@@ -247,7 +261,9 @@ def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimension
     return np.stack([x, y, z + share * share * (3 - 2 * share) * _relief_mm(x, y, form, d)], axis=-1)
 
 
-def _relief_mm(x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions) -> NDArray[np.float64]:
+def _relief_mm(
+    x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions
+) -> NDArray[np.float64]:
     # Soft maximum of cones with rounded tips and of the fossa's floor; 0 at the highest cusp.
     cusps = np.array(form.cusps)
     tips = cusps[:, :2] * [d.md_crown_mm / 2, d.ll_crown_mm / 2]

@@ -51,5 +51,7 @@ def upper_tooth(position: int) -> ToothDimensions:
         CaptureInputError: no tooth has this place.
     """
     if not 1 <= position <= len(UPPER_TEETH):
-        raise CaptureInputError(f"No tooth stands at place {position} from the midline; FDI numbers end in 1 to {len(UPPER_TEETH)}, so renumber the tooth.")
+        raise CaptureInputError(
+            f"No tooth stands at place {position} from the midline; FDI numbers end in 1 to {len(UPPER_TEETH)}, so renumber the tooth."
+        )
     return UPPER_TEETH[position - 1]

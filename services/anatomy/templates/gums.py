@@ -56,8 +56,16 @@ def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
     Args:
         sockets: in order of arc length.
     """
-    first, last = sockets[0].arc_mm - sockets[0].width_mm / 2 - BEHIND_MM, sockets[-1].arc_mm + sockets[-1].width_mm / 2 + BEHIND_MM
-    cap = np.arange(1, round(np.pi / 2 * END_ROUNDING_MM / STEP_MM)) / round(np.pi / 2 * END_ROUNDING_MM / STEP_MM) * np.pi / 2
+    first, last = (
+        sockets[0].arc_mm - sockets[0].width_mm / 2 - BEHIND_MM,
+        sockets[-1].arc_mm + sockets[-1].width_mm / 2 + BEHIND_MM,
+    )
+    cap = (
+        np.arange(1, round(np.pi / 2 * END_ROUNDING_MM / STEP_MM))
+        / round(np.pi / 2 * END_ROUNDING_MM / STEP_MM)
+        * np.pi
+        / 2
+    )
     low, high = first + END_ROUNDING_MM, last - END_ROUNDING_MM
     middle = np.linspace(low, high, round((high - low) / STEP_MM) + 1)
     stations = np.concatenate([low - END_ROUNDING_MM * np.cos(cap), middle, high + END_ROUNDING_MM * np.sin(cap)])
@@ -70,37 +78,58 @@ def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
     for k in range(len(stations)):
         up, out = superellipse(scale[k] * (crest[k] - floor[k]) / 2, scale[k] * half_depth[k], COLUMNS, EXPONENT)
         rings.append(np.column_stack([points[k] + out[:, None] * outward[k], (crest[k] + floor[k]) / 2 + up])[::-1])
-    ends = [np.append(arch.points_mm(np.array([end]))[0], (crest[k] + floor[k]) / 2) for end, k in ((first, 0), (last, -1))]
+    ends = [
+        np.append(arch.points_mm(np.array([end]))[0], (crest[k] + floor[k]) / 2) for end, k in ((first, 0), (last, -1))
+    ]
     return close_rings(np.concatenate([*rings, np.stack(ends)]), len(rings), COLUMNS)
 
 
 def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
     """An open wall: the palate's vault between the gums and, behind the last teeth, a wall down past the occlusal plane."""
-    ends = np.array([sockets[-1].arc_mm, -sockets[0].arc_mm]) + np.array([sockets[-1].width_mm, sockets[0].width_mm]) / 2 + BEHIND_MM / 2
+    ends = (
+        np.array([sockets[-1].arc_mm, -sockets[0].arc_mm])
+        + np.array([sockets[-1].width_mm, sockets[0].width_mm]) / 2
+        + BEHIND_MM / 2
+    )
     lengths = np.linspace(4.0, float(ends.mean()), 48)
     half_width, y = arch.points_mm(lengths).T
     rim = float(np.mean([socket.cervix_z_mm for socket in sockets])) - ROOT_STUB_MM
     across = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 57))
     # The vault rises behind the incisors and stays; its sides are steep, its middle is flat.
     rise = VAULT_MM * np.clip((y[0] - y) / 20.0, 0.0, 1.0) ** 0.7
-    vault = np.stack(np.broadcast_arrays(half_width[:, None] * across, y[:, None], rim - rise[:, None] * (1 - across**4)), axis=-1)
+    vault = np.stack(
+        np.broadcast_arrays(half_width[:, None] * across, y[:, None], rim - rise[:, None] * (1 - across**4)), axis=-1
+    )
     down = np.linspace(0.0, 1.0, 25)[1:, None]
-    back = np.stack(np.broadcast_arrays(vault[-1, :, 0], vault[-1, :, 1], vault[-1, :, 2] * (1 - down) + WALL_BELOW_MM * down), axis=-1)
+    back = np.stack(
+        np.broadcast_arrays(vault[-1, :, 0], vault[-1, :, 1], vault[-1, :, 2] * (1 - down) + WALL_BELOW_MM * down),
+        axis=-1,
+    )
     return _sheet(np.concatenate([vault, back]))
 
 
-def _outline(sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _outline(
+    sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours, monotone in between, then rounded off.
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d
 
     ends = [(s, sign * (s.width_mm / 2 + BEHIND_MM)) for s, sign in ((sockets[0], -1.0), (sockets[-1], 1.0))]
-    nodes = [(s.arc_mm + step, s.cervix_z_mm + MARGIN_MM, s.cervix_z_mm, s.half_depth_mm + COVER_MM) for s, step in ends]
+    nodes = [
+        (s.arc_mm + step, s.cervix_z_mm + MARGIN_MM, s.cervix_z_mm, s.half_depth_mm + COVER_MM) for s, step in ends
+    ]
     for socket in sockets:
         crest, depth = socket.cervix_z_mm + MARGIN_MM, socket.half_depth_mm + COVER_MM
         nodes.append((socket.arc_mm, crest, socket.cervix_z_mm, depth))
         nodes += [
-            (socket.arc_mm + side * 0.3 * socket.width_mm, crest + 0.3 * (socket.curvature_mm + PAPILLA_MM), socket.cervix_z_mm, depth) for side in (-1, 1)
+            (
+                socket.arc_mm + side * 0.3 * socket.width_mm,
+                crest + 0.3 * (socket.curvature_mm + PAPILLA_MM),
+                socket.cervix_z_mm,
+                depth,
+            )
+            for side in (-1, 1)
         ]
     for one, other in pairwise(sockets):
         cervix = (one.cervix_z_mm + other.cervix_z_mm) / 2
@@ -122,4 +151,6 @@ def _sheet(points_mm: NDArray[np.float64]) -> Mesh:
     rows, columns, _ = points_mm.shape
     a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     b, c, d = a + 1, a + columns, a + columns + 1
-    return Mesh(points_mm.reshape(-1, 3), np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).astype(np.int32))
+    return Mesh(
+        points_mm.reshape(-1, 3), np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).astype(np.int32)
+    )

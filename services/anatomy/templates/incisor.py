@@ -60,7 +60,12 @@ def build_incisor(columns: int = 40) -> Incisor:
     crown = _stack(_outer_profile, (-ROOT_STUB_MM, CROWN_MM), (ROOT_ROUNDING_MM, EDGE_ROUNDING_MM), columns)
     heights = np.linspace(0.0, CROWN_MM, 1000)
     room = (_dentin_profile(heights)[1] >= DENTIN_EDGE_MM) & (heights + enamel_thickness_mm(heights) <= CROWN_MM)
-    core = _stack(_dentin_profile, (-ROOT_STUB_MM + ROOT_ENAMEL_MM, float(heights[room].max())), (ROOT_ROUNDING_MM, DENTIN_EDGE_MM / 2), columns)
+    core = _stack(
+        _dentin_profile,
+        (-ROOT_STUB_MM + ROOT_ENAMEL_MM, float(heights[room].max())),
+        (ROOT_ROUNDING_MM, DENTIN_EDGE_MM / 2),
+        columns,
+    )
     shift = -(crown.vertices_mm.min(axis=0) + crown.vertices_mm.max(axis=0)) / 2
     return Incisor(_moved(crown, shift), _moved(core, shift), _moved(_gum_collar(columns), shift))
 
@@ -74,7 +79,9 @@ def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
     # Half axes and the labial offset of the centre line, monotone between the measured heights so that no waist appears.
     from scipy.interpolate import PchipInterpolator
 
-    labial, diameter, width = (PchipInterpolator(HEIGHT_MM, values)(height_mm) for values in (LABIAL_MM, LABIOLINGUAL_MM, MESIODISTAL_MM))
+    labial, diameter, width = (
+        PchipInterpolator(HEIGHT_MM, values)(height_mm) for values in (LABIAL_MM, LABIOLINGUAL_MM, MESIODISTAL_MM)
+    )
     return width / 2, diameter / 2, labial - diameter / 2
 
 
@@ -92,7 +99,12 @@ def _dentin_profile(height_mm: NDArray[np.float64]) -> Profile:
     return inset(width, width_above), (labial + lingual) / 2, (labial - lingual) / 2
 
 
-def _stack(profile: Callable[[NDArray[np.float64]], Profile], ends_mm: tuple[float, float], rounding_mm: tuple[float, float], columns: int) -> Mesh:
+def _stack(
+    profile: Callable[[NDArray[np.float64]], Profile],
+    ends_mm: tuple[float, float],
+    rounding_mm: tuple[float, float],
+    columns: int,
+) -> Mesh:
     # Rows: a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
     wall_rows, rim_rows = max(8, columns), max(4, columns // 8)
     rows = []

@@ -100,7 +100,9 @@ def build_jaw(seed: int | None = None) -> Jaw:
     # The left is built as a right one, in the mirror, where it meets the right central incisor.
     left = right if random is None else _quadrant(arch, _stances(random), _mirrored(right[0][0]))
 
-    sockets = tuple(socket for _, socket in reversed(right)) + tuple(replace(socket, arc_mm=-socket.arc_mm) for _, socket in left)
+    sockets = tuple(socket for _, socket in reversed(right)) + tuple(
+        replace(socket, arc_mm=-socket.arc_mm) for _, socket in left
+    )
     teeth = tuple(tooth for tooth, _ in reversed(right)) + tuple(_mirrored(tooth) for tooth, _ in left)
     gums, cavity = build_gums(arch, sockets), build_cavity(arch, sockets)
     return Jaw(tuple(_grown(tooth, size) for tooth in teeth), _scaled(gums, size), _scaled(cavity, size))
@@ -110,7 +112,14 @@ def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
     if random is None:
         return tuple(Stance() for _ in PLACES)
     tilt, turn = TILT_SPREAD_DEG, TURN_SPREAD_DEG
-    draws = random.uniform(-1, 1, (len(PLACES), 6)) * [ENAMEL_SPREAD, tilt, tilt, turn, SHIFT_SPREAD_MM, SHIFT_SPREAD_MM]
+    draws = random.uniform(-1, 1, (len(PLACES), 6)) * [
+        ENAMEL_SPREAD,
+        tilt,
+        tilt,
+        turn,
+        SHIFT_SPREAD_MM,
+        SHIFT_SPREAD_MM,
+    ]
     return tuple(Stance(1 + enamel, (x, y, z), forward, longer) for enamel, x, y, z, forward, longer in draws.tolist())
 
 
@@ -129,12 +138,16 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
             if abs(spare_mm) < GAP_ERROR_MM:
                 break
             points = frame.world_from_canonical(facing)
-            spare_mm = float(-points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM)
+            spare_mm = float(
+                -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM
+            )
             # Turning with the arch may bring a corner nearer than the move itself: so a little less at a time.
             arc_mm += 0.85 * spare_mm
             frame = _standing(arch, arc_mm, solid, d, stance)
         else:
-            raise MeshError(f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller variation.")
+            raise MeshError(
+                f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller variation."
+            )
         tooth = _stood(solid, frame, RIGHT + place)
         neighbour = SurfaceDistance(_far_half(tooth))
         cervix_z_mm = float(frame.world_from_canonical(np.array([[0.0, 0.0, solid.cervix_mm]]))[0, 2])
@@ -159,7 +172,9 @@ def _standing(arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, 
 
 
 def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
-    outer, dentin = (Mesh(frame.world_from_canonical(mesh.vertices_mm), mesh.faces) for mesh in (solid.outer, solid.dentin))
+    outer, dentin = (
+        Mesh(frame.world_from_canonical(mesh.vertices_mm), mesh.faces) for mesh in (solid.outer, solid.dentin)
+    )
     return JawTooth(fdi, outer, dentin, frame, solid.cervix_mm)
 
 
@@ -172,7 +187,9 @@ def _far_half(tooth: JawTooth) -> Mesh:
 
 def _mirrored(tooth: JawTooth) -> JawTooth:
     # The patient's other side; the frame's x axis turns from mesial to distal, so that it stays right-handed.
-    outer, dentin = (Mesh(mesh.vertices_mm @ MIRROR, mesh.faces[:, ::-1].copy()) for mesh in (tooth.outer, tooth.dentin))
+    outer, dentin = (
+        Mesh(mesh.vertices_mm @ MIRROR, mesh.faces[:, ::-1].copy()) for mesh in (tooth.outer, tooth.dentin)
+    )
     frame = ToothFrame(MIRROR @ tooth.frame.rotation @ MIRROR, MIRROR @ tooth.frame.translation_mm)
     return JawTooth(tooth.fdi - RIGHT + LEFT, outer, dentin, frame, tooth.cervix_mm)
 

@@ -8,13 +8,17 @@ from numpy.typing import NDArray
 from services.core.geometry import Mesh
 
 
-def superellipse(half_x_mm: float, half_y_mm: float, columns: int, exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def superellipse(
+    half_x_mm: float, half_y_mm: float, columns: int, exponent: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices x, y (columns,) of |x / half_x|^n + |y / half_y|^n = 1, counter-clockwise from +x.
 
     They lie at equal steps of arc length plus turning: neighbouring rows stay aligned and tight bends stay round.
     """
     angle = np.linspace(0, 2 * np.pi, 64 * columns + 1)
-    radius = (np.abs(np.cos(angle) / half_x_mm) ** exponent + np.abs(np.sin(angle) / half_y_mm) ** exponent) ** (-1 / exponent)
+    radius = (np.abs(np.cos(angle) / half_x_mm) ** exponent + np.abs(np.sin(angle) / half_y_mm) ** exponent) ** (
+        -1 / exponent
+    )
     x, y = radius * np.cos(angle), radius * np.sin(angle)
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
@@ -67,7 +71,9 @@ def _wall(rows: int, columns: int) -> NDArray[np.int64]:
     return _split_quads(a, b, a + columns, b + columns)
 
 
-def _split_quads(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64], d: NDArray[np.int64]) -> NDArray[np.int64]:
+def _split_quads(
+    a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64], d: NDArray[np.int64]
+) -> NDArray[np.int64]:
     # Quads with corners a b below c d, split alternately.
     row, column = np.indices(a.shape)
     even = ((row + column) % 2 == 0)[..., None]

@@ -36,7 +36,9 @@ class Access:
         if (authorization := request.headers.get("authorization")) is not None:
             scheme, _, presented = authorization.partition(" ")
             if scheme.lower() != "bearer":
-                raise UnauthenticatedError("This server knows no such kind of authorization; send 'Authorization: Bearer' and a token.")
+                raise UnauthenticatedError(
+                    "This server knows no such kind of authorization; send 'Authorization: Bearer' and a token."
+                )
             presented = presented.strip()
             if (token := self.tokens.trusted(presented=presented)) is None:
                 token = await self.lookers.ask(self.tokens.authenticate, presented)
@@ -46,7 +48,9 @@ class Access:
             if (token := self.tokens.trusted(session_of=session.sha256)) is None:
                 token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
             return Caller.of(token, by_session=True)
-        raise UnauthenticatedError("This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard.")
+        raise UnauthenticatedError(
+            "This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard."
+        )
 
     @staticmethod
     def credential(request: HTTPConnection) -> str | None:

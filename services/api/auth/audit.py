@@ -63,7 +63,13 @@ class AuditedAction:
         """Append the row inside the caller's transaction, unless that was done."""
         if not self.is_written:
             ids = {name: redacted(value)[:ID_LENGTH] for name, value in self.ids.items()}
-            row = {"time_s": time.time(), "who": self.who, "token": self.token, "address": self.address, "action": self.action}
+            row = {
+                "time_s": time.time(),
+                "who": self.who,
+                "token": self.token,
+                "address": self.address,
+                "action": self.action,
+            }
             connection.execute(_INSERT, row | {"ids": json.dumps(ids), "outcome": outcome})
             self.is_written = True
 

@@ -38,7 +38,16 @@ RECHECK_S = 5.0
 class AuthenticationMiddleware:
     """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
 
-    def __init__(self, app: ASGIApp, owner: Starlette, access: Access, rates: Rates, audit: AuditLog, auditors: ThreadPool, dark_auditors: ThreadPool) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        owner: Starlette,
+        access: Access,
+        rates: Rates,
+        audit: AuditLog,
+        auditors: ThreadPool,
+        dark_auditors: ThreadPool,
+    ) -> None:
         self._app, self._owner, self._access, self._rates = app, owner, access, rates
         self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
         self._ownership = Ownership(access.tokens.engine)
@@ -53,9 +62,13 @@ class AuthenticationMiddleware:
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        audited = AuditedAction(f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids)
+        audited = AuditedAction(
+            f"{method_of(scope)} {found.route.template if found.route else 'no route'}", _address(scope), ids=found.ids
+        )
         try:
-            refusal = await (self._stranger_refusal(request, audited) if _is_setup(found) else self._refusal(request, found, audited))
+            refusal = await (
+                self._stranger_refusal(request, audited) if _is_setup(found) else self._refusal(request, found, audited)
+            )
         except SQLAlchemyError:
             refusal = database_lost(scope["path"])
         if refusal is not None:
@@ -76,7 +89,9 @@ class AuthenticationMiddleware:
             return await self._refuse_unknown(request, problem, audited)
         audited.who, audited.token = caller.name, caller.token.id if caller.token else None
         if wait_s := self._rates.count(audited.token or network_of(audited.address), is_change=is_change):
-            return _too_many(f"Token {caller.name} asked" if caller.token else f"Address {audited.address} asked", wait_s, path)
+            return _too_many(
+                f"Token {caller.name} asked" if caller.token else f"Address {audited.address} asked", wait_s, path
+            )
         if found.route is None:
             return _nothing_there(found, path, request.scope["method"])
         try:
@@ -84,11 +99,15 @@ class AuthenticationMiddleware:
         except ScopeError as problem:
             await self._auditors.ask(self._audit.append, audited, HTTPStatus.FORBIDDEN)
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
-            return response_of(problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'})
+            return response_of(
+                problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'}
+            )
         request.scope["caller"], request.scope["audited"] = caller, audited
         return await self._hidden(request, found.route, found.ids, caller, audited)
 
-    async def _hidden(self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction) -> Response | None:
+    async def _hidden(
+        self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction
+    ) -> Response | None:
         """The answer to a request that names something of others: the same as if it were not there, and before anything else of it is looked at."""
         named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
         if named is None:
@@ -114,7 +133,9 @@ class AuthenticationMiddleware:
         if self._rates.is_worth_telling(network_of(audited.address)):
             await self._auditors.ask(self._audit.append, audited, HTTPStatus.TOO_MANY_REQUESTS)
 
-    async def _refuse_unknown(self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction) -> Response:
+    async def _refuse_unknown(
+        self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction
+    ) -> Response:
         """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
         credential = Access.credential(request)
         audited.token = public_id(credential) if credential else None
@@ -125,10 +146,16 @@ class AuthenticationMiddleware:
         challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
         return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
 
-    async def _pass(self, request: HTTPConnection, route: GuardedRoute | None, audited: AuditedAction, receive: Receive, send: Send) -> None:
+    async def _pass(
+        self, request: HTTPConnection, route: GuardedRoute | None, audited: AuditedAction, receive: Receive, send: Send
+    ) -> None:
         scope = request.scope
         is_audited = _is_audited(scope, route)
-        auditors = self._dark_auditors if route is not None and route.needs is not None and route.needs.darkens else self._auditors
+        auditors = (
+            self._dark_auditors
+            if route is not None and route.needs is not None and route.needs.darkens
+            else self._auditors
+        )
         known_at, is_over = time.monotonic(), False
 
         async def send_audited(message: Message) -> None:
@@ -141,10 +168,16 @@ class AuthenticationMiddleware:
                     await auditors.ask(self._audit.append, audited, message["status"])
                 except SQLAlchemyError:
                     is_over = True
-                    full = PlatformError("The audit log cannot be written, so nothing is handed out; check the database and its disk.")
+                    full = PlatformError(
+                        "The audit log cannot be written, so nothing is handed out; check the database and its disk."
+                    )
                     await response_of(full, scope["path"])(scope, receive, send)
                     return
-            if message["type"] == "http.response.body" and message.get("more_body") and time.monotonic() - known_at > RECHECK_S:
+            if (
+                message["type"] == "http.response.body"
+                and message.get("more_body")
+                and time.monotonic() - known_at > RECHECK_S
+            ):
                 known_at, is_over = time.monotonic(), not await self._is_still_known(request)
                 if is_over:
                     await send({"type": "http.response.body", "body": b""})
@@ -172,7 +205,9 @@ class AuthenticationMiddleware:
 
 
 def _is_audited(scope: Scope, route: GuardedRoute | None) -> bool:
-    return scope["method"] not in SAFE_METHODS or (route is not None and route.needs is not None and route.needs.audited)
+    return scope["method"] not in SAFE_METHODS or (
+        route is not None and route.needs is not None and route.needs.audited
+    )
 
 
 def _is_public(scope: Scope, found: Found) -> bool:
@@ -202,7 +237,17 @@ def _too_many(who: str, wait_s: int, path: str) -> Response:
 def _nothing_there(found: Found, path: str, method: str) -> Response:
     if found.allowed_methods:
         allowed = ", ".join(sorted(found.allowed_methods))
-        problem = Problem.of(HTTPStatus.METHOD_NOT_ALLOWED, "method-not-allowed", f"{path} does not take {method}; it takes {allowed}.", path)
+        problem = Problem.of(
+            HTTPStatus.METHOD_NOT_ALLOWED,
+            "method-not-allowed",
+            f"{path} does not take {method}; it takes {allowed}.",
+            path,
+        )
         return Response(problem.model_dump_json(), problem.status, {"Allow": allowed}, MEDIA_TYPE)
-    problem = Problem.of(HTTPStatus.NOT_FOUND, "not-found", f"There is nothing at {path}; GET /v1/openapi.json lists what there is.", path)
+    problem = Problem.of(
+        HTTPStatus.NOT_FOUND,
+        "not-found",
+        f"There is nothing at {path}; GET /v1/openapi.json lists what there is.",
+        path,
+    )
     return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)

@@ -16,9 +16,7 @@ from services.api.http.problems import MEDIA_TYPE, Problem
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-PAGE_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
+PAGE_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"  # noqa: E501
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _ALWAYS = (
     (b"content-security-policy", PAGE_POLICY.encode()),
@@ -26,7 +24,10 @@ _ALWAYS = (
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-opener-policy", b"same-origin"),
     (b"cross-origin-resource-policy", b"same-origin"),
-    (b"permissions-policy", b"camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()"),
+    (
+        b"permissions-policy",
+        b"camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()",
+    ),
 )
 _BY_TLS_ONLY = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
 _NOT_KEPT = (b"cache-control", b"no-store")
@@ -54,7 +55,11 @@ class BrowserProtection:
                 is_api = scope["path"].startswith("/v1/")
                 own = [one for one in message["headers"] if not (is_api and one[0] == b"cache-control")]
                 set_already = {name for name, _ in own}
-                message["headers"] = [*own, *(one for one in self._headers if one[0] not in set_already), *([_NOT_KEPT] if is_api else [])]
+                message["headers"] = [
+                    *own,
+                    *(one for one in self._headers if one[0] not in set_already),
+                    *([_NOT_KEPT] if is_api else []),
+                ]
             await send(message)
 
         asked, refusal = Headers(scope=scope), None
@@ -65,7 +70,9 @@ class BrowserProtection:
             detail = "Another site asked for this change; use the dashboard or the API itself."
             refusal = Problem.of(HTTPStatus.FORBIDDEN, "foreign-origin", detail, scope["path"])
         if refusal is not None:
-            await Response(refusal.model_dump_json(), refusal.status, media_type=MEDIA_TYPE)(scope, receive, send_shielded)
+            await Response(refusal.model_dump_json(), refusal.status, media_type=MEDIA_TYPE)(
+                scope, receive, send_shielded
+            )
             return
         await self._app(scope, receive, send_shielded)
 

@@ -9,7 +9,12 @@ import sqlalchemy as sql
 
 from services.pipeline.database import Query, metadata, writing
 
-ended_session_table = sql.Table("ended_session", metadata, sql.Column("sha256", sql.Text, primary_key=True), sql.Column("expires_s", sql.Float, nullable=False))
+ended_session_table = sql.Table(
+    "ended_session",
+    metadata,
+    sql.Column("sha256", sql.Text, primary_key=True),
+    sql.Column("expires_s", sql.Float, nullable=False),
+)
 _ONE = Query(sql.select(ended_session_table.c.sha256).where(ended_session_table.c.sha256 == sql.bindparam("of")))
 
 

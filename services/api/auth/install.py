@@ -18,7 +18,9 @@ from services.api.http.thread_pools import ThreadPool
 from services.core.settings import ServerSettings
 
 
-def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: ThreadPool, dark_auditors: ThreadPool) -> None:
+def install(
+    app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: ThreadPool, dark_auditors: ThreadPool
+) -> None:
     """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
 
     Args:
@@ -29,5 +31,11 @@ def install(app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors
     app.include_router(build_access_router(access, audit, SetupLinks(engine), secure=not settings.is_loopback))
     app.add_middleware(BodyLimit, limit_bytes=settings.body_limit_bytes)
     app.add_middleware(
-        AuthenticationMiddleware, owner=app, access=access, rates=Rates(settings.rates), audit=audit, auditors=auditors, dark_auditors=dark_auditors
+        AuthenticationMiddleware,
+        owner=app,
+        access=access,
+        rates=Rates(settings.rates),
+        audit=audit,
+        auditors=auditors,
+        dark_auditors=dark_auditors,
     )

@@ -27,7 +27,9 @@ class TokenRequest(Record):
     scopes: tuple[Scope, ...] = Field(fail_fast=True, description="what it may do", json_schema_extra={"minItems": 1})
     expires_days: Number | None = Field(default=None, gt=0, le=36_500, description="days until it ends; null: never")
     group: str | None = Field(
-        default=None, description="whose jobs and captures it sees and makes; null: its own alone", json_schema_extra={"pattern": f"^{NAME}$"}
+        default=None,
+        description="whose jobs and captures it sees and makes; null: its own alone",
+        json_schema_extra={"pattern": f"^{NAME}$"},
     )
 
 
@@ -59,7 +61,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
     def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:
         """Make a token. Its secret is in this answer and nowhere else."""
-        issued = access.tokens.create(wanted.name, wanted.scopes, wanted.expires_days, request.scope["audited"], wanted.group)
+        issued = access.tokens.create(
+            wanted.name, wanted.scopes, wanted.expires_days, request.scope["audited"], wanted.group
+        )
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
         return issued
 
@@ -75,7 +79,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
 
     def open_session(sessions: Sessions, token: Token, response: Response) -> None:
         value, lifetime_s = sessions.issue(token)
-        response.set_cookie(COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure)
+        response.set_cookie(
+            COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure
+        )
 
     @router.post("/setup", status_code=201, tags=["access"])
     def set_up(link: Sent[SetupRequest], request: Request, response: Response) -> IssuedToken:
@@ -98,7 +104,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         caller: Caller = request.scope["caller"]
         if access.sessions is not None:
             if caller.token is None or caller.by_session:
-                raise UnauthenticatedError("A session does not open another one; send the token itself as 'Authorization: Bearer …'.")
+                raise UnauthenticatedError(
+                    "A session does not open another one; send the token itself as 'Authorization: Bearer …'."
+                )
             open_session(access.sessions, caller.token, response)
         return _session(caller, access)
 
@@ -113,7 +121,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
 
     @router.get("/audit", tags=["access"], dependencies=[needs("admin")])
     def page(
-        limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=1, le=MAX_ID)] = None, who: str | None = None
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+        before: Annotated[int | None, Query(ge=1, le=MAX_ID)] = None,
+        who: str | None = None,
     ) -> AuditPage:
         """Who did what, newest first."""
         found = audit.page(limit + 1, before, who)

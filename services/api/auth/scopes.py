@@ -91,7 +91,9 @@ class GuardedRoute:
             ScopeError: the caller lacks the scope, or the route declares none or several.
         """
         if self.needs is None:
-            raise ScopeError(f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route.")
+            raise ScopeError(
+                f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route."
+            )
         require(caller, self.needs.scope)
 
 
@@ -110,8 +112,17 @@ def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
     for context in iter_route_contexts(routes):
         if isinstance(context.original_route, Mount) and context.name == PAGE:
             continue
-        declared = tuple(one.dependency for one in getattr(context, "dependencies", ()) if isinstance(one.dependency, Needs))
-        found.append(GuardedRoute(context.path_format or "", frozenset(getattr(context, "methods", None) or ()), context.path_regex, declared))
+        declared = tuple(
+            one.dependency for one in getattr(context, "dependencies", ()) if isinstance(one.dependency, Needs)
+        )
+        found.append(
+            GuardedRoute(
+                context.path_format or "",
+                frozenset(getattr(context, "methods", None) or ()),
+                context.path_regex,
+                declared,
+            )
+        )
     return found
 
 

@@ -26,7 +26,12 @@ LIFETIME_S = 3600.0
 NAME = "administrator"
 """Of the token that a link makes."""
 
-setup_link_table = sql.Table("setup_link", metadata, sql.Column("sha256", sql.Text, primary_key=True), sql.Column("expires_s", sql.Float, nullable=False))
+setup_link_table = sql.Table(
+    "setup_link",
+    metadata,
+    sql.Column("sha256", sql.Text, primary_key=True),
+    sql.Column("expires_s", sql.Float, nullable=False),
+)
 
 
 class SetupLinks:
@@ -46,7 +51,9 @@ class SetupLinks:
             if _has_token(connection):
                 return None
             connection.execute(setup_link_table.delete().where(setup_link_table.c.expires_s <= self._clock()))
-            connection.execute(setup_link_table.insert().values(sha256=_hash(secret), expires_s=self._clock() + LIFETIME_S))
+            connection.execute(
+                setup_link_table.insert().values(sha256=_hash(secret), expires_s=self._clock() + LIFETIME_S)
+            )
         return SecretStr(secret)
 
     def redeem(self, secret: str, audited: AuditedAction) -> IssuedToken:
@@ -57,11 +64,17 @@ class SetupLinks:
         """
         presented = _hash(secret)
         with writing(self._engine) as connection:
-            held = connection.scalars(sql.select(setup_link_table.c.sha256).where(setup_link_table.c.expires_s > self._clock())).all()
-            is_known = sum(hmac.compare_digest(presented, one) for one in held) > 0  # all of them, so that the time tells nothing
+            held = connection.scalars(
+                sql.select(setup_link_table.c.sha256).where(setup_link_table.c.expires_s > self._clock())
+            ).all()
+            is_known = (
+                sum(hmac.compare_digest(presented, one) for one in held) > 0
+            )  # all of them, so that the time tells nothing
             if not is_known or _has_token(connection):
                 what = "This setup link was used, has expired or is unknown"
-                raise SetupLinkError(f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for one.")
+                raise SetupLinkError(
+                    f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for one."
+                )
             connection.execute(setup_link_table.delete())
             return insert_token(connection, NAME, (Scope.ADMIN,), self._clock(), None, audited)
 

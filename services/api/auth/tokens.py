@@ -72,7 +72,9 @@ class Scope(StrEnum):
     @property
     def included(self) -> frozenset[Scope]:
         """This scope and those that come with it."""
-        return {Scope.ADMIN: frozenset(Scope), Scope.SUBMIT: frozenset({Scope.SUBMIT, Scope.READ})}.get(self, frozenset({self}))
+        return {Scope.ADMIN: frozenset(Scope), Scope.SUBMIT: frozenset({Scope.SUBMIT, Scope.READ})}.get(
+            self, frozenset({self})
+        )
 
 
 class Token(Record):
@@ -85,13 +87,17 @@ class Token(Record):
     expires_s: float | None = Field(description="Unix time; null: never")
     revoked_s: float | None = Field(description="Unix time; null: not revoked")
     last_used_s: float | None = Field(description="Unix time, noted at most once an hour; null: never")
-    group: str | None = Field(default=None, description="owns what its tokens make, and they see it; null: the token stands alone")
+    group: str | None = Field(
+        default=None, description="owns what its tokens make, and they see it; null: the token stands alone"
+    )
 
 
 class IssuedToken(Token):
     """A token on the one occasion when its secret is shown."""
 
-    token: Annotated[SecretStr, WithJsonSchema({"type": "string"})] = Field(description="send it as 'Authorization: Bearer …'; it is not shown again")
+    token: Annotated[SecretStr, WithJsonSchema({"type": "string"})] = Field(
+        description="send it as 'Authorization: Bearer …'; it is not shown again"
+    )
 
     @field_serializer("token", when_used="json")
     def _reveal(self, token: SecretStr) -> str:
@@ -112,7 +118,11 @@ class Caller:
         """What it may see."""
         if self.token is None:
             return LOCAL_VIEWER
-        return Viewer(self.token.group or owner_of_token(self.token.id), sees_all=Scope.ADMIN in self.scopes, uses_paths=Scope.SUBMIT in self.scopes)
+        return Viewer(
+            self.token.group or owner_of_token(self.token.id),
+            sees_all=Scope.ADMIN in self.scopes,
+            uses_paths=Scope.SUBMIT in self.scopes,
+        )
 
     @classmethod
     def of(cls, token: Token, *, by_session: bool = False) -> Caller:
@@ -151,13 +161,22 @@ class Tokens:
         ticks: seconds that no step of the clock changes; trust ends by them.
     """
 
-    def __init__(self, engine: sql.Engine, clock: Callable[[], float] = time.time, ticks: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, engine: sql.Engine, clock: Callable[[], float] = time.time, ticks: Callable[[], float] = time.monotonic
+    ) -> None:
         self.engine, self._clock, self._ticks = engine, clock, ticks
         self.ended_sessions = EndedSessions(engine, clock)
         self._trusted: dict[_Credential, _Trust] = {}
         self._revocations = 0
 
-    def create(self, name: str, scopes: Iterable[Scope], expires_days: float | None, audited: AuditedAction, group: str | None = None) -> IssuedToken:
+    def create(
+        self,
+        name: str,
+        scopes: Iterable[Scope],
+        expires_days: float | None,
+        audited: AuditedAction,
+        group: str | None = None,
+    ) -> IssuedToken:
         """Make a token; the result is the only place where its secret is.
 
         Args:
@@ -170,7 +189,9 @@ class Tokens:
             what = f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like an id"
             raise InputError(f"Token name {name!r} does not serve; {what}.")
         if group is not None and not re.fullmatch(NAME, group):
-            raise InputError(f"Group {group!r} of token {name} does not serve; use up to 64 letters, digits, points and hyphens.")
+            raise InputError(
+                f"Group {group!r} of token {name} does not serve; use up to 64 letters, digits, points and hyphens."
+            )
         if not (wanted := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
         now = self._clock()
@@ -184,7 +205,12 @@ class Tokens:
     def list(self) -> list[Token]:
         """Every token, newest first, revoked and expired ones too."""
         with self.engine.connect() as connection:
-            return [Token(**_fields(row)) for row in connection.execute(sql.select(token_table).order_by(token_table.c.created_s.desc())).mappings()]
+            return [
+                Token(**_fields(row))
+                for row in connection.execute(
+                    sql.select(token_table).order_by(token_table.c.created_s.desc())
+                ).mappings()
+            ]
 
     def revoke(self, token_id: str, audited: AuditedAction) -> Token:
         """End a token now, by its id, else by the name of one that is not revoked; ending it again changes nothing.
@@ -194,9 +220,18 @@ class Tokens:
         """
         now = self._clock()
         with writing(self.engine) as connection:
-            is_meant = sql.or_(token_table.c.id == token_id, sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)))
+            is_meant = sql.or_(
+                token_table.c.id == token_id,
+                sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)),
+            )
             id_first = sql.case((token_table.c.id == token_id, 0), else_=1)
-            found = connection.execute(sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())).mappings().first()
+            found = (
+                connection.execute(
+                    sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())
+                )
+                .mappings()
+                .first()
+            )
             if found is None:
                 raise UnknownTokenError(f"There is no token {token_id}; list the tokens to see their ids.")
             row = dict(found)
@@ -211,7 +246,11 @@ class Tokens:
     def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
         """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks nobody."""
         found = self._trusted.get(_Credential.of(presented, session_of))
-        return found.token if found is not None and self._ticks() < found.until_ticks and found.revocations == self._revocations else None
+        return (
+            found.token
+            if found is not None and self._ticks() < found.until_ticks and found.revocations == self._revocations
+            else None
+        )
 
     def authenticate(self, presented: str) -> Token:
         """The token that was presented.
@@ -244,7 +283,9 @@ class Tokens:
         if session is not None and self.ended_sessions.has(session):
             raise UnauthenticatedError("This session was ended; sign in again with a token.")
         if row is None or not _is_living(row, self._clock()):
-            raise UnauthenticatedError("The token of this session has expired or was revoked; sign in with another one.")
+            raise UnauthenticatedError(
+                "The token of this session has expired or was revoked; sign in with another one."
+            )
         return self._trust(_Credential.of(session_of=session or token_id), row, revocations)
 
     def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
@@ -262,17 +303,32 @@ class Tokens:
     def _note_use(self, row: Any) -> None:
         now = self._clock()
         if row["last_used_s"] is None or now - row["last_used_s"] >= LAST_USE_STEP_S:
-            with suppress(sql.exc.OperationalError), writing(self.engine) as connection:  # a full disk must not refuse a reader
+            with (
+                suppress(sql.exc.OperationalError),
+                writing(self.engine) as connection,
+            ):  # a full disk must not refuse a reader
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
 
 
 def insert_token(
-    connection: sql.Connection, name: str, scopes: Iterable[Scope], now_s: float, expires_s: float | None, audited: AuditedAction, group: str | None = None
+    connection: sql.Connection,
+    name: str,
+    scopes: Iterable[Scope],
+    now_s: float,
+    expires_s: float | None,
+    audited: AuditedAction,
+    group: str | None = None,
 ) -> IssuedToken:
     """Add a token, and the audit's row of it, inside the caller's transaction."""
     token_id = secrets.token_hex(6)
     secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
-    row = {"id": token_id, "name": name, "scopes": " ".join(scopes), "sha256": _hash(secret.get_secret_value()), "created_s": now_s}
+    row = {
+        "id": token_id,
+        "name": name,
+        "scopes": " ".join(scopes),
+        "sha256": _hash(secret.get_secret_value()),
+        "created_s": now_s,
+    }
     row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None, "group": group}
     connection.execute(token_table.insert().values(row))
     audited.ids["token_id"] = token_id
@@ -295,4 +351,6 @@ def _is_living(row: Any, now: float) -> bool:
 
 
 def _fields(row: Any) -> dict[str, Any]:
-    return {name: row[name] for name in Token.model_fields} | {"scopes": tuple(Scope(name) for name in row["scopes"].split())}
+    return {name: row[name] for name in Token.model_fields} | {
+        "scopes": tuple(Scope(name) for name in row["scopes"].split())
+    }

@@ -72,7 +72,9 @@ class Calibrations:
         """
         require_consistent(calibration, f"Calibration {name}")
         content = (calibration.model_dump_json(indent=1) + "\n").encode()
-        entry = NamedCalibration(name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s(), owner=viewer.owner)
+        entry = NamedCalibration(
+            name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s(), owner=viewer.owner
+        )
         names = self._names(viewer.owner)
         names.mkdir(parents=True, exist_ok=True)
         if not self._content(entry.id).exists():
@@ -80,7 +82,9 @@ class Calibrations:
         is_new = self._take_name(entry)
         known = entry if is_new else read_record(names / f"{name}.json", NamedCalibration)
         if known.id != entry.id:
-            raise CalibrationTakenError(f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date.")
+            raise CalibrationTakenError(
+                f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date."
+            )
         return CalibrationCreation(_detail(known, calibration), is_new)
 
     def list(self, viewer: Viewer = LOCAL_VIEWER) -> list[NamedCalibration]:
@@ -108,7 +112,9 @@ class Calibrations:
         """
         is_id = _ID.fullmatch(path.name) is not None and self._content(path.name).is_file()
         if not is_id or not (viewer.sees_all or any(entry.id == path.name for entry in self.list(viewer))):
-            raise SettingsError(f"Option 'calibration': there is no {path}; give the 'option' of GET /v1/calibrations/NAME.")
+            raise SettingsError(
+                f"Option 'calibration': there is no {path}; give the 'option' of GET /v1/calibrations/NAME."
+            )
 
     def locate(self, spec: JobSpec) -> JobSpec:
         """The job with a stored calibration's file instead of its id."""
@@ -121,7 +127,10 @@ class Calibrations:
 
     def _seen(self, viewer: Viewer) -> tuple[Path, ...]:
         # Folders of names, one's own first.
-        own, others = self._names(viewer.owner), [self._names(DEFAULT_GROUP), *sorted((self._folder / "owners").glob("*"))]
+        own, others = (
+            self._names(viewer.owner),
+            [self._names(DEFAULT_GROUP), *sorted((self._folder / "owners").glob("*"))],
+        )
         return (own, *(other for other in others if other != own)) if viewer.sees_all else (own,)
 
     def _content(self, calibration_id: str) -> Path:

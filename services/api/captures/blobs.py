@@ -40,7 +40,9 @@ class PartialFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         os.close(self._descriptor)
 
     def write(self, block: bytes) -> None:
@@ -138,5 +140,7 @@ def sync_folders(*folders: Path) -> None:
 
 def _disk_full(problem: OSError) -> Exception:
     if problem.errno in _FULL:
-        return DiskFullError("The server's disk is full; free some space there and send again, what was acknowledged is kept.")
+        return DiskFullError(
+            "The server's disk is full; free some space there and send again, what was acknowledged is kept."
+        )
     return problem

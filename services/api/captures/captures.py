@@ -24,8 +24,21 @@ from services.api.captures.file_locks import FileLocks
 from services.api.captures.table import CaptureTable, FileRow, unknown_capture
 from services.api.captures.uploads import Uploads, upload_path
 from services.client.capture_paths import TEXTS, require_paths
-from services.client.capture_records import CaptureDetail, CaptureFile, CapturePage, CaptureState, FileFault, UploadManifest
-from services.client.errors import CaptureStateError, CorruptUploadError, LockedError, TooLargeError, UnknownCaptureError
+from services.client.capture_records import (
+    CaptureDetail,
+    CaptureFile,
+    CapturePage,
+    CaptureState,
+    FileFault,
+    UploadManifest,
+)
+from services.client.errors import (
+    CaptureStateError,
+    CorruptUploadError,
+    LockedError,
+    TooLargeError,
+    UnknownCaptureError,
+)
 from services.core.calibration import Calibration
 from services.core.errors import DiskFullError, SettingsError
 from services.core.owners import LOCAL_VIEWER, Viewer
@@ -69,7 +82,9 @@ class Captures:
         self._free_bytes = free_bytes or (lambda: shutil.disk_usage(data).free)
         self._guard = threading.RLock()
 
-    def create(self, manifest: UploadManifest, key: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> CaptureCreation:
+    def create(
+        self, manifest: UploadManifest, key: str | None = None, viewer: Viewer = LOCAL_VIEWER
+    ) -> CaptureCreation:
         """Open a capture, or find the one that this manifest or idempotency key has led its owner to already.
 
         Raises:
@@ -81,7 +96,9 @@ class Captures:
         sizes: dict[str, int] = {}
         for file in manifest.files:
             if sizes.setdefault(file.sha256, file.bytes) != file.bytes:
-                raise CorruptUploadError(f"File {file.path} has the SHA-256 of another file of another size; hash the files again.")
+                raise CorruptUploadError(
+                    f"File {file.path} has the SHA-256 of another file of another size; hash the files again."
+                )
         digest, key = manifest.digest(viewer.owner), viewer.key(key)
         with self._guard:
             self.sweep()
@@ -89,9 +106,13 @@ class Captures:
                 return CaptureCreation(self.get(earlier.id), is_new=False)
             own = self._table.known((file.sha256 for file in manifest.files), viewer.owner)
             known = [file.sha256 in own and self._blobs.holds(file.sha256, file.bytes) for file in manifest.files]
-            self._require_space(sum(file.bytes for file, is_known in zip(manifest.files, known, strict=True) if not is_known))
+            self._require_space(
+                sum(file.bytes for file, is_known in zip(manifest.files, known, strict=True) if not is_known)
+            )
             now_s = self._now_s()
-            capture = self._table.insert(manifest, digest, key, known, now_s, now_s + self._limits.open_for_s, viewer.owner)
+            capture = self._table.insert(
+                manifest, digest, key, known, now_s, now_s + self._limits.open_for_s, viewer.owner
+            )
             return CaptureCreation(self.get(capture.id), is_new=True)
 
     def get(self, capture: str) -> CaptureDetail:
@@ -108,7 +129,9 @@ class Captures:
             UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError: it says nothing.
         """
         if (state := self._table.get(capture).state) is not CaptureState.COMMITTED:
-            raise CaptureStateError(f"Capture {capture} is {state}; commit it first with POST /v1/captures/{capture}/commit.")
+            raise CaptureStateError(
+                f"Capture {capture} is {state}; commit it first with POST /v1/captures/{capture}/commit."
+            )
         return self._reader.describe(self._data / FOLDER / capture).calibration
 
     def page(self, limit: int, before: int | None = None, viewer: Viewer = LOCAL_VIEWER) -> CapturePage:
@@ -131,7 +154,11 @@ class Captures:
         names = frozenset(row.file.path for row in rows)
         files = [(self._blobs.path(row.file.sha256), row.file.path) for row in rows]
         details = dict(self._reader.content_faults(files, self._limits, names))
-        faults = [FileFault(path=row.file.path, kind="refused", detail=details[row.file.path]) for row in rows if row.file.path in details]
+        faults = [
+            FileFault(path=row.file.path, kind="refused", detail=details[row.file.path])
+            for row in rows
+            if row.file.path in details
+        ]
         if not faults:
             with self._guard:
                 self.uploads.require_open(capture, or_committed=True)
@@ -198,7 +225,12 @@ class Captures:
 
     def _shown(self, row: FileRow) -> CaptureFile:
         is_known, received = self.uploads.is_known(row), self.uploads.received_bytes(row)
-        return CaptureFile(**row.file.model_dump(), received_bytes=received, is_known=is_known, upload=upload_path(row.capture, row.number))
+        return CaptureFile(
+            **row.file.model_dump(),
+            received_bytes=received,
+            is_known=is_known,
+            upload=upload_path(row.capture, row.number),
+        )
 
     def _arrival_fault(self, row: FileRow) -> FileFault | None:
         file, received = row.file, self.uploads.received_bytes(row)
@@ -210,8 +242,16 @@ class Captures:
                 return FileFault(path=file.path, kind="corrupt", detail=problem.message)
             return None
         if row.is_corrupt and received == 0:
-            return FileFault(path=file.path, kind="corrupt", detail=f"File {file.path} was received with another SHA-256 than the manifest's; send it again.")
-        return FileFault(path=file.path, kind="missing", detail=f"File {file.path} is received up to byte {received} of {file.bytes}; send the rest.")
+            return FileFault(
+                path=file.path,
+                kind="corrupt",
+                detail=f"File {file.path} was received with another SHA-256 than the manifest's; send it again.",
+            )
+        return FileFault(
+            path=file.path,
+            kind="missing",
+            detail=f"File {file.path} is received up to byte {received} of {file.bytes}; send the rest.",
+        )
 
     def _publish(self, capture: str, rows: list[FileRow]) -> None:
         final = self._data / FOLDER / capture
@@ -229,7 +269,9 @@ class Captures:
             sync_folders(final.parent)
         except OSError as problem:
             shutil.rmtree(draft, ignore_errors=True)
-            raise DiskFullError(f"Capture {capture} cannot be published ({problem.strerror}); free some disk on the server and commit again.") from problem
+            raise DiskFullError(
+                f"Capture {capture} cannot be published ({problem.strerror}); free some disk on the server and commit again."
+            ) from problem
 
     def _retire(self, capture: str) -> None:
         """Make it expired, then remove its folder, and every content that no other capture has; repeatable at any point."""
@@ -248,17 +290,30 @@ class Captures:
     def _require_limits(self, manifest: UploadManifest) -> None:
         limits, files = self._limits, manifest.files
         if len(files) > limits.most_files:
-            raise TooLargeError(f"The capture has {len(files)} files and {limits.most_files} are allowed; leave some out.")
+            raise TooLargeError(
+                f"The capture has {len(files)} files and {limits.most_files} are allowed; leave some out."
+            )
         for file in files:
-            largest = limits.largest_text_bytes if PurePosixPath(file.path).suffix.lower() in TEXTS else limits.largest_file_bytes
+            largest = (
+                limits.largest_text_bytes
+                if PurePosixPath(file.path).suffix.lower() in TEXTS
+                else limits.largest_file_bytes
+            )
             if file.bytes > largest:
-                raise TooLargeError(f"File {file.path!r} has {file.bytes} bytes and {largest} are allowed; make it smaller.")
+                raise TooLargeError(
+                    f"File {file.path!r} has {file.bytes} bytes and {largest} are allowed; make it smaller."
+                )
         if (total := sum(file.bytes for file in files)) > limits.largest_capture_bytes:
-            raise TooLargeError(f"The capture has {total} bytes and {limits.largest_capture_bytes} are allowed; leave some files out.")
+            raise TooLargeError(
+                f"The capture has {total} bytes and {limits.largest_capture_bytes} are allowed; leave some files out."
+            )
 
     def _require_space(self, wanted_bytes: int) -> None:
         outstanding = self._table.outstanding_bytes()
-        if wanted_bytes > 0 and (free := self._free_bytes()) < wanted_bytes + outstanding + self._limits.keep_free_bytes:
+        if (
+            wanted_bytes > 0
+            and (free := self._free_bytes()) < wanted_bytes + outstanding + self._limits.keep_free_bytes
+        ):
             raise DiskFullError(
                 f"The capture needs {wanted_bytes} bytes of disk, and of {free} free ones {outstanding} are promised to open captures and"
                 f" {self._limits.keep_free_bytes} kept back; free some space on the server, or delete captures."

@@ -17,7 +17,17 @@ from services.core.slab_folder import SlabFolder
 
 MAX_TIMES_PACKED = 1100
 """Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""
-_ITEM_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "float16": 2, "int32": 4, "uint32": 4, "float32": 4}
+_ITEM_BYTES = {
+    "bool": 1,
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "float16": 2,
+    "int32": 4,
+    "uint32": 4,
+    "float32": 4,
+}
 _PIXEL_BYTES, _SLAB_PIXEL_BYTES = 4, 8
 
 
@@ -56,13 +66,17 @@ def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> st
     if image.decoded_bytes > limits.largest_image_bytes:
         return f"Image {name} declares {image.size}, more than {limits.largest_image_bytes} bytes when decoded; crop or bin it."
     if image.file_bytes is not None and image.file_bytes != size:
-        return f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
+        return (
+            f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
+        )
     if image.decoded_bytes > MAX_TIMES_PACKED * size:
         return f"Image {name} declares {image.size} in {size} bytes, which no photograph packs to; export it again."
     return metadata_fault(path, name, suffix)
 
 
-def _description_fault(name: str, description: FolderCapture, limits: UploadLimits, names: frozenset[str]) -> str | None:
+def _description_fault(
+    name: str, description: FolderCapture, limits: UploadLimits, names: frozenset[str]
+) -> str | None:
     for camera in description.cameras:
         if math.prod(camera.size) * len(description.channels) * _PIXEL_BYTES > limits.largest_image_bytes:
             size = " x ".join(map(str, camera.size))

@@ -31,7 +31,9 @@ class Described(Record):
 class CaptureReader(Protocol):
     """Reads what others have written: in this process, or in one of bounded memory and time."""
 
-    def content_faults(self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]) -> Iterator[tuple[str, str]]:
+    def content_faults(
+        self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
+    ) -> Iterator[tuple[str, str]]:
         """Names of files, which are given with where they lie, and what is wrong with their contents; see ``capture_contents``."""
 
     def describe(self, capture: Path) -> Described:
@@ -41,7 +43,9 @@ class CaptureReader(Protocol):
 class ReadHere:
     """Reads in this process."""
 
-    def content_faults(self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]) -> Iterator[tuple[str, str]]:
+    def content_faults(
+        self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
+    ) -> Iterator[tuple[str, str]]:
         """See ``CaptureReader``."""
         for path, name in files:
             if (fault := content_fault(path, name, limits, names)) is not None:
@@ -68,11 +72,18 @@ def describe(capture: Path) -> Described:
     """
     path = description_file(capture)
     if path is not None and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
-        raise CaptureInputError(f"{path} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed; leave out what describes no image.")
+        raise CaptureInputError(
+            f"{path} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed; leave out what describes no image."
+        )
     description = read_description(capture)
-    for what, count, most in (("cameras", len(description.cameras), MAX_CAMERAS), ("lights", len(description.lights), MAX_LIGHTS)):
+    for what, count, most in (
+        ("cameras", len(description.cameras), MAX_CAMERAS),
+        ("lights", len(description.lights), MAX_LIGHTS),
+    ):
         if count > most:
-            raise CaptureInputError(f"{path} lists {count} {what}, more than any rig has ({most}); remove those without images.")
+            raise CaptureInputError(
+                f"{path} lists {count} {what}, more than any rig has ({most}); remove those without images."
+            )
     pixels: Mapping[str, int] = {camera.name: camera.size[0] * camera.size[1] for camera in description.cameras}
     seen = [image.camera for image in description.images] or [name for name in pixels for _ in description.lights]
     calibration = Calibration(**{part: getattr(description, part) for part in Calibration.model_fields})

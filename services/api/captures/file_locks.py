@@ -25,7 +25,9 @@ class FileLocks:
         """
         with self._guard:
             if (capture, number) in self._taken:
-                raise LockedError(f"Another request is sending file number {number} of capture {capture}; wait for it to end.")
+                raise LockedError(
+                    f"Another request is sending file number {number} of capture {capture}; wait for it to end."
+                )
             self._taken.add((capture, number))
         try:
             yield

@@ -45,7 +45,12 @@ class ReadingProcess:
 
     def __init__(self) -> None:
         # Nothing of the server's environment goes along, such as a token or a database's password.
-        environment = {"PATH": os.defpath, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment = {
+            "PATH": os.defpath,
+            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+            "PYTHONUTF8": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
         command = [sys.executable, "-m", "services.api.captures.reading_process", str(MAX_BYTES)]
         self._process = subprocess.Popen(  # noqa: S603
             command,
@@ -87,10 +92,16 @@ class ReadApart:
     """A ``CaptureReader`` that reads in processes of bounded memory and time."""
 
     def __init__(self) -> None:
-        self._places, self._lock, self._idle = threading.BoundedSemaphore(PROCESSES), threading.Lock(), list[ReadingProcess]()
+        self._places, self._lock, self._idle = (
+            threading.BoundedSemaphore(PROCESSES),
+            threading.Lock(),
+            list[ReadingProcess](),
+        )
         self._is_closed = False
 
-    def content_faults(self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]) -> Iterator[tuple[str, str]]:
+    def content_faults(
+        self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
+    ) -> Iterator[tuple[str, str]]:
         """Names of files and what is wrong with their contents; ends with the first that cannot be told of within the bounds."""
         parsed, others = list[tuple[Path, str]](), list[tuple[Path, str]]()
         for path, name in files:
@@ -99,15 +110,22 @@ class ReadApart:
         for batch in batches:
             (path, name), is_parsed = batch[0], len(batch) == 1 and batch[0] in parsed
             if is_parsed and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
-                yield name, f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a JSON file; leave out what describes no image."
+                yield (
+                    name,
+                    f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a JSON file; leave out what describes no image.",
+                )
                 continue
             asked = [(str(path), name) for path, name in batch]
             try:
-                answer = self._ask({"files": asked, "limits": limits.model_dump(), "names": sorted(names) if is_parsed else []}, name)
+                answer = self._ask(
+                    {"files": asked, "limits": limits.model_dump(), "names": sorted(names) if is_parsed else []}, name
+                )
             except CostlyFileError as problem:
                 yield name, str(problem)
                 return
-            yield from ((name, fault) for (_, name), fault in zip(batch, answer["faults"], strict=True) if fault is not None)
+            yield from (
+                (name, fault) for (_, name), fault in zip(batch, answer["faults"], strict=True) if fault is not None
+            )
 
     def describe(self, capture: Path) -> Described:
         """What a capture says of itself; see ``descriptions``.
@@ -147,7 +165,9 @@ class ReadApart:
                 process.close()
         if answer is None or "is_costly" in answer:
             bounds = f"{MAX_BYTES // 2**20} MiB of memory and {MAX_S:g} s"
-            raise CostlyFileError(f"{name} cannot be read within {bounds}; make it smaller or simpler, or export it again.")
+            raise CostlyFileError(
+                f"{name} cannot be read within {bounds}; make it smaller or simpler, or export it again."
+            )
         if "code" in answer:
             raise error_of(answer["code"], answer["message"]) or DentineError(answer["message"])
         return answer
@@ -157,7 +177,9 @@ def _started() -> ReadingProcess:
     try:
         return ReadingProcess()
     except OSError as problem:
-        raise PlatformError(f"The server cannot start a process to read the capture in ({problem.strerror}); free some memory and try again.") from problem
+        raise PlatformError(
+            f"The server cannot start a process to read the capture in ({problem.strerror}); free some memory and try again."
+        ) from problem
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

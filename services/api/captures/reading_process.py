@@ -46,7 +46,10 @@ def _answer(asked: dict[str, Any]) -> dict[str, Any]:
     except MemoryError:
         return {"is_costly": True}
     except OSError as problem:
-        return {"code": DentineError.code, "message": f"{problem.filename or 'A file'} cannot be read ({problem.strerror}); check the server's disk."}
+        return {
+            "code": DentineError.code,
+            "message": f"{problem.filename or 'A file'} cannot be read ({problem.strerror}); check the server's disk.",
+        }
 
 
 def _bound(most_bytes: int) -> None:

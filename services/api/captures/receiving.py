@@ -42,7 +42,9 @@ class Received:
     expires_s: float
 
 
-async def receive(uploads: Uploads, capture: str, number: int, offset: int, stream: AsyncIterator[bytes], checksum: Checksum | None) -> Received:
+async def receive(
+    uploads: Uploads, capture: str, number: int, offset: int, stream: AsyncIterator[bytes], checksum: Checksum | None
+) -> Received:
     """Append a request's bytes to an upload and verify the file once it is whole.
 
     Raises:
@@ -53,7 +55,11 @@ async def receive(uploads: Uploads, capture: str, number: int, offset: int, stre
     try:
         with uploads.claims.claim(capture, number):
             upload = await in_thread(uploads.begin, capture, number, offset)
-            result = await _append(uploads, upload, body, checksum) if upload.missing_bytes else Received(offset, upload.expires_s)
+            result = (
+                await _append(uploads, upload, body, checksum)
+                if upload.missing_bytes
+                else Received(offset, upload.expires_s)
+            )
             if result.offset == upload.row.file.bytes:
                 await in_thread(uploads.finish, upload.row)
             return result
@@ -87,7 +93,9 @@ def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
         return opened.enter_context(uploads.open_partial(upload))
     except OSError as problem:
         if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
-            raise DiskFullError("The server's disk is full; free some space there and send again, what was acknowledged is kept.") from problem
+            raise DiskFullError(
+                "The server's disk is full; free some space there and send again, what was acknowledged is kept."
+            ) from problem
         raise
 
 
@@ -105,7 +113,9 @@ class _Tail:
         block, self.buffer = bytes(self.buffer), bytearray()
         file = self._upload.row.file
         if self._written + len(block) > file.bytes:
-            raise TooLargeError(f"More bytes were sent of file {file.path!r} than the {file.bytes} of the manifest; send only what is missing.")
+            raise TooLargeError(
+                f"More bytes were sent of file {file.path!r} than the {file.bytes} of the manifest; send only what is missing."
+            )
         self._partial.write(block)
         self._written += len(block)
         if self._hash is not None:
@@ -121,7 +131,11 @@ class _Tail:
 
     def require_checksum(self) -> None:
         """Refuse bytes that were altered on their way."""
-        if self._hash is not None and self._checksum is not None and not hmac.compare_digest(self._hash.digest(), self._checksum.digest):
+        if (
+            self._hash is not None
+            and self._checksum is not None
+            and not hmac.compare_digest(self._hash.digest(), self._checksum.digest)
+        ):
             raise ChecksumError(
                 f"The bytes sent of file {self._upload.row.file.path!r} do not have the {self._checksum.algorithm} that was sent with them; send them again."
             )

@@ -41,7 +41,9 @@ def build_captures_router(captures: Captures) -> APIRouter:
                 try:
                     await in_thread(captures.sweep)
                 except (SQLAlchemyError, OSError):
-                    logging.getLogger(__name__).exception("looking after captures failed; trying again in %g s", SWEEP_S)
+                    logging.getLogger(__name__).exception(
+                        "looking after captures failed; trying again in %g s", SWEEP_S
+                    )
                 await asyncio.sleep(SWEEP_S)
 
         task = asyncio.create_task(sweep())
@@ -53,10 +55,25 @@ def build_captures_router(captures: Captures) -> APIRouter:
                 await task
 
     router = APIRouter(lifespan=sweeping)
-    under = APIRouter(prefix="/v1/captures", route_class=BodyRoute, responses=refusals(404, 409, 410, 413, 422, 423, 507), tags=["captures"])
+    under = APIRouter(
+        prefix="/v1/captures",
+        route_class=BodyRoute,
+        responses=refusals(404, 409, 410, 413, 422, 423, 507),
+        tags=["captures"],
+    )
 
-    @under.post("", status_code=201, response_model=CaptureDetail, responses={200: {"model": CaptureDetail}}, dependencies=[needs("submit")])
-    def create(manifest: Sent[UploadManifest], asker: Asker, idempotency_key: Annotated[str | None, Header(max_length=200)] = None) -> Response:
+    @under.post(
+        "",
+        status_code=201,
+        response_model=CaptureDetail,
+        responses={200: {"model": CaptureDetail}},
+        dependencies=[needs("submit")],
+    )
+    def create(
+        manifest: Sent[UploadManifest],
+        asker: Asker,
+        idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
+    ) -> Response:
         """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
         creation = captures.create(manifest, idempotency_key, asker)
         headers = {"Location": f"/v1/captures/{creation.capture.id}"}
@@ -64,7 +81,11 @@ def build_captures_router(captures: Captures) -> APIRouter:
 
     @under.get("", dependencies=[needs("read")])
     @in_json
-    def page(asker: Asker, limit: Annotated[int, Query(ge=1, le=500)] = 50, before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None) -> CapturePage:
+    def page(
+        asker: Asker,
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+        before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None,
+    ) -> CapturePage:
         """List captures, newest first."""
         return captures.page(limit, before, asker)
 
@@ -83,8 +104,12 @@ def build_captures_router(captures: Captures) -> APIRouter:
     def commit(capture: str, request: Request) -> Response:
         """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused. Repeating it changes nothing."""
         if faults := captures.commit(capture):
-            detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (f" It is one of {len(faults)} such files." if len(faults) > 1 else "")
-            problem = IncompleteCapture.of(HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.scope["path"], files=faults)
+            detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (
+                f" It is one of {len(faults)} such files." if len(faults) > 1 else ""
+            )
+            problem = IncompleteCapture.of(
+                HTTPStatus.CONFLICT, IncompleteCaptureError.code, detail, request.scope["path"], files=faults
+            )
             return Response(problem.model_dump_json(), problem.status, media_type=MEDIA_TYPE)
         return Response(captures.get(capture).model_dump_json(), media_type=JSON)
 

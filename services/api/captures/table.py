@@ -81,7 +81,11 @@ class CaptureTable:
         Raises:
             CaptureStateError: the key belongs to another manifest.
         """
-        query = sql.select(capture_table).where(sql.or_(capture_table.c.manifest == manifest, capture_table.c.key == key if key is not None else sql.false()))
+        query = sql.select(capture_table).where(
+            sql.or_(
+                capture_table.c.manifest == manifest, capture_table.c.key == key if key is not None else sql.false()
+            )
+        )
         with self._engine.connect() as connection:
             rows = connection.execute(query).mappings().all()
         if any(row["key"] == key and row["manifest"] != manifest for row in rows if key is not None):
@@ -102,13 +106,30 @@ class CaptureTable:
         """Add an open capture; of each file it is told whether its owner has sent the content already."""
         identity = secrets.token_hex(8)
         files = [
-            {"capture": identity, "number": number, "received_bytes": file.bytes if is_known else 0, "is_known": is_known}
+            {
+                "capture": identity,
+                "number": number,
+                "received_bytes": file.bytes if is_known else 0,
+                "is_known": is_known,
+            }
             | {"is_created": False, "is_corrupt": False}
             | file.model_dump()
             for number, (file, is_known) in enumerate(zip(manifest.files, known, strict=True))
         ]
-        row: dict[str, Any] = {"id": identity, "key": key, "manifest": digest, "state": CaptureState.OPEN, "subject": manifest.subject}
-        row |= {"created_s": created_s, "expires_s": expires_s, "file_count": len(files), "bytes": sum(file.bytes for file in manifest.files), "owner": owner}
+        row: dict[str, Any] = {
+            "id": identity,
+            "key": key,
+            "manifest": digest,
+            "state": CaptureState.OPEN,
+            "subject": manifest.subject,
+        }
+        row |= {
+            "created_s": created_s,
+            "expires_s": expires_s,
+            "file_count": len(files),
+            "bytes": sum(file.bytes for file in manifest.files),
+            "owner": owner,
+        }
         with writing(self._engine) as connection:
             connection.execute(capture_table.insert().values(row))
             connection.execute(file_table.insert(), files)
@@ -123,7 +144,11 @@ class CaptureTable:
         row = None
         if capture.isascii() and capture.isalnum():
             with self._engine.connect() as connection:
-                row = connection.execute(sql.select(capture_table).where(capture_table.c.id == capture)).mappings().first()
+                row = (
+                    connection.execute(sql.select(capture_table).where(capture_table.c.id == capture))
+                    .mappings()
+                    .first()
+                )
         if row is None:
             raise unknown_capture(capture)
         return _capture(row)
@@ -154,7 +179,9 @@ class CaptureTable:
         with self._engine.connect() as connection:
             row = connection.execute(query).mappings().first()
         if row is None:
-            raise UnknownCaptureError(f"Capture {capture} has no file number {number}; ask for the capture to see its files.")
+            raise UnknownCaptureError(
+                f"Capture {capture} has no file number {number}; ask for the capture to see its files."
+            )
         return _file(row)
 
     def file_at(self, capture: str, path: str) -> FileRow:
@@ -173,9 +200,15 @@ class CaptureTable:
     def change_file(self, capture: str, number: int, expires_s: float | None = None, **columns: object) -> None:
         """Change a file's columns and, if it is given, the capture's expiry, in one transaction."""
         with writing(self._engine) as connection:
-            connection.execute(file_table.update().where(file_table.c.capture == capture, file_table.c.number == number).values(columns))
+            connection.execute(
+                file_table.update()
+                .where(file_table.c.capture == capture, file_table.c.number == number)
+                .values(columns)
+            )
             if expires_s is not None:
-                connection.execute(capture_table.update().where(capture_table.c.id == capture).values(expires_s=expires_s))
+                connection.execute(
+                    capture_table.update().where(capture_table.c.id == capture).values(expires_s=expires_s)
+                )
 
     def known(self, contents: Iterable[str], owner: str) -> set[str]:
         """Those contents that an owner has sent whole."""
@@ -184,7 +217,9 @@ class CaptureTable:
         with self._engine.connect() as connection:
             for start in range(0, len(wanted), _BATCH):
                 of_batch = file_table.c.sha256.in_(wanted[start : start + _BATCH])
-                query = sql.select(file_table.c.sha256).where(of_batch, file_table.c.is_known, file_table.c.capture.in_(own))
+                query = sql.select(file_table.c.sha256).where(
+                    of_batch, file_table.c.is_known, file_table.c.capture.in_(own)
+                )
                 found.update(connection.scalars(query.distinct()))
         return found
 
@@ -194,11 +229,15 @@ class CaptureTable:
         own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
         values = {"received_bytes": file_table.c.bytes, "is_corrupt": False, "is_known": True}
         with writing(self._engine) as connection:
-            connection.execute(file_table.update().where(file_table.c.sha256 == sha256, file_table.c.capture.in_(own)).values(values))
+            connection.execute(
+                file_table.update().where(file_table.c.sha256 == sha256, file_table.c.capture.in_(own)).values(values)
+            )
 
     def change_state(self, capture: str, state: CaptureState) -> None:
         """Set a capture's state; an expired one gives up its key and manifest."""
-        values: dict[str, object] = {"state": state} | ({"key": None, "manifest": None} if state is CaptureState.EXPIRED else {})
+        values: dict[str, object] = {"state": state} | (
+            {"key": None, "manifest": None} if state is CaptureState.EXPIRED else {}
+        )
         with writing(self._engine) as connection:
             connection.execute(capture_table.update().where(capture_table.c.id == capture).values(values))
 
@@ -215,14 +254,20 @@ class CaptureTable:
 
     def in_state(self, state: CaptureState, expiring_before_s: float) -> list[Capture]:
         """Captures of a state whose expiry lies before a time."""
-        query = sql.select(capture_table).where(capture_table.c.state == state, capture_table.c.expires_s < expiring_before_s)
+        query = sql.select(capture_table).where(
+            capture_table.c.state == state, capture_table.c.expires_s < expiring_before_s
+        )
         with self._engine.connect() as connection:
             return [_capture(row) for row in connection.execute(query).mappings()]
 
     def outstanding_bytes(self) -> int:
         """Bytes that open captures have still to receive."""
         missing = sql.func.sum(file_table.c.bytes - file_table.c.received_bytes)
-        query = sql.select(missing).join(capture_table, capture_table.c.id == file_table.c.capture).where(capture_table.c.state == CaptureState.OPEN)
+        query = (
+            sql.select(missing)
+            .join(capture_table, capture_table.c.id == file_table.c.capture)
+            .where(capture_table.c.state == CaptureState.OPEN)
+        )
         with self._engine.connect() as connection:
             return int(connection.scalar(query) or 0)
 
@@ -233,7 +278,11 @@ class CaptureTable:
         with self._engine.connect() as connection:
             for start in range(0, len(wanted), _BATCH):
                 of_batch = file_table.c.sha256.in_(wanted[start : start + _BATCH])
-                used.update(connection.scalars(sql.select(file_table.c.sha256).where(of_batch, file_table.c.capture != besides).distinct()))
+                used.update(
+                    connection.scalars(
+                        sql.select(file_table.c.sha256).where(of_batch, file_table.c.capture != besides).distinct()
+                    )
+                )
         return set(wanted) - used
 
     def job_with(self, path: str) -> str | None:
@@ -249,4 +298,12 @@ def _capture(row: Any) -> Capture:
 
 def _file(row: Any) -> FileRow:
     file = ManifestFile(**{name: row[name] for name in ManifestFile.model_fields})
-    return FileRow(row["capture"], row["number"], file, row["received_bytes"], row["is_created"], row["is_corrupt"], row["is_known"])
+    return FileRow(
+        row["capture"],
+        row["number"],
+        file,
+        row["received_bytes"],
+        row["is_created"],
+        row["is_corrupt"],
+        row["is_known"],
+    )

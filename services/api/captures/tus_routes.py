@@ -34,7 +34,9 @@ class TusRoute(APIRoute):
         await super().handle(scope, receive, send_named)
 
 
-def require_version(tus_resumable: Annotated[str | None, Header(json_schema_extra={"const": tus.VERSION})] = None) -> None:
+def require_version(
+    tus_resumable: Annotated[str | None, Header(json_schema_extra={"const": tus.VERSION})] = None,
+) -> None:
     """Refuse a request in another version of the protocol, or in none."""
     if tus_resumable != tus.VERSION:
         raise HTTPException(412, f"Header Tus-Resumable must be {tus.VERSION}; send it", {"Tus-Version": tus.VERSION})
@@ -42,27 +44,47 @@ def require_version(tus_resumable: Annotated[str | None, Header(json_schema_extr
 
 def build_tus_router(uploads: Uploads) -> APIRouter:
     """Routes over the given uploads."""
-    router = APIRouter(prefix="/v1/uploads", route_class=TusRoute, responses=refusals(404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507), tags=["uploads"])
+    router = APIRouter(
+        prefix="/v1/uploads",
+        route_class=TusRoute,
+        responses=refusals(404, 408, 409, 410, 412, 413, 415, 422, 423, 460, 507),
+        tags=["uploads"],
+    )
     versioned = [Depends(require_version)]
 
     def told(upload: Upload) -> dict[str, str]:
         metadata = tus.format_metadata({"capture": upload.row.capture, "path": upload.row.file.path})
-        return _progress(upload.offset, upload.expires_s) | {"Upload-Length": str(upload.row.file.bytes), "Upload-Metadata": metadata}
+        return _progress(upload.offset, upload.expires_s) | {
+            "Upload-Length": str(upload.row.file.bytes),
+            "Upload-Metadata": metadata,
+        }
 
     @router.options("", status_code=204, dependencies=[needs("read")])
     def options() -> Response:
         """What of tus is spoken here."""
-        headers = {"Tus-Version": tus.VERSION, "Tus-Extension": tus.EXTENSIONS, "Tus-Max-Size": str(uploads.limits.largest_file_bytes)}
+        headers = {
+            "Tus-Version": tus.VERSION,
+            "Tus-Extension": tus.EXTENSIONS,
+            "Tus-Max-Size": str(uploads.limits.largest_file_bytes),
+        }
         return Response(status_code=204, headers=headers | {"Tus-Checksum-Algorithm": ",".join(tus.DIGEST_BYTES)})
 
     @router.post("", status_code=201, dependencies=[*versioned, needs("submit")], response_class=Response)
-    def create(asker: Asker, upload_length: Annotated[int, Header(ge=0, le=2**53)], upload_metadata: Annotated[str, Header(max_length=2000)]) -> Response:
+    def create(
+        asker: Asker,
+        upload_length: Annotated[int, Header(ge=0, le=2**53)],
+        upload_metadata: Annotated[str, Header(max_length=2000)],
+    ) -> Response:
         """Start to send one file of an open capture; Upload-Metadata names 'capture' and 'path'. Starting again changes nothing."""
         metadata = tus.parse_metadata(upload_metadata)
         if missing := {"capture", "path"} - set(metadata):
-            raise UploadError(f"Upload-Metadata lacks {min(missing)!r}; name the capture's id and the file's path in it.")
+            raise UploadError(
+                f"Upload-Metadata lacks {min(missing)!r}; name the capture's id and the file's path in it."
+            )
         upload = uploads.create(metadata["capture"], metadata["path"], upload_length, asker)
-        return Response(status_code=201, headers={"Location": upload_path(upload.row.capture, upload.row.number)} | told(upload))
+        return Response(
+            status_code=201, headers={"Location": upload_path(upload.row.capture, upload.row.number)} | told(upload)
+        )
 
     @router.head("/{capture}/{number}", dependencies=[*versioned, needs("submit")], response_class=Response)
     def head(capture: str, number: FileNumber) -> Response:
@@ -74,7 +96,12 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         status_code=204,
         dependencies=[*versioned, needs("submit")],
         response_class=Response,
-        openapi_extra={"requestBody": {"content": {tus.CHUNK_TYPE: {"schema": {"type": "string", "format": "binary"}}}, "required": True}},
+        openapi_extra={
+            "requestBody": {
+                "content": {tus.CHUNK_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+                "required": True,
+            }
+        },
     )
     async def append(
         capture: str,
@@ -92,11 +119,16 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
             try:
                 received = await receive(uploads, capture, number, upload_offset, aiter(request.stream()), checksum)
             except SilenceError:
-                raise HTTPException(408, f"Nothing was sent for {uploads.limits.silence_s:g} s; ask for Upload-Offset and go on from there") from None
+                raise HTTPException(
+                    408,
+                    f"Nothing was sent for {uploads.limits.silence_s:g} s; ask for Upload-Offset and go on from there",
+                ) from None
             return Response(status_code=204, headers=_progress(received.offset, received.expires_s))
         return Response(status_code=204)  # to nobody: the client has gone away
 
-    @router.delete("/{capture}/{number}", status_code=204, dependencies=[*versioned, needs("submit")], response_class=Response)
+    @router.delete(
+        "/{capture}/{number}", status_code=204, dependencies=[*versioned, needs("submit")], response_class=Response
+    )
     def terminate(capture: str, number: FileNumber) -> Response:
         """Discard what was received of the file."""
         uploads.terminate(capture, number)

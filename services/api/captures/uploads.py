@@ -37,7 +37,9 @@ class Upload:
 class Uploads:
     """Offsets are recorded only once their bytes are durable, so a dead server loses no acknowledged byte."""
 
-    def __init__(self, table: CaptureTable, blobs: Blobs, claims: FileLocks, limits: UploadLimits, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, table: CaptureTable, blobs: Blobs, claims: FileLocks, limits: UploadLimits, now_s: Callable[[], float]
+    ) -> None:
         self.limits, self.claims = limits, claims
         self._table, self._blobs, self._now_s = table, blobs, now_s
 
@@ -52,7 +54,9 @@ class Uploads:
         self.require_open(capture)
         row = self._table.file_at(capture, path)
         if row.file.bytes != size_bytes:
-            raise CorruptUploadError(f"File {path!r} has {row.file.bytes} bytes by the manifest and {size_bytes} by Upload-Length; correct the wrong one.")
+            raise CorruptUploadError(
+                f"File {path!r} has {row.file.bytes} bytes by the manifest and {size_bytes} by Upload-Length; correct the wrong one."
+            )
         self._table.change_file(capture, row.number, is_created=True)
         return self.find(capture, row.number)
 
@@ -65,7 +69,9 @@ class Uploads:
         self.require_open(capture, or_committed=True)
         row = self._table.file(capture, number)
         if not row.is_created:
-            raise UnknownCaptureError(f"File {row.file.path!r} of capture {capture} has no upload; create it with POST /v1/uploads.")
+            raise UnknownCaptureError(
+                f"File {row.file.path!r} of capture {capture} has no upload; create it with POST /v1/uploads."
+            )
         return Upload(row, self.received_bytes(row), self._table.get(capture).expires_s)
 
     def begin(self, capture: str, number: int, offset: int) -> Upload:
@@ -77,7 +83,9 @@ class Uploads:
         self.require_open(capture)
         upload = self.find(capture, number)
         if upload.offset != offset:
-            raise OffsetError(f"File {upload.row.file.path!r} is here up to byte {upload.offset}, not {offset}; ask for Upload-Offset and send from there.")
+            raise OffsetError(
+                f"File {upload.row.file.path!r} is here up to byte {upload.offset}, not {offset}; ask for Upload-Offset and send from there."
+            )
         return upload
 
     def open_partial(self, upload: Upload) -> PartialFile:
@@ -99,7 +107,9 @@ class Uploads:
         file = row.file
         if not self.is_known(row) and not self._blobs.adopt(row.capture, row.number, file.sha256):
             self._table.change_file(row.capture, row.number, received_bytes=0, is_corrupt=True)
-            raise CorruptUploadError(f"File {file.path!r} was received whole, but its SHA-256 is not the manifest's; it was discarded, so send it again.")
+            raise CorruptUploadError(
+                f"File {file.path!r} was received whole, but its SHA-256 is not the manifest's; it was discarded, so send it again."
+            )
         self._table.mark_known(file.sha256, row.capture)
         self._blobs.discard_partial(row.capture, row.number)
 
@@ -113,7 +123,9 @@ class Uploads:
         with self.claims.claim(capture, number):
             row = self.find(capture, number).row
             self._blobs.discard_partial(capture, number)
-            self._table.change_file(capture, number, is_created=False, received_bytes=row.file.bytes if self.is_known(row) else 0)
+            self._table.change_file(
+                capture, number, is_created=False, received_bytes=row.file.bytes if self.is_known(row) else 0
+            )
 
     def is_known(self, row: FileRow) -> bool:
         """Whether the whole content is here and verified, and its owner has sent it.
@@ -135,7 +147,11 @@ class Uploads:
             UnknownCaptureError: there is none. ExpiredError: it was not committed in time. CaptureStateError: it is committed.
         """
         found = self._table.get(capture)
-        if found.state is CaptureState.EXPIRED or (found.state is CaptureState.OPEN and found.expires_s < self._now_s()):
+        if found.state is CaptureState.EXPIRED or (
+            found.state is CaptureState.OPEN and found.expires_s < self._now_s()
+        ):
             raise ExpiredError(f"Capture {capture} was not committed in time and has expired; upload it again.")
         if found.state is CaptureState.COMMITTED and not or_committed:
-            raise CaptureStateError(f"Capture {capture} is committed and takes no more bytes; upload changed files as a new capture.")
+            raise CaptureStateError(
+                f"Capture {capture} is committed and takes no more bytes; upload changed files as a new capture."
+            )

@@ -32,9 +32,13 @@ def change_database_password(url: str, file: Path) -> None:
     try:
         with engine.begin() as connection:
             role = connection.dialect.identifier_preparer.quote(parsed.username or "")
-            connection.exec_driver_sql(f"ALTER ROLE {role} PASSWORD '{read_password(planned)}'")  # of letters, digits, - and _
+            connection.exec_driver_sql(
+                f"ALTER ROLE {role} PASSWORD '{read_password(planned)}'"
+            )  # of letters, digits, - and _
     except sql.exc.OperationalError as problem:
-        raise PlatformError(f"The database at {parsed.host} does not take a new password ({_reason(problem)}); check that it runs.") from problem
+        raise PlatformError(
+            f"The database at {parsed.host} does not take a new password ({_reason(problem)}); check that it runs."
+        ) from problem
     finally:
         engine.dispose()
     write_password(file, read_password(planned))

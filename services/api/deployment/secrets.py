@@ -75,7 +75,9 @@ def _certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as problem:
-        raise SettingsError(f"{path} is no PEM certificate; restore it, or remove it and what it signed so that both are made anew.") from problem
+        raise SettingsError(
+            f"{path} is no PEM certificate; restore it, or remove it and what it signed so that both are made anew."
+        ) from problem
 
 
 def _signing_key(path: Path) -> ec.EllipticCurvePrivateKey:
@@ -83,7 +85,9 @@ def _signing_key(path: Path) -> ec.EllipticCurvePrivateKey:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
         if isinstance(key, ec.EllipticCurvePrivateKey):
             return key
-    raise SettingsError(f"{path} is no plain elliptic-curve key in PEM; restore it, or remove the folder so that another authority is made.")
+    raise SettingsError(
+        f"{path} is no plain elliptic-curve key in PEM; restore it, or remove the folder so that another authority is made."
+    )
 
 
 def _make_authority(folder: Path) -> None:
@@ -100,7 +104,9 @@ def _make_authority(folder: Path) -> None:
         decipher_only=False,
     )
     identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
-    builder = _builder(name, name, key, AUTHORITY_LIFE).add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    builder = _builder(name, name, key, AUTHORITY_LIFE).add_extension(
+        x509.BasicConstraints(ca=True, path_length=0), critical=True
+    )
     builder = builder.add_extension(usage, critical=True).add_extension(identifier, critical=False)
     _write_key(folder / "ca.key", key)
     write_private(folder / "ca.crt", _pem(builder.sign(key, hashes.SHA256())), READABLE_BY_ALL)
@@ -119,10 +125,16 @@ def _make_certificate(authority: Path, folder: Path) -> None:
     write_private(folder / "ca.crt", _pem(issuer), READABLE_BY_ALL)
 
 
-def _builder(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, life: timedelta) -> x509.CertificateBuilder:
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, life: timedelta
+) -> x509.CertificateBuilder:
     now = datetime.now(UTC)
     builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
-    return builder.serial_number(x509.random_serial_number()).not_valid_before(now - CLOCK_STEP).not_valid_after(now + life)
+    return (
+        builder.serial_number(x509.random_serial_number())
+        .not_valid_before(now - CLOCK_STEP)
+        .not_valid_after(now + life)
+    )
 
 
 def _name(common: str) -> x509.Name:

@@ -34,7 +34,12 @@ class LightRequest(Record):
 
     light: Whole = Field(ge=0, lt=2**15, description="index of the light, from 0")
     level: Unit = Field(default=0.05, description="LED level, fraction of full scale")
-    on_s: Number = Field(default=10.0, gt=0, le=LONGEST_LIGHT_S, description="it goes dark by itself after this time; ask again to keep it on")
+    on_s: Number = Field(
+        default=10.0,
+        gt=0,
+        le=LONGEST_LIGHT_S,
+        description="it goes dark by itself after this time; ask again to keep it on",
+    )
 
 
 class DomeState(Record):
@@ -85,7 +90,9 @@ class Dome:
             UnknownDomeError: this server has none. RigError: it does not answer.
         """
         status = _status(self._ask(ANSWER_S, do="status"))
-        return DomeState(address=self._address or "", status=status, capturing=tuple(job.id for job in self._jobs.capturing()))
+        return DomeState(
+            address=self._address or "", status=status, capturing=tuple(job.id for job in self._jobs.capturing())
+        )
 
     def all_off(self) -> AllOff:
         """Switch every light off and stop every capture; waits for nobody who has the dome.
@@ -110,7 +117,9 @@ class Dome:
             UnknownDomeError: this server has none. DomeBusyError: a capture or a preflight has it. SettingsError: no such light. RigError and its kinds.
         """
         if wanted.level > self._settings.max_level:
-            raise SettingsError(f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g} (DENTINE__SERVER__DOME__MAX_LEVEL); lower it.")
+            raise SettingsError(
+                f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g} (DENTINE__SERVER__DOME__MAX_LEVEL); lower it."
+            )
         with self._driven_by_hand():
             return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
 
@@ -150,7 +159,9 @@ class Dome:
             raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
         try:
             if capturing := self._jobs.capturing():
-                raise DomeBusyError(f"Job {capturing[0].id} captures with a dome; wait for it, cancel it, or press ALL OFF.")
+                raise DomeBusyError(
+                    f"Job {capturing[0].id} captures with a dome; wait for it, cancel it, or press ALL OFF."
+                )
             yield
         finally:
             self._driving.release()
@@ -173,11 +184,15 @@ class Dome:
         try:
             return self._process_ask(timeout_s, **command)
         except TimeoutError:
-            raise RigUnreachableError(f"The dome at {self._address} did not do it within {timeout_s:g} s; press ALL OFF, or its emergency stop.") from None
+            raise RigUnreachableError(
+                f"The dome at {self._address} did not do it within {timeout_s:g} s; press ALL OFF, or its emergency stop."
+            ) from None
 
     def _process_ask(self, timeout_s: float, **command: object) -> DomeAnswer:
         if self._address is None:
-            raise UnknownDomeError("This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS to its controller's host:port.")
+            raise UnknownDomeError(
+                "This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS to its controller's host:port."
+            )
         return self._process.ask(timeout_s, **command)
 
 

@@ -98,13 +98,21 @@ class DomeProcess:
             raise PlatformError("The dome's packages are not installed on the server; install dentine[capture].")
         command = [sys.executable, "-m", DOOR, self._settings.model_dump_json()]
         # A session of its own: Ctrl-C must not reach it before the server has closed its pipe.
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)  # noqa: S603
+        self._process = subprocess.Popen(  # noqa: S603
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
         self._commands, self._waiting = queue.SimpleQueue(), {}
-        threading.Thread(target=_speak, args=(self._process, self._commands, self._waiting), name="to the dome process", daemon=True).start()
+        threading.Thread(
+            target=_speak, args=(self._process, self._commands, self._waiting), name="to the dome process", daemon=True
+        ).start()
         threading.Thread(target=_listen, args=(self._process, self._waiting), name="dome process", daemon=True).start()
 
 
-def _speak(process: subprocess.Popen[str], commands: queue.SimpleQueue[DomeCommand | None], waiting: dict[int, Future[DomeAnswer]]) -> None:
+def _speak(
+    process: subprocess.Popen[str],
+    commands: queue.SimpleQueue[DomeCommand | None],
+    waiting: dict[int, Future[DomeAnswer]],
+) -> None:
     """Write every command, then close the pipe, which is what ends the process."""
     assert process.stdin is not None
     for command in iter(commands.get, None):
@@ -129,4 +137,8 @@ def _listen(process: subprocess.Popen[str], waiting: dict[int, Future[DomeAnswer
 def _tell_ended(waiting: dict[int, Future[DomeAnswer]], *numbers: int) -> None:
     for number in numbers:
         if (future := waiting.pop(number, None)) is not None:
-            future.set_exception(RigError("The process that works the dome ended, and so did its light; ask again, the server's log says why it ended."))
+            future.set_exception(
+                RigError(
+                    "The process that works the dome ended, and so did its light; ask again, the server's log says why it ended."
+                )
+            )

@@ -30,8 +30,19 @@ class RequestMetrics:
 
     def __init__(self, registry: CollectorRegistry) -> None:
         labels = ("method", "route")
-        self._answers = Counter("dentine_requests", "Answers by method, route template and class of status", (*labels, "status"), registry=registry)
-        self._latency = Histogram("dentine_request_latency_seconds", "Time to the head of the answer", labels, buckets=_LATENCIES_S, registry=registry)
+        self._answers = Counter(
+            "dentine_requests",
+            "Answers by method, route template and class of status",
+            (*labels, "status"),
+            registry=registry,
+        )
+        self._latency = Histogram(
+            "dentine_request_latency_seconds",
+            "Time to the head of the answer",
+            labels,
+            buckets=_LATENCIES_S,
+            registry=registry,
+        )
 
     def count(self, method: str, route: str, status: int, latency_s: float) -> None:
         """Count one answer."""
@@ -70,25 +81,37 @@ class ServiceCollector(Collector):
     def _of_database(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         with self._engine.connect() as connection:
             by_state = _counts(connection, sql.select(job_table.c.state, sql.func.count()).group_by(job_table.c.state))
-            queued_s = connection.scalar(sql.select(sql.func.min(job_table.c.changed_s)).where(job_table.c.state == JobState.QUEUED))
+            queued_s = connection.scalar(
+                sql.select(sql.func.min(job_table.c.changed_s)).where(job_table.c.state == JobState.QUEUED)
+            )
             running = _counts(connection, _running_stages())
             rows = connection.scalar(sql.select(sql.func.count()).select_from(event_table)) or 0
-            deliveries = _counts(connection, sql.select(delivery_table.c.state, sql.func.count()).group_by(delivery_table.c.state))
+            deliveries = _counts(
+                connection, sql.select(delivery_table.c.state, sql.func.count()).group_by(delivery_table.c.state)
+            )
         yield _gauge("dentine_jobs", "Jobs by state", "state", ((state, by_state.get(state, 0)) for state in JobState))
         age_s = 0.0 if queued_s is None else max(time.time() - queued_s, 0.0)
-        yield GaugeMetricFamily("dentine_oldest_queued_job_seconds", "How long the oldest queued job has waited; 0 without one", age_s)
-        yield _gauge("dentine_stages_running", "Running stages", "stage", ((stage, running.get(stage, 0)) for stage in STAGES))
+        yield GaugeMetricFamily(
+            "dentine_oldest_queued_job_seconds", "How long the oldest queued job has waited; 0 without one", age_s
+        )
+        yield _gauge(
+            "dentine_stages_running", "Running stages", "stage", ((stage, running.get(stage, 0)) for stage in STAGES)
+        )
         yield GaugeMetricFamily("dentine_event_rows", "Rows of the event table", rows)
         states = ((state, deliveries.get(state, 0)) for state in DeliveryState)
         yield _gauge("dentine_webhook_deliveries", "Webhook deliveries in the log by state", "state", states)
-        yield CounterMetricFamily("dentine_steps", "Steps that fits have taken since this server started", self._count_steps())
+        yield CounterMetricFamily(
+            "dentine_steps", "Steps that fits have taken since this server started", self._count_steps()
+        )
 
     def _count_steps(self) -> int:
         """Only rows that are new since the last scrape are looked at."""
         with self._counting, self._engine.connect() as connection:
             newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
             fresh = event_table.c.id.between(self._counted_to + 1, newest)
-            self._steps += connection.scalar(sql.select(sql.func.count()).where(fresh, event_table.c.kind == "step")) or 0
+            self._steps += (
+                connection.scalar(sql.select(sql.func.count()).where(fresh, event_table.c.kind == "step")) or 0
+            )
             self._counted_to = newest
             return self._steps
 

@@ -60,7 +60,12 @@ class Readiness:
         workers: Callable[[], str] | None = None,
     ) -> None:
         self._engine, self._jobs_folder = engine, jobs_folder
-        self._is_running, self._free_bytes, self._address, self._certificates = is_running, free_bytes, scheduler, certificates
+        self._is_running, self._free_bytes, self._address, self._certificates = (
+            is_running,
+            free_bytes,
+            scheduler,
+            certificates,
+        )
         self._workers = workers or _no_workers
         self._file = _identity(engine)
         self._prober, self._store_prober = ThreadPoolExecutor(1, "readiness"), ThreadPoolExecutor(1, "store-readiness")
@@ -78,15 +83,21 @@ class Readiness:
 
     def _database(self) -> str:
         if _identity(self._engine) != self._file:
-            raise StoreError("The database file was removed or replaced while the server ran; stop the server, restore the file and start again.")
+            raise StoreError(
+                "The database file was removed or replaced while the server ran; stop the server, restore the file and start again."
+            )
         writing_once = self._prober.submit(self._take_write_lock)
         try:
             writing_once.result(PROBE_S)
         except TimeoutError:
             writing_once.cancel()
-            raise StoreError(f"The database grants no write within {PROBE_S:g} s; find the process that holds it locked and end it.") from None
+            raise StoreError(
+                f"The database grants no write within {PROBE_S:g} s; find the process that holds it locked and end it."
+            ) from None
         except sql.exc.SQLAlchemyError as problem:
-            raise StoreError(f"The database cannot be written ({_cause(problem)}); check its file, its folder and the disk.") from problem
+            raise StoreError(
+                f"The database cannot be written ({_cause(problem)}); check its file, its folder and the disk."
+            ) from problem
         return "The database can be read and written."
 
     def _take_write_lock(self) -> None:
@@ -106,9 +117,13 @@ class Readiness:
             writing_once.result(STORE_PROBE_S)
         except TimeoutError:
             writing_once.cancel()
-            raise StoreError(f"The jobs' folder takes no file within {STORE_PROBE_S:g} s; look at its disk, or at the network to it.") from None
+            raise StoreError(
+                f"The jobs' folder takes no file within {STORE_PROBE_S:g} s; look at its disk, or at the network to it."
+            ) from None
         except OSError as problem:
-            raise StoreError(f"The jobs' folder cannot be written ({problem.strerror}); check its rights, its mount and the disk.") from problem
+            raise StoreError(
+                f"The jobs' folder cannot be written ({problem.strerror}); check its rights, its mount and the disk."
+            ) from problem
         return "The jobs' folder can be written."
 
     def _write_file(self) -> None:
@@ -126,7 +141,9 @@ class Readiness:
         try:
             free_mib = self._free_bytes() // 2**20
         except OSError as problem:
-            raise StoreError(f"The free space of the data folder cannot be read ({problem.strerror}); check that it exists.") from problem
+            raise StoreError(
+                f"The free space of the data folder cannot be read ({problem.strerror}); check that it exists."
+            ) from problem
         needed_mib = KEPT_FREE_BYTES // 2**20
         if free_mib < needed_mib:
             raise StoreError(f"Only {free_mib} MiB of disk are free; free at least {needed_mib} MiB.")

@@ -29,16 +29,33 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
     """Routes over the given checks and metrics."""
     router = APIRouter(prefix="/v1", tags=["health"], responses=refusals())
 
-    @router.get("/health/ready", response_model=Ready, responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}}, dependencies=[needs("read")])
+    @router.get(
+        "/health/ready",
+        response_model=Ready,
+        responses={503: {"model": NotReady, "content": {MEDIA_TYPE: {}}}},
+        dependencies=[needs("read")],
+    )
     def ready(request: Request) -> Response:
         """Whether a submitted job would run: database, scheduler, workers, store and disk are each tried."""
         checks = readiness.checks()
         if bad := [check for check in checks if not check.ok]:
-            told = Problem.of(HTTPStatus.SERVICE_UNAVAILABLE, "not-ready", " ".join(check.sentence for check in bad), request.scope["path"])
-            return Response(NotReady(**told.model_dump(), checks=checks).model_dump_json(), told.status, media_type=MEDIA_TYPE)
+            told = Problem.of(
+                HTTPStatus.SERVICE_UNAVAILABLE,
+                "not-ready",
+                " ".join(check.sentence for check in bad),
+                request.scope["path"],
+            )
+            return Response(
+                NotReady(**told.model_dump(), checks=checks).model_dump_json(), told.status, media_type=MEDIA_TYPE
+            )
         return Response(Ready(status="ready", checks=checks).model_dump_json(), media_type="application/json")
 
-    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}}, dependencies=[needs("read")])
+    @router.get(
+        "/metrics",
+        response_class=Response,
+        responses={200: {"content": {"text/plain": {}}}},
+        dependencies=[needs("read")],
+    )
     def metrics() -> Response:
         """Metrics for Prometheus, in its text format."""
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)

@@ -24,9 +24,10 @@ HOUR_S, DAY_S = 3600.0, 86400.0
 _TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}(-.*)?")
 """Key of a stage's task, or of one that it has made; see ``pipeline``."""
 _SUCCEEDED = Query(
-    sql.select(sql.func.count(), sql.func.coalesce(sql.func.sum(sql.case((job_table.c.changed_s > sql.bindparam("hour_ago_s"), 1), else_=0)), 0)).where(
-        job_table.c.state == JobState.SUCCEEDED.value, job_table.c.changed_s > sql.bindparam("day_ago_s")
-    )
+    sql.select(
+        sql.func.count(),
+        sql.func.coalesce(sql.func.sum(sql.case((job_table.c.changed_s > sql.bindparam("hour_ago_s"), 1), else_=0)), 0),
+    ).where(job_table.c.state == JobState.SUCCEEDED.value, job_table.c.changed_s > sql.bindparam("day_ago_s"))
 )
 
 _IS_AT_WORK = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.CANCELLING.value)
@@ -51,7 +52,9 @@ class WorkerState(Record):
     memory_limit_bytes: int | None = Field(description="beyond it its tasks are stopped; null where it has none")
     has_dome: bool = Field(description="whether captures may run there")
     runs_stages: bool = Field(description="whether all other stages may run there, as it has shown that it can")
-    fault: str = Field(description="what it cannot do of what it was started for, and the remedy; empty where nothing is wrong")
+    fault: str = Field(
+        description="what it cannot do of what it was started for, and the remedy; empty where nothing is wrong"
+    )
     heard_s: float = Field(description="Unix time of its last sign of life")
 
 
@@ -71,10 +74,21 @@ def list_workers(workers: Workers, repository: Repository, viewer: Viewer = LOCA
         SchedulerLostError: the scheduler does not answer.
     """
     seen = workers.look()
-    found = () if seen is None else tuple(sorted(_states(seen.workers, seen.processing, _seen_by(viewer, repository)), key=lambda one: one.name))
+    found = (
+        ()
+        if seen is None
+        else tuple(
+            sorted(_states(seen.workers, seen.processing, _seen_by(viewer, repository)), key=lambda one: one.name)
+        )
+    )
     now_s = time.time()
     in_day, in_hour = _SUCCEEDED.rows(repository.engine, hour_ago_s=now_s - HOUR_S, day_ago_s=now_s - DAY_S)[0]
-    return WorkerList(workers=found, sentence=_sentence(found, is_started=seen is not None), succeeded_last_hour=in_hour, succeeded_last_day=in_day)
+    return WorkerList(
+        workers=found,
+        sentence=_sentence(found, is_started=seen is not None),
+        succeeded_last_hour=in_hour,
+        succeeded_last_day=in_day,
+    )
 
 
 def _seen_by(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
@@ -85,7 +99,9 @@ def _seen_by(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
 
 
 def _states(
-    workers: Mapping[str, Mapping[str, Any]], processing: Mapping[str, Iterable[Any]], is_seen: Callable[[str], bool] = lambda _: True
+    workers: Mapping[str, Mapping[str, Any]],
+    processing: Mapping[str, Iterable[Any]],
+    is_seen: Callable[[str], bool] = lambda _: True,
 ) -> Iterable[WorkerState]:
     for address, worker in workers.items():
         keys = (_TASK.fullmatch(str(key)) for key in processing.get(address, ()))
@@ -106,7 +122,9 @@ def _states(
 def _tasks(keys: Iterable[re.Match[str]], is_seen: Callable[[str], bool]) -> tuple[WorkerTask, ...]:
     """Each stage once, of however many parts of it the worker has."""
     found = dict.fromkeys((key[1], key[2]) for key in keys)
-    return tuple(WorkerTask.model_validate({"stage": stage, "job": job if is_seen(job) else None}) for stage, job in found)
+    return tuple(
+        WorkerTask.model_validate({"stage": stage, "job": job if is_seen(job) else None}) for stage, job in found
+    )
 
 
 def _sentence(found: tuple[WorkerState, ...], *, is_started: bool) -> str:

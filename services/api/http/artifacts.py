@@ -63,7 +63,12 @@ def open_artifact(root: Path, name: str) -> Path:
     path = root.joinpath(*relative.parts)
     inside = not relative.is_absolute() and ".." not in relative.parts and "\0" not in name
     with suppress(OSError):  # a path too long for the disk
-        if inside and _is_public(relative) and not any((root / part).is_symlink() for part in (relative, *relative.parents[:-1])) and path.is_file():
+        if (
+            inside
+            and _is_public(relative)
+            and not any((root / part).is_symlink() for part in (relative, *relative.parents[:-1]))
+            and path.is_file()
+        ):
             return path
     raise UnknownJobError(f"The job has no artifact {name!r}; list its artifacts to see their paths.")
 
@@ -101,7 +106,11 @@ def _ranges(asked: str, size_bytes: int) -> list[tuple[int, int]] | None:
     unit, _, ranges = asked.partition("=")
     found = [_RANGE.fullmatch(part.strip()) for part in ranges.split(",")]
     parts = [(part["first"], part["last"]) for part in found if part is not None]
-    if unit.strip().lower() != "bytes" or len(parts) < len(found) or any(first and last and int(last) < int(first) for first, last in parts):
+    if (
+        unit.strip().lower() != "bytes"
+        or len(parts) < len(found)
+        or any(first and last and int(last) < int(first) for first, last in parts)
+    ):
         return None
     return [_limits(first, last, size_bytes) for first, last in parts]
 
@@ -133,7 +142,12 @@ def _walk(folder: Path, below: PurePosixPath = PurePosixPath()) -> Iterator[tupl
 
 def _is_public(relative: PurePosixPath) -> bool:
     hidden = any(part.startswith(".") for part in relative.parts)
-    return bool(relative.parts) and not hidden and not relative.name.endswith(_INTERNAL_SUFFIXES) and relative.parts != (CANCEL_FLAG,)
+    return (
+        bool(relative.parts)
+        and not hidden
+        and not relative.name.endswith(_INTERNAL_SUFFIXES)
+        and relative.parts != (CANCEL_FLAG,)
+    )
 
 
 def _media_type(path: PurePath) -> str:

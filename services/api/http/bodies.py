@@ -60,13 +60,17 @@ def parse(body: bytes) -> Any:
     # Every value but the first of its list or object follows a comma, so that this counts no fewer than there are.
     values, most = sum(map(body.count, (b",", b"[", b"{"))), max(MAX_VALUES, len(body) // BYTES_PER_VALUE)
     if values > most:
-        raise SettingsError(f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route asks for.")
+        raise SettingsError(
+            f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route asks for."
+        )
     return json.loads(body, object_pairs_hook=_of_few_members)
 
 
 def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) > MAX_MEMBERS:
-        raise SettingsError(f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks for.")
+        raise SettingsError(
+            f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks for."
+        )
     return dict(members)
 
 

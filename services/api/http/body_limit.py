@@ -68,7 +68,9 @@ class BodyLimit:
         await self._app(scope, receive_counted, send_unless_refused)
 
     def _too_long(self, path: str) -> Response:
-        problem = BodyTooLargeError(f"A body here may have up to {self._limit_bytes} bytes; send less, or upload a capture below {EXEMPT}.")
+        problem = BodyTooLargeError(
+            f"A body here may have up to {self._limit_bytes} bytes; send less, or upload a capture below {EXEMPT}."
+        )
         return response_of(problem, path, {"Connection": "close"})
 
 

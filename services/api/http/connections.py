@@ -46,7 +46,10 @@ class Crowd:
     def admit(self, newcomer: BoundedProtocol) -> bool:
         """Let a connection in, in place of the one that has waited longest where all places are taken; False where all are at work."""
         if len(self.open) >= self.most and not self.shed(1):
-            self.tell("All %d connections are at work; further ones are refused. See DENTINE__SERVER__CONNECTIONS__MOST.", self.most)
+            self.tell(
+                "All %d connections are at work; further ones are refused. See DENTINE__SERVER__CONNECTIONS__MOST.",
+                self.most,
+            )
             return False
         self.open.add(newcomer)
         return True
@@ -85,8 +88,14 @@ class Crowd:
     def handle_exception(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Of the event loop: an accept without descriptors, of which it would tell some hundred times a second, makes room and is told once."""
         problem = context.get("exception")
-        if isinstance(problem, OSError) and problem.errno in _OUT_OF_DESCRIPTORS and "accept" in context.get("message", ""):
-            self.tell("No descriptor is left for further connections (%s); raise the limit of open files.", problem.strerror)
+        if (
+            isinstance(problem, OSError)
+            and problem.errno in _OUT_OF_DESCRIPTORS
+            and "accept" in context.get("message", "")
+        ):
+            self.tell(
+                "No descriptor is left for further connections (%s); raise the limit of open files.", problem.strerror
+            )
             self.shed(SHED)
         else:
             loop.default_exception_handler(context)

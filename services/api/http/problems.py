@@ -88,8 +88,14 @@ class Problem(Record):
     def of(cls, status: int, code: str, detail: str, path: str, **more: object) -> Self:
         """The document for a status, one of our codes and a decoded path; ``more`` are the members of a subclass."""
         title = phrase_of(status)
-        fields = {"detail": redacted(detail).encode(errors="backslashreplace").decode(), "instance": quote(redacted(path), safe=_PATH_CHARACTERS), "code": code}
-        return cls.model_validate({"type": f"urn:dentine:problem:{code}", "title": title, "status": status} | fields | more)
+        fields = {
+            "detail": redacted(detail).encode(errors="backslashreplace").decode(),
+            "instance": quote(redacted(path), safe=_PATH_CHARACTERS),
+            "code": code,
+        }
+        return cls.model_validate(
+            {"type": f"urn:dentine:problem:{code}", "title": title, "status": status} | fields | more
+        )
 
 
 _STATUS: dict[type[DentineError], int] = {
@@ -139,7 +145,9 @@ def response_of(problem: DentineError, path: str, headers: dict[str, str] | None
     from starlette.responses import Response
 
     status = status_of(problem)
-    return Response(Problem.of(status, problem.code, problem.message, path).model_dump_json(), status, headers, MEDIA_TYPE)
+    return Response(
+        Problem.of(status, problem.code, problem.message, path).model_dump_json(), status, headers, MEDIA_TYPE
+    )
 
 
 def database_lost(path: str) -> Response:
@@ -154,7 +162,9 @@ def database_lost(path: str) -> Response:
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """What the description says of routes that may answer so, besides what the shield, the gate and a lost database answer everywhere."""
     chosen = sorted({400, 401, 403, 429, 503, *statuses})
-    return {status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen}
+    return {
+        status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen
+    }
 
 
 def install(app: FastAPI) -> None:
@@ -179,7 +189,9 @@ def install(app: FastAPI) -> None:
     app.openapi = describe_refusals  # type: ignore[method-assign]
 
     def answer(request: Request, status: int, code: str, detail: str, headers: Any = None) -> Response:
-        return Response(Problem.of(status, code, detail, request.scope["path"]).model_dump_json(), status, headers, MEDIA_TYPE)
+        return Response(
+            Problem.of(status, code, detail, request.scope["path"]).model_dump_json(), status, headers, MEDIA_TYPE
+        )
 
     @app.exception_handler(DentineError)
     def _dentine(request: Request, problem: DentineError) -> Response:
@@ -202,9 +214,15 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     def _http(request: Request, problem: HTTPException) -> Response:
         status = HTTPStatus(problem.status_code)
-        if status is HTTPStatus.BAD_REQUEST and problem.__cause__ is not None:  # FastAPI's on a body that is no text; of other malformed bodies it says 422
-            return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", "The body cannot be read; send JSON in UTF-8.")
-        return answer(request, status, phrase_of(status).lower().replace(" ", "-"), f"{problem.detail}.", problem.headers)
+        if (
+            status is HTTPStatus.BAD_REQUEST and problem.__cause__ is not None
+        ):  # FastAPI's on a body that is no text; of other malformed bodies it says 422
+            return answer(
+                request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", "The body cannot be read; send JSON in UTF-8."
+            )
+        return answer(
+            request, status, phrase_of(status).lower().replace(" ", "-"), f"{problem.detail}.", problem.headers
+        )
 
     @app.exception_handler(Exception)
     def _unexpected(request: Request, _problem: Exception) -> Response:

@@ -55,8 +55,15 @@ class RequestLog:
             if not status:  # an exception, which the server answers further out
                 status = 500
                 self._metrics.count(scope["method"], route_of(scope), status, duration_s)
-            told = {"method": method_of(scope), "route": route_of(scope), "status": status, "duration_s": round(duration_s, 6)}
-            logging.getLogger(__name__).info("Request answered.", extra=told | {"client": scope["client"][0] if scope.get("client") else None})
+            told = {
+                "method": method_of(scope),
+                "route": route_of(scope),
+                "status": status,
+                "duration_s": round(duration_s, 6),
+            }
+            logging.getLogger(__name__).info(
+                "Request answered.", extra=told | {"client": scope["client"][0] if scope.get("client") else None}
+            )
 
 
 def method_of(scope: Scope) -> str:

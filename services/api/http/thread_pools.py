@@ -33,7 +33,9 @@ class ThreadPool:
 
     async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
         """What the work returns."""
-        return await asyncio.get_running_loop().run_in_executor(self._pool, partial(copy_context().run, work, *arguments, **options))
+        return await asyncio.get_running_loop().run_in_executor(
+            self._pool, partial(copy_context().run, work, *arguments, **options)
+        )
 
     def answering(self, handler: Callable[P, R]) -> Callable[P, Coroutine[Any, Any, R]]:
         """Let a handler be called here, where FastAPI would call it in one of forty threads."""

@@ -235,7 +235,9 @@ class Admission:
 
     def pause(self, job_id: str, problem: DentineError) -> None:
         """Let a job wait that could not go on."""
-        what = "disk" if isinstance(problem, DiskFullError) else "store" if isinstance(problem, StoreError) else "workers"
+        what = (
+            "disk" if isinstance(problem, DiskFullError) else "store" if isinstance(problem, StoreError) else "workers"
+        )
         with self._lock:
             self._paused[job_id] = self._clock() + RETRY_S, f"Waits for {what}: {problem.message}"
 
@@ -288,7 +290,11 @@ class Admission:
 
     def _no_place(self) -> str:
         placed = self._placed()
-        return f"{_TURN[0]}: {_named(placed)}, and {self._at_once} at once is the most." if len(placed) >= self._at_once else ""
+        return (
+            f"{_TURN[0]}: {_named(placed)}, and {self._at_once} at once is the most."
+            if len(placed) >= self._at_once
+            else ""
+        )
 
     def _no_memory(self, needs: Needs, memory_bytes: int | None) -> str:
         placed = self._placed()

@@ -28,7 +28,16 @@ MAX_EVENTS = 1000
 MAX_TURNS = 64
 """Remembered; a stream that was stalled for longer reads again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"text/event-stream": {"itemSchema": {"type": "object", "properties": {name: {"type": "string"} for name in ("data", "event", "id")}}}}}
+    200: {
+        "content": {
+            "text/event-stream": {
+                "itemSchema": {
+                    "type": "object",
+                    "properties": {name: {"type": "string"} for name in ("data", "event", "id")},
+                }
+            }
+        }
+    }
 }
 """What the API's description says of a stream."""
 
@@ -80,7 +89,9 @@ class EventFeed:
         ask: calls a reader in a thread.
     """
 
-    def __init__(self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread) -> None:
+    def __init__(
+        self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread
+    ) -> None:
         self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
         self._turns = deque([Turn(0)], MAX_TURNS)
 
@@ -110,7 +121,9 @@ class EventFeed:
             return Response(chapter.told, headers=UNBUFFERED, media_type=EventStream.media_type)
         return EventStream(self.follow(job_id, after, (turn, chapter)), headers=UNBUFFERED)
 
-    async def follow(self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None) -> AsyncIterator[bytes]:
+    async def follow(
+        self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None
+    ) -> AsyncIterator[bytes]:
         """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or the job's deletion.
 
         Args:

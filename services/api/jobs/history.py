@@ -91,7 +91,9 @@ def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> Preview
     """One page of the pictures that the fit wrote."""
     events = log.read(after, limit + 1, kind="preview")
     previews = [_preview(event, job_id) for event in events[:limit]]
-    return PreviewPage(previews=previews, next_after=previews[-1].id if previews else after, is_last=len(events) <= limit)
+    return PreviewPage(
+        previews=previews, next_after=previews[-1].id if previews else after, is_last=len(events) <= limit
+    )
 
 
 def read_history(log: EventLog, points: int, channel: str | None = None) -> History:

@@ -46,7 +46,11 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
 
     @router.get("/jobs/{job_id}/history", response_model=History, tags=["jobs"], dependencies=[needs("read")])
     @readers.answering
-    def history(job_id: str, points: Annotated[int, Query(ge=3, le=5000)] = 500, channel: Annotated[str | None, Query(max_length=100)] = None) -> Response:
+    def history(
+        job_id: str,
+        points: Annotated[int, Query(ge=3, le=5000)] = 500,
+        channel: Annotated[str | None, Query(max_length=100)] = None,
+    ) -> Response:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
         return Response(histories.read(events_of(job_id), points, channel), media_type=JSON)
 
@@ -66,13 +70,18 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
     )
     @openers.answering
     def preview(
-        job_id: str, preview_id: Annotated[int, PathParameter(ge=1, le=MAX_ID)], picture: Literal["render", "photo", "residual"], request: Request
+        job_id: str,
+        preview_id: Annotated[int, PathParameter(ge=1, le=MAX_ID)],
+        picture: Literal["render", "photo", "residual"],
+        request: Request,
     ) -> Response:
         """One picture; takes Range and If-None-Match."""
         events = events_of(job_id).read(preview_id - 1, 1, kind="preview")
         path = events[0].data.get(picture) if events and events[0].id == preview_id else None
         if not isinstance(path, str):
-            raise UnknownJobError(f"The job has no {picture} of preview {preview_id}; list its previews to see their ids.")
+            raise UnknownJobError(
+                f"The job has no {picture} of preview {preview_id}; list its previews to see their ids."
+            )
         return artifact_response(request, open_artifact(jobs.folder(job_id), path))
 
     @router.get(

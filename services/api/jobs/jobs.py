@@ -64,7 +64,9 @@ class Jobs:
         SettingsError: the database belongs to another data folder.
     """
 
-    def __init__(self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None) -> None:
+    def __init__(
+        self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None
+    ) -> None:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(keep_password_apart(settings.database_url, self._data))
@@ -75,15 +77,26 @@ class Jobs:
         self.calibrations = Calibrations(self._data)
         self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
-        self._admission = Admission(lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks)
+        self._admission = Admission(
+            lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks
+        )
         places, running = settings.jobs_at_once, lambda: self._admission.sharing
-        self._time_ranges = TimeRanges(self.repository, self.locate, self._is_kept_by, machine, places, running, self.reader.describe)
+        self._time_ranges = TimeRanges(
+            self.repository, self.locate, self._is_kept_by, machine, places, running, self.reader.describe
+        )
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
             return run(self._light_limits.lowered(spec), folder, events)
 
         self._runner = Runner(
-            self.repository, self.folder, self.locate, run_within_limits, self._admission, self._tidy, self._time_ranges.learn, self.server_paths.tell
+            self.repository,
+            self.folder,
+            self.locate,
+            run_within_limits,
+            self._admission,
+            self._tidy,
+            self._time_ranges.learn,
+            self.server_paths.tell,
         )
         self._is_alone = settings.database is None
         self._deleting = threading.Lock()
@@ -114,7 +127,14 @@ class Jobs:
         """A job's options with the files of what the server stores for it."""
         return self.calibrations.locate(self.captures.locate(spec))
 
-    def submit(self, spec: JobSpec, key: str | None = None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
+    def submit(
+        self,
+        spec: JobSpec,
+        key: str | None = None,
+        request_id: str | None = None,
+        name: str | None = None,
+        viewer: Viewer = LOCAL_VIEWER,
+    ) -> Creation:
         """Queue a job, under a label where it is given one.
 
         Raises:
@@ -137,7 +157,9 @@ class Jobs:
             self.calibrations.require(spec.calibration, viewer)
         elif spec.calibration is not None:
             self.server_paths.require("calibration", spec.calibration)
-        self._admission.refuse_too_large(self.locate(spec))  # before other submissions have to wait, as it walks through the capture
+        self._admission.refuse_too_large(
+            self.locate(spec)
+        )  # before other submissions have to wait, as it walks through the capture
         with self.captures.keeping(spec, viewer):
             creation = self.repository.create(spec, key, request_id, name, viewer)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
@@ -191,7 +213,9 @@ class Jobs:
 
     def capturing(self) -> list[Job]:
         """Jobs under way, of any server of the database, whose capture is not published yet."""
-        return self._to_capture(self.repository.page(MAX_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING))))
+        return self._to_capture(
+            self.repository.page(MAX_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING)))
+        )
 
     def lights_again(self, job_id: str) -> bool:
         """Whether a retry of a job would light a dome that is not simulated.
@@ -199,7 +223,10 @@ class Jobs:
         Raises:
             UnknownJobError: there is no such job.
         """
-        return any(job.spec.rig is not None and not job.spec.rig.is_simulated for job in self._to_capture([self.repository.get(job_id)]))
+        return any(
+            job.spec.rig is not None and not job.spec.rig.is_simulated
+            for job in self._to_capture([self.repository.get(job_id)])
+        )
 
     def cancel_captures(self) -> list[str]:
         """Cancel every job that captures or will capture next; returns their ids."""
@@ -220,7 +247,11 @@ class Jobs:
         look = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
         if (reason := look(job.id)) is not None:
             return self.server_paths.tell(reason, self.locate(job.spec))
-        return None if job.state is JobState.RUNNING or self.is_running() else "This server does not run jobs; restart it and read its log."
+        return (
+            None
+            if job.state is JobState.RUNNING or self.is_running()
+            else "This server does not run jobs; restart it and read its log."
+        )
 
     def _is_kept_by(self, job: Job) -> str | None:
         return self._admission.reason(job.id, besides_turn=True) if job.state is JobState.QUEUED else None
@@ -260,5 +291,11 @@ class Jobs:
 def _stage_progress(job: Job, stage: StageName, last: JobEvent | None) -> StageProgress:
     if last is None:
         return StageProgress(stage=stage, state="waiting", attempt=0, done=0.0, message="")
-    state = "finished" if last.kind == "finished" else "running" if job.state in {JobState.RUNNING, JobState.CANCELLING} else "stopped"
+    state = (
+        "finished"
+        if last.kind == "finished"
+        else "running"
+        if job.state in {JobState.RUNNING, JobState.CANCELLING}
+        else "stopped"
+    )
     return StageProgress(stage=stage, state=state, attempt=last.attempt, done=last.done or 0.0, message=last.message)

@@ -27,7 +27,9 @@ class LightLimits:
             what = f"Option 'rig.dome': this server captures with {known} and not with {rig.dome}"
             raise SettingsError(f"{what}; name one of them, or have {_PREFIX}JOB_ADDRESSES name this one.")
         if rig.level > settings.max_level:
-            what = f"Option 'rig.level': {rig.level:g} is above this server's {settings.max_level:g} ({_PREFIX}MAX_LEVEL)"
+            what = (
+                f"Option 'rig.level': {rig.level:g} is above this server's {settings.max_level:g} ({_PREFIX}MAX_LEVEL)"
+            )
             raise SettingsError(f"{what}; lower it.")
         on_s = rig.settle_s + rig.exposure_s
         if on_s > settings.max_exposure_s:
@@ -47,5 +49,7 @@ class LightLimits:
         if spec.rig is None:
             return spec
         self.require(spec.rig)
-        limits = {name: min(getattr(spec.rig, name), getattr(self._settings, name)) for name in LIMITS_OF_A_RIG - {"dome"}}
+        limits = {
+            name: min(getattr(spec.rig, name), getattr(self._settings, name)) for name in LIMITS_OF_A_RIG - {"dome"}
+        }
         return spec.model_copy(update={"rig": spec.rig.model_copy(update=limits)})

@@ -38,9 +38,13 @@ class Course(Record):
     """One run from its start to its success, without a break."""
 
     machine: str = Field(description="class of the machines that ran its stages")
-    reached_s: dict[StageName, tuple[float, ...]] = Field(description="by stage, from the start of the run until each tenth of it, its beginning first")
+    reached_s: dict[StageName, tuple[float, ...]] = Field(
+        description="by stage, from the start of the run until each tenth of it, its beginning first"
+    )
     total_s: float
-    beside: float = Field(default=1.0, ge=1, description="how many jobs shared the workers, this one included; mean over the run")
+    beside: float = Field(
+        default=1.0, ge=1, description="how many jobs shared the workers, this one included; mean over the run"
+    )
 
 
 class PastRun(Record):
@@ -76,11 +80,21 @@ def course_of(events: Iterable[JobEvent]) -> Course | None:
             tenths = TENTHS if event.kind == "finished" else 1 + tenth_of(event.done or 0.0)
             times += [event.time_s - began_s] * (tenths - len(times))
     times = [time_s for one in reached.values() for time_s in one]
-    if began_s is None or ended_s is None or not machines or "" in machines or any(len(one) < TENTHS for one in reached.values()):
+    if (
+        began_s is None
+        or ended_s is None
+        or not machines
+        or "" in machines
+        or any(len(one) < TENTHS for one in reached.values())
+    ):
         return None
     if [0.0, *times, ended_s - began_s] != sorted([0.0, *times, ended_s - began_s]):
         return None
-    return Course(machine="; ".join(sorted(machines)), reached_s={stage: tuple(one) for stage, one in reached.items()}, total_s=ended_s - began_s)
+    return Course(
+        machine="; ".join(sorted(machines)),
+        reached_s={stage: tuple(one) for stage, one in reached.items()},
+        total_s=ended_s - began_s,
+    )
 
 
 class PastRuns:
@@ -95,9 +109,17 @@ class PastRuns:
         if course is None:
             return
         course = course.model_copy(update={"beside": beside})
-        row = {"job": job_id, "method": method, "machine": course.machine, "size": size.model_dump_json(), "course": course.model_dump_json()}
+        row = {
+            "job": job_id,
+            "method": method,
+            "machine": course.machine,
+            "size": size.model_dump_json(),
+            "course": course.model_dump_json(),
+        }
         with writing(self._engine) as connection:
-            ended_s = connection.scalar(sql.select(sql.func.max(event_table.c.time_s)).where(event_table.c.job == job_id))
+            ended_s = connection.scalar(
+                sql.select(sql.func.max(event_table.c.time_s)).where(event_table.c.job == job_id)
+            )
             if ended_s is not None:  # else the job was deleted meanwhile
                 connection.execute(past_run_table.insert().values(row | {"ended_s": ended_s}))
 

@@ -23,12 +23,20 @@ class Failure(Record):
     message: str = Field(description="one sentence that names the thing and the remedy")
     exit_status: int = Field(description="what `dentine run` would have exited with")
     stage: StageName | None = None
-    evidence: dict[str, str | int | float | None] = Field(default={}, description="what was measured when it failed, units in the names")
+    evidence: dict[str, str | int | float | None] = Field(
+        default={}, description="what was measured when it failed, units in the names"
+    )
 
     @classmethod
     def of(cls, problem: DentineError, stage: StageName | None) -> Self:
         """The failure that an error means."""
-        return cls(code=problem.code, message=problem.message, exit_status=problem.exit_status, stage=stage, evidence=dict(problem.evidence))
+        return cls(
+            code=problem.code,
+            message=problem.message,
+            exit_status=problem.exit_status,
+            stage=stage,
+            evidence=dict(problem.evidence),
+        )
 
 
 class Job(Record):
@@ -41,11 +49,14 @@ class Job(Record):
     changed_s: float = Field(description="Unix time of the last change of state")
     spec: JobSpec
     failure: Failure | None
-    request_id: str | None = Field(default=None, description="of the request that submitted it; log lines of the job carry it")
+    request_id: str | None = Field(
+        default=None, description="of the request that submitted it; log lines of the job carry it"
+    )
     name: JobName | None = Field(default=None, description="label that a person gave it")
     owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
     verdict: Verdict | None = Field(
-        default=None, description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it"
+        default=None,
+        description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it",
     )
 
     def seen_by(self, viewer: Viewer) -> Job:
@@ -61,7 +72,9 @@ class Deletion(Record):
     submitted_s: float = Field(description="Unix time of the submission")
     files: int = Field(description="files that were removed")
     bytes: int
-    digest: str = Field(description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before")
+    digest: str = Field(
+        description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before"
+    )
 
 
 @dataclass(frozen=True)

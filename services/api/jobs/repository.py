@@ -27,7 +27,16 @@ from services.core.errors import FencedError
 from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
 from services.pipeline.database import Query, open_database, writing
-from services.pipeline.event_log import Begun, EventAddress, EventLog, begun, event_table, insert_event, latest_of_stages, lease_table
+from services.pipeline.event_log import (
+    Begun,
+    EventAddress,
+    EventLog,
+    begun,
+    event_table,
+    insert_event,
+    latest_of_stages,
+    lease_table,
+)
 
 KNOWN_JOBS = 1024
 """Jobs, and their options, that are kept as they were read."""
@@ -39,7 +48,9 @@ _JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields if name in j
 _ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
 _WITH_KEY = Query(_JOBS.where(job_table.c.key == sql.bindparam("of_key")))
 _NEWEST_EVENTS = Query(
-    sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest")).where(event_table.c.id > sql.bindparam("after")).group_by(event_table.c.job)
+    sql.select(event_table.c.job, sql.func.max(event_table.c.id).label("newest"))
+    .where(event_table.c.id > sql.bindparam("after"))
+    .group_by(event_table.c.job)
 )
 _UNFINISHED = Query(_JOBS.where(_IS_UNFINISHED).order_by(job_table.c.number))
 _BEGUN = Query(latest_of_stages(sql.select(job_table.c.id).where(_IS_UNFINISHED)))
@@ -49,7 +60,11 @@ _INSERT = job_table.insert()
 @lru_cache(64)
 def _listing(only: JobFilter, *, is_first: bool) -> Query:
     """The newest ``most`` jobs, those with a number below ``before`` unless it is the first page."""
-    query = _JOBS.where(*only.conditions()).order_by(job_table.c.number.desc()).limit(sql.bindparam("most", type_=sql.Integer))
+    query = (
+        _JOBS.where(*only.conditions())
+        .order_by(job_table.c.number.desc())
+        .limit(sql.bindparam("most", type_=sql.Integer))
+    )
     return Query(query if is_first else query.where(job_table.c.number < sql.bindparam("before")))
 
 
@@ -65,7 +80,9 @@ class Repository:
         self.engine = open_database(url)
         upgrade(self.engine)
         self.past_runs = PastRuns(self.engine)
-        self._spec_of = lru_cache(KNOWN_JOBS)(JobSpec.model_validate_json)  # the same text always means the same options, which never change
+        self._spec_of = lru_cache(KNOWN_JOBS)(
+            JobSpec.model_validate_json
+        )  # the same text always means the same options, which never change
         self._verdicts = Verdicts(self.engine)
         self._known = lru_cache(KNOWN_JOBS)(self._read)
 
@@ -73,7 +90,14 @@ class Repository:
         """Close every connection."""
         self.engine.dispose()
 
-    def create(self, spec: JobSpec, key: str | None, request_id: str | None = None, name: str | None = None, viewer: Viewer = LOCAL_VIEWER) -> Creation:
+    def create(
+        self,
+        spec: JobSpec,
+        key: str | None,
+        request_id: str | None = None,
+        name: str | None = None,
+        viewer: Viewer = LOCAL_VIEWER,
+    ) -> Creation:
         """Insert a job as QUEUED, or find the one that its owner submitted with this idempotency key.
 
         Raises:
@@ -85,8 +109,21 @@ class Repository:
             if key is not None and (earlier := connection.execute(_WITH_KEY.statement, {"of_key": own_key}).first()):
                 return Creation(self._same(earlier, spec, key), is_new=False)
             job_id, now = secrets.token_hex(6), self._clock()
-            row = {"id": job_id, "key": own_key, "state": JobState.SUBMITTED, "created_s": now, "changed_s": now, "spec": options, "request_id": request_id}
-            row |= {"kind": spec.kind, "source": str(spec.rig.mouth if spec.rig else spec.capture), "name": name, "owner": viewer.owner}
+            row = {
+                "id": job_id,
+                "key": own_key,
+                "state": JobState.SUBMITTED,
+                "created_s": now,
+                "changed_s": now,
+                "spec": options,
+                "request_id": request_id,
+            }
+            row |= {
+                "kind": spec.kind,
+                "source": str(spec.rig.mouth if spec.rig else spec.capture),
+                "name": name,
+                "owner": viewer.owner,
+            }
             connection.execute(_INSERT, row)
             insert_event(connection, job_id, 0, kind="state", message="Submitted.", data={"state": JobState.SUBMITTED})
             self._apply(connection, job_id, Trigger.QUEUE)
@@ -128,7 +165,9 @@ class Repository:
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Newest jobs first, those with a number below ``before``."""
         values = {"most": limit} | ({} if before is None else {"before": before})
-        return self._verdicts.judged(self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values)))
+        return self._verdicts.judged(
+            self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values))
+        )
 
     def unfinished(self) -> list[Job]:
         """Jobs that run or wait, those that have waited longest first."""
@@ -161,7 +200,9 @@ class Repository:
         """Keep a lease; False if somebody else has the job by now."""
         held = (lease_table.c.job == lease.job.id) & (lease_table.c.number == lease.number)
         with writing(self.engine) as connection:
-            return bool(connection.execute(lease_table.update().where(held).values(until_s=self._clock() + seconds)).rowcount)
+            return bool(
+                connection.execute(lease_table.update().where(held).values(until_s=self._clock() + seconds)).rowcount
+            )
 
     def settle(self, lease: Lease, trigger: Trigger, failure: Failure | None = None) -> Transition:
         """Apply what the holder of a lease says of its job, and end the lease.
@@ -171,7 +212,9 @@ class Repository:
         """
         with writing(self.engine) as connection:
             if (newest := self._lease_number(connection, lease.job.id)) != lease.number:
-                raise FencedError(f"Job {lease.job.id} was taken over under lease {newest}; lease {lease.number} has no say in it.")
+                raise FencedError(
+                    f"Job {lease.job.id} was taken over under lease {newest}; lease {lease.number} has no say in it."
+                )
             connection.execute(lease_table.update().where(lease_table.c.job == lease.job.id).values(until_s=0.0))
             return self._apply(connection, lease.job.id, trigger, failure)
 
@@ -211,7 +254,9 @@ class Repository:
     def _lose(self, which: sql.ColumnElement[bool]) -> list[str]:
         running = job_table.c.state.in_([JobState.RUNNING, JobState.CANCELLING])
         with writing(self.engine) as connection:
-            ids = list(connection.scalars(sql.select(job_table.c.id).where(running, which).order_by(job_table.c.number)))
+            ids = list(
+                connection.scalars(sql.select(job_table.c.id).where(running, which).order_by(job_table.c.number))
+            )
             for job_id in ids:
                 self._apply(connection, job_id, Trigger.LOSE)
         return ids
@@ -227,7 +272,9 @@ class Repository:
             if job.state is not JobState.DELETING:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
             collect_changes(connection, self._clock())  # as the events go with the job
-            receipt = Deletion(job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest)
+            receipt = Deletion(
+                job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest
+            )
             connection.execute(deletion_table.insert().values(receipt.model_dump() | {"owner": job.owner}))
             for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):
                 connection.execute(column.table.delete().where(column == job_id))
@@ -240,15 +287,23 @@ class Repository:
             UnknownJobError: no job of this id was deleted.
         """
         with self.engine.connect() as connection:
-            row = connection.execute(sql.select(deletion_table).where(deletion_table.c.job == job_id)).mappings().first()
+            row = (
+                connection.execute(sql.select(deletion_table).where(deletion_table.c.job == job_id)).mappings().first()
+            )
         if row is None:
             raise unknown_deletion(job_id)
         return Deletion(**{name: row[name] for name in Deletion.model_fields})
 
     def ended_before(self, time_s: float) -> list[str]:
         """Jobs that ended before a time, oldest first, and those whose deletion was begun."""
-        ended = job_table.c.state.in_([state for state in JobState if state.is_final]) & (job_table.c.changed_s < time_s)
-        query = sql.select(job_table.c.id).where(ended | (job_table.c.state == JobState.DELETING)).order_by(job_table.c.number)
+        ended = job_table.c.state.in_([state for state in JobState if state.is_final]) & (
+            job_table.c.changed_s < time_s
+        )
+        query = (
+            sql.select(job_table.c.id)
+            .where(ended | (job_table.c.state == JobState.DELETING))
+            .order_by(job_table.c.number)
+        )
         with self.engine.connect() as connection:
             return list(connection.scalars(query))
 
@@ -307,14 +362,22 @@ class Repository:
             owner=owner,
         )
 
-    def _apply(self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
+    def _apply(
+        self, connection: sql.Connection, job_id: str, trigger: Trigger, failure: Failure | None = None
+    ) -> Transition:
         before = self._find(connection, job_id).state
         transition = apply(before, trigger)
         if transition.state is before and trigger is not Trigger.LOSE:
             return transition
-        changes = {"state": transition.state, "changed_s": self._clock(), "failure": failure.model_dump_json() if failure else None}
+        changes = {
+            "state": transition.state,
+            "changed_s": self._clock(),
+            "failure": failure.model_dump_json() if failure else None,
+        }
         connection.execute(job_table.update().where(job_table.c.id == job_id).values(changes))
-        data: dict[str, Any] = {"state": transition.state, "trigger": trigger} | ({"failure": failure.model_dump()} if failure else {})
+        data: dict[str, Any] = {"state": transition.state, "trigger": trigger} | (
+            {"failure": failure.model_dump()} if failure else {}
+        )
         message = failure.message if failure else f"{transition.state.capitalize()}."
         insert_event(connection, job_id, 0, kind="state", message=message, data=data)
         return transition

@@ -43,7 +43,9 @@ class Submission(JobSpec):
 
     def spec(self) -> JobSpec:
         """The options alone."""
-        return JobSpec.model_construct(self.model_fields_set - {"name"}, **{name: getattr(self, name) for name in JobSpec.model_fields})
+        return JobSpec.model_construct(
+            self.model_fields_set - {"name"}, **{name: getattr(self, name) for name in JobSpec.model_fields}
+        )
 
 
 class Label(Record):
@@ -63,8 +65,12 @@ class JobDetail(Job):
     """A job and how far each of its stages is."""
 
     stages: list[StageProgress]
-    waits_for: str | None = Field(description="why a queued job does not start, or a running one does not go on; null if nothing keeps it")
-    remaining: TimeRange | None = Field(description="how long until it ends, waiting in the queue included; null unless it waits or runs")
+    waits_for: str | None = Field(
+        description="why a queued job does not start, or a running one does not go on; null if nothing keeps it"
+    )
+    remaining: TimeRange | None = Field(
+        description="how long until it ends, waiting in the queue included; null unless it waits or runs"
+    )
 
 
 class Health(Record):
@@ -73,7 +79,9 @@ class Health(Record):
     status: str
 
 
-def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: ThreadPool, lookers: ThreadPool, cancellers: ThreadPool) -> APIRouter:
+def build_router(
+    jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: ThreadPool, lookers: ThreadPool, cancellers: ThreadPool
+) -> APIRouter:
     """Routes over the given jobs.
 
     Args:
@@ -99,11 +107,19 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: Thre
             async with asyncio.timeout(LOOK_S):
                 return await lookers.ask(jobs.time_range, job)
         except TimeoutError:
-            return TimeRange(reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again.")
+            return TimeRange(
+                reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again."
+            )
 
-    @router.post("/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")])
+    @router.post(
+        "/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")]
+    )
     def submit(
-        wanted: Sent[Submission], asker: Asker, request: Request, response: Response, idempotency_key: Annotated[str | None, Header(max_length=200)] = None
+        wanted: Sent[Submission],
+        asker: Asker,
+        request: Request,
+        response: Response,
+        idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
     ) -> Job:
         """Submit a job. The same Idempotency-Key with the same options gives the same job, and status 200.
 
@@ -127,12 +143,20 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: Thre
         kind: KindName | None = None,
         created_after_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
         created_before_s: Annotated[float | None, Query(allow_inf_nan=False, description="Unix time")] = None,
-        capture: Annotated[str | None, Query(max_length=500, description="text in the path of the capture or of the rig's mouth, in any case")] = None,
+        capture: Annotated[
+            str | None,
+            Query(max_length=500, description="text in the path of the capture or of the rig's mouth, in any case"),
+        ] = None,
     ) -> JobPage:
         """List jobs, newest first."""
-        only = JobFilter(states=state, kind=kind, created_after_s=created_after_s, created_before_s=created_before_s, source=capture)
+        only = JobFilter(
+            states=state, kind=kind, created_after_s=created_after_s, created_before_s=created_before_s, source=capture
+        )
         found = jobs.repository.page(limit + 1, before, only=only.seen_by(asker))
-        return JobPage(jobs=[job.seen_by(asker) for job in found[:limit]], next_before=found[limit - 1].number if len(found) > limit else None)
+        return JobPage(
+            jobs=[job.seen_by(asker) for job in found[:limit]],
+            next_before=found[limit - 1].number if len(found) > limit else None,
+        )
 
     @router.get("/jobs/{job_id}", response_model=JobDetail, tags=["jobs"], dependencies=[needs("read")])
     async def get(job_id: str, asker: Asker) -> Response:
@@ -173,13 +197,24 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: Thre
         """The receipt of a deleted job."""
         return jobs.repository.deletion(job_id)
 
-    @router.get("/jobs/{job_id}/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
+    @router.get(
+        "/jobs/{job_id}/events",
+        response_class=Response,
+        responses=EVENT_ANSWERS,
+        tags=["jobs"],
+        dependencies=[needs("read")],
+    )
     async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MAX_ID)] = None) -> Response:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
         return await feed.answer(job_id, last_event_id or 0)
 
-    @router.get("/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")])
-    async def events_of_several(asker: Asker, job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MAX_STREAMED, description=_PLACE)]) -> Response:
+    @router.get(
+        "/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")]
+    )
+    async def events_of_several(
+        asker: Asker,
+        job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MAX_STREAMED, description=_PLACE)],
+    ) -> Response:
         """The events of several jobs in one stream, as a browser has few connections.
 
         Event 'end' names the job and its final state, null for an absent one.
@@ -203,7 +238,11 @@ def build_router(jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: Thre
         return list_artifacts(jobs.folder(jobs.repository.get(job_id).id))
 
     @router.get(
-        "/jobs/{job_id}/artifacts/{path:path}", response_class=Response, responses=ANSWERS, tags=["artifacts"], dependencies=[needs("read", audited=True)]
+        "/jobs/{job_id}/artifacts/{path:path}",
+        response_class=Response,
+        responses=ANSWERS,
+        tags=["artifacts"],
+        dependencies=[needs("read", audited=True)],
     )
     @openers.answering
     def artifact(job_id: str, path: str, request: Request) -> Response:

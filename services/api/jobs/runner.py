@@ -14,7 +14,14 @@ from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.records import Failure, Job, Lease
 from services.api.jobs.repository import Repository
 from services.client.errors import JobStateError
-from services.core.errors import DentineError, DiskFullError, FencedError, JobCancelledError, ReadOnlyStoreError, SchedulerLostError
+from services.core.errors import (
+    DentineError,
+    DiskFullError,
+    FencedError,
+    JobCancelledError,
+    ReadOnlyStoreError,
+    SchedulerLostError,
+)
 from services.core.records import JobSpec
 from services.core.stage import StageName
 from services.core.store import telling_disk_faults
@@ -59,7 +66,13 @@ class Runner:
         tell: Callable[[str, JobSpec], str] = lambda sentence, _: sentence,
     ) -> None:
         self._tell = tell
-        self._repository, self._folder, self._locate, self._run, self._admission = repository, folder, locate, run, admission
+        self._repository, self._folder, self._locate, self._run, self._admission = (
+            repository,
+            folder,
+            locate,
+            run,
+            admission,
+        )
         self._on_round, self._on_success = on_round, on_success
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
@@ -134,7 +147,9 @@ class Runner:
         # In turn; those that wait for disk or workers let others pass.
         queued = sorted(self._repository.queued(), key=turn)
         self._admission.begin_round(job.id for job in queued)
-        self._told_obstacles = {job.id: told for job in queued if (told := self._told_obstacles.get(job.id)) is not None}
+        self._told_obstacles = {
+            job.id: told for job in queued if (told := self._told_obstacles.get(job.id)) is not None
+        }
         for job in queued:
             if self._closing.is_set():
                 return
@@ -230,7 +245,10 @@ class Runner:
                 raise  # nothing of the job broke; whoever leases it next may have better luck
             logging.getLogger(__name__).exception("Job broke.")
             message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
-            trigger, failure = Trigger.FAIL, Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job))
+            trigger, failure = (
+                Trigger.FAIL,
+                Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job)),
+            )
         if failure is not None:
             failure = failure.model_copy(update={"message": self._tell(failure.message, self._locate(job.spec))})
         self._settle(lease, trigger, failure)
@@ -241,7 +259,9 @@ class Runner:
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", lease.job.id, problem)
             return
-        logging.getLogger(__name__).info("Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None})
+        logging.getLogger(__name__).info(
+            "Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None}
+        )
         if transition.state is JobState.SUCCEEDED:
             self._on_success(lease.job, self._admission.beside(lease.job.id))
 
@@ -258,7 +278,12 @@ class Runner:
             return Trigger.STOPPED
         if self._closing.is_set():
             return Trigger.LOSE
-        self._admission.pause(job.id, SchedulerLostError("The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself."))
+        self._admission.pause(
+            job.id,
+            SchedulerLostError(
+                "The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself."
+            ),
+        )
         return Trigger.PAUSE
 
     def _is_cancelled(self, lease: Lease) -> bool:

@@ -24,7 +24,9 @@ class ServerPaths:
 
     def __init__(self, roots: tuple[Path, ...] | None, data: Path) -> None:
         if relative := next((root for root in roots or () if not root.is_absolute()), None):
-            raise SettingsError(f"Setting {SETTING}: {relative} is relative; give absolute folders, separated by commas.")
+            raise SettingsError(
+                f"Setting {SETTING}: {relative} is relative; give absolute folders, separated by commas."
+            )
         self._roots = None if roots is None else tuple(root.resolve() for root in roots)
         self._data = data.resolve()
 
@@ -47,7 +49,9 @@ class ServerPaths:
         resolved = _resolved(path)
         if self._roots is not None and (resolved is None or not self._is_allowed(resolved)):
             what = f"Option '{option}': this server takes no folder of its own there"
-            raise SettingsError(f"{what}; upload it, with dentine submit --upload or in the page, or have {SETTING} name its root.")
+            raise SettingsError(
+                f"{what}; upload it, with dentine submit --upload or in the page, or have {SETTING} name its root."
+            )
         if resolved is None or not _is_there(path):
             raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
 
@@ -61,7 +65,11 @@ class ServerPaths:
 
 def without_folders(spec: JobSpec) -> JobSpec:
     """A job's options with the names alone of what lies in folders of the server, for whoever may not use those."""
-    changes: dict[str, object] = {name: Path(path.name) for name in ("capture", "calibration") if (path := getattr(spec, name)) and path.is_absolute()}
+    changes: dict[str, object] = {
+        name: Path(path.name)
+        for name in ("capture", "calibration")
+        if (path := getattr(spec, name)) and path.is_absolute()
+    }
     if spec.rig is not None and spec.rig.mouth.is_absolute():
         changes["rig"] = spec.rig.model_copy(update={"mouth": Path(spec.rig.mouth.name)})
     return spec.model_copy(update=changes) if changes else spec
@@ -75,7 +83,9 @@ def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
         data: the server's own folder, in which ``captures/ID`` and ``jobs/ID`` are as everybody calls them.
     """
     named = (located.capture, located.calibration, located.rig.mouth if located.rig is not None else None)
-    folders = [path.parent for path in named if path is not None and path.is_absolute() and not path.is_relative_to(data)]
+    folders = [
+        path.parent for path in named if path is not None and path.is_absolute() and not path.is_relative_to(data)
+    ]
     for folder in sorted({data, *folders}, key=lambda one: len(str(one)), reverse=True):
         if folder != folder.parent:
             text = text.replace(f"{folder}/", "")

@@ -55,7 +55,9 @@ def _sized(spec: JobSpec, values: int) -> JobSize:
 
 def method_of(spec: JobSpec) -> str:
     """The same text for jobs that do the same."""
-    return json.dumps(spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": spec.rig is not None}, sort_keys=True)
+    return json.dumps(
+        spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": spec.rig is not None}, sort_keys=True
+    )
 
 
 @lru_cache(maxsize=256)

@@ -64,18 +64,24 @@ class JobFilter(Record):
     kind: KindName | None = None
     created_after_s: float | None = Field(default=None, description="Unix time")
     created_before_s: float | None = Field(default=None, description="Unix time")
-    source: str | None = Field(default=None, description="text in the path of the capture or of the rig's mouth, in any case")
+    source: str | None = Field(
+        default=None, description="text in the path of the capture or of the rig's mouth, in any case"
+    )
     owner: str | None = Field(default=None, description="whose jobs; null: everybody's")
     by_name: bool = Field(default=False, description="whether source is looked for in the path's last part alone")
 
     def seen_by(self, viewer: Viewer) -> JobFilter:
         """The same, of what somebody may see."""
-        return self.model_copy(update={"owner": None if viewer.sees_all else viewer.owner, "by_name": not viewer.uses_paths})
+        return self.model_copy(
+            update={"owner": None if viewer.sees_all else viewer.owner, "by_name": not viewer.uses_paths}
+        )
 
     def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
         """What a row of the job table must fulfil."""
         if self.states:
-            yield sql.or_(*(job_table.c.state == state.value for state in sorted(set(self.states))))  # each once, as SQLite nests no more than 1000 of them
+            yield sql.or_(
+                *(job_table.c.state == state.value for state in sorted(set(self.states)))
+            )  # each once, as SQLite nests no more than 1000 of them
         if self.kind is not None:
             yield job_table.c.kind == self.kind
         if self.created_after_s is not None:

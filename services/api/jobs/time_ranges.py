@@ -38,7 +38,9 @@ WIDEST = 100.0
 class TimeRange(Record):
     """How long until a job ends; both limits are null where nothing honest can be said."""
 
-    low_s: float | None = Field(default=None, description="from now; in 80 of 100 cases the job ends between the two limits")
+    low_s: float | None = Field(
+        default=None, description="from now; in 80 of 100 cases the job ends between the two limits"
+    )
     high_s: float | None = Field(default=None, description="from now")
     past_jobs: int = Field(default=0, description="how many past jobs it is learned from")
     reason: str | None = Field(default=None, description="why there is no range")
@@ -51,7 +53,10 @@ class TimeRange(Record):
         if self.low_s is None or self.high_s is None:
             return self
         low_s, high_s = (
-            _start_s([getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places) for limit in ("low_s", "high_s")
+            _start_s(
+                [getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places
+            )
+            for limit in ("low_s", "high_s")
         )
         fewer = min(one.past_jobs for one in (self, *running, *ahead))
         return self.model_copy(update={"low_s": self.low_s + low_s, "high_s": self.high_s + high_s, "past_jobs": fewer})
@@ -91,8 +96,15 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
     pairs = [_split(run, position) for run in compared]
     # What was needed so far tells of what is left by as much as it was a part of the whole.
-    weight = 0.0 if position.took_s is None or not pairs else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
-    past = [Observation((*_features(run), weight * math.log(took_s)), left_s) for run, (took_s, left_s) in zip(compared, pairs, strict=True)]
+    weight = (
+        0.0
+        if position.took_s is None or not pairs
+        else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
+    )
+    past = [
+        Observation((*_features(run), weight * math.log(took_s)), left_s)
+        for run, (took_s, left_s) in zip(compared, pairs, strict=True)
+    ]
     pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
     outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
     if outlook is None:
@@ -102,7 +114,10 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     if left is None:
         return TimeRange(past_jobs=len(past), reason=f"It takes longer than {len(past)} jobs like it let expect.")
     if left[1] + position.since_s > WIDEST * (left[0] + position.since_s):
-        return TimeRange(past_jobs=len(past), reason=f"The {len(past)} past jobs differ too much from each other, or from this one, to tell a time.")
+        return TimeRange(
+            past_jobs=len(past),
+            reason=f"The {len(past)} past jobs differ too much from each other, or from this one, to tell a time.",
+        )
     return TimeRange(low_s=left[0], high_s=left[1], past_jobs=len(past))
 
 
@@ -149,7 +164,9 @@ class TimeRanges:
     def of(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
         if job.state is JobState.RUNNING:
-            return self._own(job, self._repository.events_of(job.id).begun(), _Past(self._repository), max(self._running(), 1))
+            return self._own(
+                job, self._repository.events_of(job.id).begun(), _Past(self._repository), max(self._running(), 1)
+            )
         if job.state is not JobState.QUEUED:
             return None
         unfinished, stages, past = self._repository.unfinished(), self._repository.begun(), _Past(self._repository)
@@ -175,8 +192,12 @@ class TimeRanges:
         size = size_of(self._locate(job.spec), self._describe)
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")
-        machine = (stages.started.data.get("machine") if stages.started is not None else self._machine) or past.newest_machine
-        return time_range(size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine), beside)
+        machine = (
+            stages.started.data.get("machine") if stages.started is not None else self._machine
+        ) or past.newest_machine
+        return time_range(
+            size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine), beside
+        )
 
 
 class _Past:
@@ -218,7 +239,12 @@ def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position |
         reached_s = log.reached_s(stage, last.attempt, tenth / TENTHS) or reached_s
     is_whole = all(event.attempt == 1 and event.time_s >= job.changed_s for event in latest)
     is_compared = is_whole and (stage, tenth) != (stages[0], 0)  # until then nothing was done that tells a pace
-    return Position(stage, tenth, max(time.time() - max(reached_s, job.changed_s), 0.0), reached_s - job.changed_s if is_compared else None)
+    return Position(
+        stage,
+        tenth,
+        max(time.time() - max(reached_s, job.changed_s), 0.0),
+        reached_s - job.changed_s if is_compared else None,
+    )
 
 
 def _following(stages: tuple[StageName, ...], event: JobEvent) -> StageName:

@@ -30,7 +30,9 @@ def require_mask(content: bytes, camera: Camera) -> None:
         _require_rows(content, camera)
     except (ValueError, struct.error, zlib.error) as problem:
         size, why = " x ".join(map(str, camera.size)), "it is cut off" if isinstance(problem, struct.error) else problem
-        raise MaskError(f"The mask of camera {camera.name} cannot be used: {why}; send a grey PNG of {size} pixels.") from problem
+        raise MaskError(
+            f"The mask of camera {camera.name} cannot be used: {why}; send a grey PNG of {size} pixels."
+        ) from problem
 
 
 def _require_header(header: PngHeader, camera: Camera) -> None:
@@ -47,7 +49,10 @@ def _require_rows(content: bytes, camera: Camera) -> None:
     inflater, inflated_bytes, place = zlib.decompressobj(), 0, len(PNG_SIGNATURE)
     while True:
         length, kind = struct.unpack_from(">I4s", content, place)
-        data, (checksum,) = content[place + 8 : place + 8 + length], struct.unpack_from(">I", content, place + 8 + length)
+        data, (checksum,) = (
+            content[place + 8 : place + 8 + length],
+            struct.unpack_from(">I", content, place + 8 + length),
+        )
         if zlib.crc32(kind + data) != checksum:
             raise ValueError("a part of it is damaged")
         if kind == b"IDAT":
@@ -69,5 +74,11 @@ def picture_of(bits: NDArray[np.uint8]) -> bytes:
     """A grey PNG of 8 bits a pixel, of an array (height, width)."""
     height, width = bits.shape
     rows = b"".join(b"\0" + row.tobytes() for row in bits)
-    parts = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, _GREY, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
-    return PNG_SIGNATURE + b"".join(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, _GREY, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    )
+    return PNG_SIGNATURE + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    )

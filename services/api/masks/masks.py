@@ -36,7 +36,9 @@ class MaskList(Record):
     """A job's masks by hand."""
 
     masks: tuple[Mask, ...]
-    is_stale: bool = Field(description="whether what the job has prepared was prepared with other masks; a retry prepares and fits again")
+    is_stale: bool = Field(
+        description="whether what the job has prepared was prepared with other masks; a retry prepares and fits again"
+    )
 
 
 class Masks:
@@ -62,7 +64,9 @@ class Masks:
         """
         path = mask_path(self._jobs.folder(job.id), camera, light)
         if len(path.name) > LONGEST_NAME or not path.is_file():
-            raise UnknownMaskError(f"The job has no mask by hand of camera {camera} and light {light}; list its masks to see which there are.")
+            raise UnknownMaskError(
+                f"The job has no mask by hand of camera {camera} and light {light}; list its masks to see which there are."
+            )
         return path
 
     def put(self, job: Job, camera: str, light: str, content: bytes) -> None:
@@ -98,7 +102,9 @@ class Masks:
         folder, manifest = open_stage(root, "prepared", PreparedManifest, verify=False)
         cameras, lights = [one.name for one in manifest.cameras], [one.name for one in manifest.lights]
         if camera not in cameras or light not in lights:
-            raise UnknownMaskError(f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and {', '.join(lights)}.")
+            raise UnknownMaskError(
+                f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and {', '.join(lights)}."
+            )
         width, height = manifest.cameras[cameras.index(camera)].size
         valid = StoredArray(folder / "prepared.zarr" / "valid")
         return picture_of(valid[cameras.index(camera), lights.index(light), :height, :width].astype(np.uint8))
@@ -109,9 +115,13 @@ class Masks:
         lights = [one.name for one in description.lights]
         if found is None or light not in {*lights, ALL_LIGHTS}:
             cameras = ", ".join(one.name for one in description.cameras)
-            raise UnknownMaskError(f"The job's capture has no camera {camera} with light {light}; it has {cameras} and {', '.join(lights)}, or '{ALL_LIGHTS}'.")
+            raise UnknownMaskError(
+                f"The job's capture has no camera {camera} with light {light}; it has {cameras} and {', '.join(lights)}, or '{ALL_LIGHTS}'."
+            )
         if len(mask_path(Path(), camera, light).name) > LONGEST_NAME:
-            raise UnknownMaskError(f"The names of camera {camera} and light {light} are too long for a mask; shorten them in the capture.")
+            raise UnknownMaskError(
+                f"The names of camera {camera} and light {light} are too long for a mask; shorten them in the capture."
+            )
         return found
 
     def _calibration(self, job: Job) -> Calibration:

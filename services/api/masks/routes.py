@@ -30,8 +30,15 @@ def build_masks_router(jobs: Jobs, masks: Masks) -> APIRouter:
         """List a job's masks by hand, and whether its preparation has taken them in."""
         return masks.list(job)
 
-    @router.get("/{camera}/{light}", response_class=Response, responses=ANSWERS | {200: {"content": {PNG: {}}}}, dependencies=[needs("read", audited=True)])
-    def get(job: Found, camera: str, light: str, request: Request, which: Literal["hand", "prepared"] = "hand") -> Response:
+    @router.get(
+        "/{camera}/{light}",
+        response_class=Response,
+        responses=ANSWERS | {200: {"content": {PNG: {}}}},
+        dependencies=[needs("read", audited=True)],
+    )
+    def get(
+        job: Found, camera: str, light: str, request: Request, which: Literal["hand", "prepared"] = "hand"
+    ) -> Response:
         """A mask as PNG: by hand, as put, without metadata; prepared, the sum of the reasons why a pixel is out (MaskBit), 0 where the fit may look."""
         if which == "prepared":
             return Response(masks.prepared(job, camera, light), media_type=PNG)

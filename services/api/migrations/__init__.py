@@ -45,4 +45,6 @@ def _telling_refusals(engine: sql.Engine) -> Iterator[None]:
             raise
         reason = str(problem.orig).strip().splitlines()[-1].rpartition("FATAL:")[2].strip()
         remedy = "check that it runs, its address, and the password, whose file DENTINE__SERVER__DATABASE_PASSWORD_FILE names"
-        raise PlatformError(f"The database at {engine.url.host} does not let this server in ({reason}); {remedy}.") from problem
+        raise PlatformError(
+            f"The database at {engine.url.host} does not let this server in ({reason}); {remedy}."
+        ) from problem

@@ -25,7 +25,10 @@ class Preset(Record):
 def list_presets() -> list[Preset]:
     """All of them, by name; read once, as they belong to the package."""
     files = (file for file in resources.files(__name__).iterdir() if file.name.endswith(".toml"))
-    return sorted((Preset(name=file.name.removesuffix(".toml"), **tomllib.loads(file.read_text())) for file in files), key=lambda preset: preset.name)
+    return sorted(
+        (Preset(name=file.name.removesuffix(".toml"), **tomllib.loads(file.read_text())) for file in files),
+        key=lambda preset: preset.name,
+    )
 
 
 def find_preset(name: str) -> Preset:

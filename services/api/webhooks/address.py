@@ -42,11 +42,17 @@ class AddressPolicy:
             parts = httpx.URL(url)
             host = parts.raw_host.decode()
         except (httpx.InvalidURL, ValueError) as problem:
-            raise WebhookAddressError(f"The webhook's address is malformed ({problem}); give one such as https://example.org/hook.") from problem
+            raise WebhookAddressError(
+                f"The webhook's address is malformed ({problem}); give one such as https://example.org/hook."
+            ) from problem
         if parts.scheme not in {"https", "http"} or not _HOST.fullmatch(host) or not 0 < (parts.port or 443) < 2**16:
-            raise WebhookAddressError("The webhook's address must be an absolute https address, such as https://example.org/hook.")
+            raise WebhookAddressError(
+                "The webhook's address must be an absolute https address, such as https://example.org/hook."
+            )
         if parts.userinfo or parts.fragment:
-            raise WebhookAddressError("The webhook's address must not hold a login or a fragment; the signature tells the receiver who sends.")
+            raise WebhookAddressError(
+                "The webhook's address must not hold a login or a fragment; the signature tells the receiver who sends."
+            )
         if parts.scheme == "http" and not self.allow_private:
             raise WebhookAddressError("The webhook's address must be https.")
         if (literal := _literal(host)) is not None:
@@ -60,7 +66,9 @@ class AddressPolicy:
         """
         if not is_public(address):
             if not self.allow_private or address.is_multicast or address.is_unspecified:
-                raise WebhookAddressError(f"Webhooks may not go to {address}, which is no public address; set private_webhooks to allow private ones.")
+                raise WebhookAddressError(
+                    f"Webhooks may not go to {address}, which is no public address; set private_webhooks to allow private ones."
+                )
         elif scheme == "http":
             raise WebhookAddressError(f"A webhook to the public address {address} must be https.")
 
@@ -74,7 +82,9 @@ class AddressPolicy:
             ask = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
             found = await asyncio.get_running_loop().run_in_executor(_ASKERS, ask)
         except (OSError, UnicodeError) as problem:
-            raise WebhookAddressError(f"The webhook's host {host} cannot be resolved; correct the address.") from problem
+            raise WebhookAddressError(
+                f"The webhook's host {host} cannot be resolved; correct the address."
+            ) from problem
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
         for address in addresses:
             self.check_address(ipaddress.ip_address(address), scheme)

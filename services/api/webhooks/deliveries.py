@@ -41,7 +41,9 @@ class Delivery(Record):
     """One message to one webhook."""
 
     id: int
-    message: str = Field(description="header webhook-id: the same in every try, so that a receiver can tell a repetition")
+    message: str = Field(
+        description="header webhook-id: the same in every try, so that a receiver can tell a repetition"
+    )
     payload: dict[str, Any]
     created_s: float = Field(description="Unix time")
     state: DeliveryState
@@ -80,36 +82,57 @@ class Deliveries:
 
     def claim(self, now_s: float, busy: Collection[str], most: int) -> list[Claim]:
         """Take the oldest due delivery of each webhook that is not busy."""
-        is_due = (delivery_table.c.state == DeliveryState.PENDING, delivery_table.c.next_try_s <= now_s, delivery_table.c.webhook.not_in(busy))
-        oldest = sql.select(sql.func.min(delivery_table.c.id)).where(*is_due).group_by(delivery_table.c.webhook).limit(most)
+        is_due = (
+            delivery_table.c.state == DeliveryState.PENDING,
+            delivery_table.c.next_try_s <= now_s,
+            delivery_table.c.webhook.not_in(busy),
+        )
+        oldest = (
+            sql.select(sql.func.min(delivery_table.c.id)).where(*is_due).group_by(delivery_table.c.webhook).limit(most)
+        )
         with self._engine.connect() as connection:
             if not connection.scalars(oldest).all():
                 return []
         with writing(self._engine) as connection:
             ids = connection.scalars(oldest).all()
-            connection.execute(delivery_table.update().where(delivery_table.c.id.in_(ids)).values(next_try_s=now_s + CLAIM_S))
+            connection.execute(
+                delivery_table.update().where(delivery_table.c.id.in_(ids)).values(next_try_s=now_s + CLAIM_S)
+            )
             query = (
                 sql.select(delivery_table, webhook_table.c.url, webhook_table.c.secret)
                 .join_from(delivery_table, webhook_table, delivery_table.c.webhook == webhook_table.c.id)
                 .where(delivery_table.c.id.in_(ids))
             )
             names = ("webhook", "message", "payload", "url", "secret", "tries", "deadline_s")
-            return [Claim(delivery=row["id"], **{name: row[name] for name in names}) for row in connection.execute(query).mappings()]
+            return [
+                Claim(delivery=row["id"], **{name: row[name] for name in names})
+                for row in connection.execute(query).mappings()
+            ]
 
     def settle(self, claim: Claim, attempt: Attempt, retry_s: float, *, is_gone: bool = False) -> None:
         """Log a try; after a failed one plan the next in ``retry_s``, or give up. ``is_gone``: the receiver wants no more."""
         now_s = attempt.time_s + attempt.duration_s
         with writing(self._engine) as connection:
-            webhook = connection.execute(sql.select(webhook_table).where(webhook_table.c.id == claim.webhook)).mappings().first()
+            webhook = (
+                connection.execute(sql.select(webhook_table).where(webhook_table.c.id == claim.webhook))
+                .mappings()
+                .first()
+            )
             if webhook is None:
                 return  # deleted meanwhile, with its log
             connection.execute(attempt_table.insert().values(attempt.model_dump() | {"delivery": claim.delivery}))
             if attempt.error is None:
                 _update(connection, claim, state=DeliveryState.DELIVERED, next_try_s=None, tries=claim.tries + 1)
-                connection.execute(webhook_table.update().where(webhook_table.c.id == claim.webhook).values(failing_since_s=None))
+                connection.execute(
+                    webhook_table.update().where(webhook_table.c.id == claim.webhook).values(failing_since_s=None)
+                )
                 return
             failing_since_s = webhook["failing_since_s"] or attempt.time_s
-            connection.execute(webhook_table.update().where(webhook_table.c.id == claim.webhook).values(failing_since_s=failing_since_s))
+            connection.execute(
+                webhook_table.update()
+                .where(webhook_table.c.id == claim.webhook)
+                .values(failing_since_s=failing_since_s)
+            )
             again_s = now_s + retry_s
             is_last = again_s > claim.deadline_s or is_gone or not webhook["active"]
             state, next_try_s = (DeliveryState.GIVEN_UP, None) if is_last else (DeliveryState.PENDING, again_s)
@@ -131,7 +154,12 @@ class Deliveries:
         Raises:
             UnknownWebhookError: there is no such webhook.
         """
-        query = sql.select(delivery_table).where(delivery_table.c.webhook == webhook_id).order_by(delivery_table.c.id.desc()).limit(limit)
+        query = (
+            sql.select(delivery_table)
+            .where(delivery_table.c.webhook == webhook_id)
+            .order_by(delivery_table.c.id.desc())
+            .limit(limit)
+        )
         if before is not None:
             query = query.where(delivery_table.c.id < before)
         with self._engine.connect() as connection:
@@ -177,21 +205,30 @@ def _reason_to_stop(failing_s: float, *, is_gone: bool) -> str:
 
 def _forget(connection: sql.Connection, before_s: float) -> None:
     """Drop what was settled long ago."""
-    old = sql.select(delivery_table.c.id).where(delivery_table.c.created_s < before_s, delivery_table.c.next_try_s.is_(None))
+    old = sql.select(delivery_table.c.id).where(
+        delivery_table.c.created_s < before_s, delivery_table.c.next_try_s.is_(None)
+    )
     connection.execute(attempt_table.delete().where(attempt_table.c.delivery.in_(old)))
-    connection.execute(delivery_table.delete().where(delivery_table.c.created_s < before_s, delivery_table.c.next_try_s.is_(None)))
+    connection.execute(
+        delivery_table.delete().where(delivery_table.c.created_s < before_s, delivery_table.c.next_try_s.is_(None))
+    )
 
 
 def _find(connection: sql.Connection, webhook_id: str, delivery_id: int) -> Any:
     query = sql.select(delivery_table).where(delivery_table.c.webhook == webhook_id, delivery_table.c.id == delivery_id)
     row = connection.execute(query).mappings().first()
     if row is None:
-        raise UnknownWebhookError(f"Webhook {webhook_id} has no delivery {delivery_id}; list its deliveries to see their ids.")
+        raise UnknownWebhookError(
+            f"Webhook {webhook_id} has no delivery {delivery_id}; list its deliveries to see their ids."
+        )
     return row
 
 
 def _delivery(connection: sql.Connection, row: Any) -> Delivery:
     query = sql.select(attempt_table).where(attempt_table.c.delivery == row["id"]).order_by(attempt_table.c.id)
-    attempts = tuple(Attempt(**{name: tried[name] for name in Attempt.model_fields}) for tried in connection.execute(query).mappings())
+    attempts = tuple(
+        Attempt(**{name: tried[name] for name in Attempt.model_fields})
+        for tried in connection.execute(query).mappings()
+    )
     fields = {name: row[name] for name in ("id", "message", "created_s", "state", "next_try_s")}
     return Delivery(**fields, payload=json.loads(row["payload"]), attempts=attempts)

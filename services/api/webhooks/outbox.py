@@ -41,14 +41,23 @@ def collect_changes(connection: sql.Connection, now_s: float) -> int:
                     payload = _payload(event["job"], data, event["time_s"])
                     insert_delivery(connection, webhook["id"], f"evt_{event['id']}_{webhook['id']}", payload, now_s)
                     added += 1
-    if not connection.execute(cursor_table.update().where(cursor_table.c.reader == _READER).values(event=newest)).rowcount:
+    if not connection.execute(
+        cursor_table.update().where(cursor_table.c.reader == _READER).values(event=newest)
+    ).rowcount:
         connection.execute(cursor_table.insert().values(reader=_READER, event=newest))
     return added
 
 
 def insert_delivery(connection: sql.Connection, webhook_id: str, message: str, payload: str, now_s: float) -> int:
     """Queue a message; returns the delivery's id."""
-    row = {"webhook": webhook_id, "message": message, "payload": payload, "created_s": now_s, "state": DeliveryState.PENDING, "tries": 0}
+    row = {
+        "webhook": webhook_id,
+        "message": message,
+        "payload": payload,
+        "created_s": now_s,
+        "state": DeliveryState.PENDING,
+        "tries": 0,
+    }
     row |= {"next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
     return connection.execute(delivery_table.insert().values(row).returning(delivery_table.c.id)).scalar_one()
 
@@ -69,7 +78,12 @@ def _payload(job: str, data: dict[str, Any], time_s: float) -> str:
 
 
 def _changes(connection: sql.Connection, after: int, limit: int) -> Any:
-    query = sql.select(event_table).where(event_table.c.id > after, event_table.c.kind == "state").order_by(event_table.c.id).limit(limit)
+    query = (
+        sql.select(event_table)
+        .where(event_table.c.id > after, event_table.c.kind == "state")
+        .order_by(event_table.c.id)
+        .limit(limit)
+    )
     return connection.execute(query).mappings().all()
 
 

@@ -26,7 +26,13 @@ class DeliveryPage(Record):
 
 def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRouter:
     """Routes over the given subscriptions and their log."""
-    router = APIRouter(prefix="/v1/webhooks", route_class=BodyRoute, tags=["webhooks"], responses=refusals(404, 409, 422), dependencies=[needs("admin")])
+    router = APIRouter(
+        prefix="/v1/webhooks",
+        route_class=BodyRoute,
+        tags=["webhooks"],
+        responses=refusals(404, 409, 422),
+        dependencies=[needs("admin")],
+    )
 
     @router.post("", status_code=201)
     def create(wanted: Sent[WebhookRequest], response: Response) -> NewWebhook:
@@ -61,7 +67,11 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
         return deliveries.test(webhook_id, time.time())
 
     @router.get("/{webhook_id}/deliveries")
-    def log(webhook_id: str, limit: Annotated[int, Query(ge=1, le=100)] = 50, before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None) -> DeliveryPage:
+    def log(
+        webhook_id: str,
+        limit: Annotated[int, Query(ge=1, le=100)] = 50,
+        before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None,
+    ) -> DeliveryPage:
         """The webhook's deliveries with every try, newest first."""
         found = deliveries.page(webhook_id, limit + 1, before)
         return DeliveryPage(deliveries=found[:limit], next_before=found[limit - 1].id if len(found) > limit else None)

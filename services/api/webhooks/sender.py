@@ -68,19 +68,30 @@ class WebhookSender:
     async def run(self) -> None:
         """Send until cancelled. What is on its way then falls due again when its claim ends."""
         sending: dict[str, asyncio.Task[None]] = {}
-        limits = httpx.Limits(max_keepalive_connections=0)  # a kept connection to one host would serve another at the same address
-        timeout, verify = httpx.Timeout(self._total_s, connect=CONNECT_S), self._tls or httpx.create_ssl_context(trust_env=False)
-        async with httpx.AsyncClient(verify=verify, trust_env=False, follow_redirects=False, timeout=timeout, limits=limits) as http:
+        limits = httpx.Limits(
+            max_keepalive_connections=0
+        )  # a kept connection to one host would serve another at the same address
+        timeout, verify = (
+            httpx.Timeout(self._total_s, connect=CONNECT_S),
+            self._tls or httpx.create_ssl_context(trust_env=False),
+        )
+        async with httpx.AsyncClient(
+            verify=verify, trust_env=False, follow_redirects=False, timeout=timeout, limits=limits
+        ) as http:
             try:
                 while True:
                     sending = {webhook: task for webhook, task in sending.items() if not task.done()}
                     try:
                         await in_thread(self._deliveries.collect, self._clock())
                         most = MAX_AT_ONCE - len(sending)
-                        for claim in await in_thread(self._deliveries.claim, self._clock(), tuple(sending), most) if most else ():
+                        for claim in (
+                            await in_thread(self._deliveries.claim, self._clock(), tuple(sending), most) if most else ()
+                        ):
                             sending[claim.webhook] = asyncio.create_task(self._deliver(http, claim))
                     except sql.exc.SQLAlchemyError as problem:
-                        logging.getLogger(__name__).warning("Webhooks wait for the database: %s", problem.__class__.__name__)
+                        logging.getLogger(__name__).warning(
+                            "Webhooks wait for the database: %s", problem.__class__.__name__
+                        )
                     await asyncio.sleep(self._period_s)
             finally:
                 for task in sending.values():
@@ -105,7 +116,9 @@ class WebhookSender:
         try:
             await in_thread(self._deliveries.settle, claim, attempt, wait_s, is_gone=status == 410)
         except sql.exc.SQLAlchemyError as problem:
-            logging.getLogger(__name__).warning("A webhook's delivery could not be logged: %s", type(problem).__name__, extra={"webhook": claim.webhook})
+            logging.getLogger(__name__).warning(
+                "A webhook's delivery could not be logged: %s", type(problem).__name__, extra={"webhook": claim.webhook}
+            )
 
     async def _post(self, http: httpx.AsyncClient, claim: Claim) -> int:
         """Connect to a checked address under the name that the certificate must prove; the answer's body is not read."""
@@ -122,7 +135,13 @@ class WebhookSender:
         }
         unreached = httpx.ConnectError("no address")
         for address in await self._policy.resolve(host, port, url.scheme):
-            request = http.build_request("POST", url.copy_with(host=address), content=claim.payload, headers=headers, extensions={"sni_hostname": host})
+            request = http.build_request(
+                "POST",
+                url.copy_with(host=address),
+                content=claim.payload,
+                headers=headers,
+                extensions={"sni_hostname": host},
+            )
             try:
                 response = await http.send(request, stream=True)
             except (httpx.ConnectError, httpx.ConnectTimeout) as problem:

@@ -26,9 +26,21 @@ _SECRET_BYTES = 32
 
 States = Annotated[
     tuple[JobState, ...],
-    Field(min_length=1, max_length=len(JobState), fail_fast=True, description="states of a job to tell of when it enters them"),
+    Field(
+        min_length=1,
+        max_length=len(JobState),
+        fail_fast=True,
+        description="states of a job to tell of when it enters them",
+    ),
 ]
-Url = Annotated[str, Field(min_length=1, max_length=2000, description="where to POST; https, and no private address unless the server's settings allow it")]
+Url = Annotated[
+    str,
+    Field(
+        min_length=1,
+        max_length=2000,
+        description="where to POST; https, and no private address unless the server's settings allow it",
+    ),
+]
 
 ENDED = tuple(state for state in JobState if state.is_final)
 
@@ -45,7 +57,9 @@ class WebhookChange(Record):
 
     url: Url | None = None
     states: States | None = None
-    active: bool | None = Field(default=None, description="false gives up what is pending; true forgets earlier failures")
+    active: bool | None = Field(
+        default=None, description="false gives up what is pending; true forgets earlier failures"
+    )
 
 
 class Webhook(Record):
@@ -84,7 +98,13 @@ class Webhooks:
             if (connection.scalar(sql.select(sql.func.count()).select_from(webhook_table)) or 0) >= MAX_WEBHOOKS:
                 raise JobStateError(f"There are {MAX_WEBHOOKS} webhooks already; delete one first.")
             newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
-            row = {"id": f"wh_{secrets.token_hex(8)}", "url": request.url, "states": _states(request.states), "secret": secret, "created_s": time.time()}
+            row = {
+                "id": f"wh_{secrets.token_hex(8)}",
+                "url": request.url,
+                "states": _states(request.states),
+                "secret": secret,
+                "created_s": time.time(),
+            }
             row |= {"active": True, "after_event": newest, "failing_since_s": None, "note": ""}
             connection.execute(webhook_table.insert().values(row))
         return NewWebhook(**_fields(row), secret=secret)
@@ -92,7 +112,10 @@ class Webhooks:
     def list(self) -> list[Webhook]:
         """All subscriptions, oldest first."""
         with self._engine.connect() as connection:
-            return [Webhook(**_fields(row)) for row in connection.execute(sql.select(webhook_table).order_by(webhook_table.c.created_s)).mappings()]
+            return [
+                Webhook(**_fields(row))
+                for row in connection.execute(sql.select(webhook_table).order_by(webhook_table.c.created_s)).mappings()
+            ]
 
     def get(self, webhook_id: str) -> Webhook:
         """One subscription.
@@ -155,7 +178,9 @@ def find_webhook(connection: sql.Connection, webhook_id: str) -> Any:
 def switch_off(connection: sql.Connection, webhook_id: str, note: str) -> None:
     """Make a subscription inactive and give up what is pending for it."""
     connection.execute(webhook_table.update().where(webhook_table.c.id == webhook_id).values(active=False, note=note))
-    pending = delivery_table.update().where(delivery_table.c.webhook == webhook_id, delivery_table.c.state == DeliveryState.PENDING)
+    pending = delivery_table.update().where(
+        delivery_table.c.webhook == webhook_id, delivery_table.c.state == DeliveryState.PENDING
+    )
     connection.execute(pending.values(state=DeliveryState.GIVEN_UP, next_try_s=None))
 
 

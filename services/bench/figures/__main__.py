@@ -15,7 +15,15 @@ from types import MappingProxyType
 
 from services.bench.figures.ambient import under_ambient_light
 from services.bench.figures.cast import FULL, QUICK, Cast
-from services.bench.figures.drawings import Drawn, caption_page, five_lights, front_and_side, stages, unseen_camera, whole_jaw
+from services.bench.figures.drawings import (
+    Drawn,
+    caption_page,
+    five_lights,
+    front_and_side,
+    stages,
+    unseen_camera,
+    whole_jaw,
+)
 from services.bench.figures.environment import memorial, under_an_environment
 from services.bench.fits.tooth_capture import real_tooth
 from services.core.errors import DentineError, InputError
@@ -58,23 +66,37 @@ def keep(folder: Path, name: str, drawn: Drawn) -> None:
     """Write a figure and its caption, and the page of all that are there."""
     write_atomic(folder / f"{name}.png", png_bytes(drawn.picture))
     write_atomic(folder / f"{name}.txt", (drawn.caption + "\n").encode())
-    present = [(one, (folder / f"{one}.txt").read_text().strip()) for one in FIGURES if (folder / f"{one}.txt").is_file()]
+    present = [
+        (one, (folder / f"{one}.txt").read_text().strip()) for one in FIGURES if (folder / f"{one}.txt").is_file()
+    ]
     write_atomic(folder / "index.html", caption_page(present).encode())
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Make figures; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m services.bench.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m services.bench.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0]
+    )
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the figures (default: figures)")
     parser.add_argument("--only", metavar="NAMES", help=f"some of {', '.join(FIGURES)}, with commas (default: all)")
-    parser.add_argument("--quick", action="store_true", help="smaller captures of the procedural incisor and fits of few samples, for a check")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="smaller captures of the procedural incisor and fits of few samples, for a check",
+    )
     options = parser.parse_args(arguments)
     try:
-        names, cast = chosen_figures(options.only), Cast(QUICK if options.quick else FULL, options.out / "work", None if options.quick else real_tooth())
+        names, cast = (
+            chosen_figures(options.only),
+            Cast(QUICK if options.quick else FULL, options.out / "work", None if options.quick else real_tooth()),
+        )
         cast.work.mkdir(parents=True, exist_ok=True)
         for name in names:
             if name == "environment" and memorial() is None:
-                print("environment: skipped, because hdr-memorial does not lie in shared/data beside the checkout.", flush=True)
+                print(
+                    "environment: skipped, because hdr-memorial does not lie in shared/data beside the checkout.",
+                    flush=True,
+                )
                 continue
             keep(options.out, name, FIGURES[name](cast))
             print(options.out / f"{name}.png", flush=True)

@@ -24,7 +24,9 @@ from services.phantom.reflection import ROUGHNESS
 
 CHANNEL = "green"
 AMBIENT_SAMPLES = 256
-QUANTITIES = tuple(f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "absorption_share"))
+QUANTITIES = tuple(
+    f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "absorption_share")
+)
 """Reduced scattering, per mm, and 1 - alpha'."""
 
 Row = dict[str, Any]
@@ -51,7 +53,11 @@ def ambient_rows(cast: Cast) -> list[Row]:
     media = json.loads((source / "truth.json").read_text())["channels"][CHANNEL]
     rows = []
     for fraction in cast.effort.ambient:
-        folder = case.fitted_with(cast.work, _added(source, case, fraction), f"-ambient-{fraction:g}") if fraction else case.fitted(cast.work)
+        folder = (
+            case.fitted_with(cast.work, _added(source, case, fraction), f"-ambient-{fraction:g}")
+            if fraction
+            else case.fitted(cast.work)
+        )
         rows.append({"fraction": fraction} | described(Fitted(folder).report, media))
     return rows
 
@@ -66,21 +72,39 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
         tissue = tissue_of({f"{part}.{leaf}": value for part in media for leaf, value in media[part].items()})
         (tooth,) = (source / "teeth").iterdir()
         surfaces = {path.stem: read_mesh(path) for path in sorted(tooth.glob("*.ply"))}
-        options = {"samples": AMBIENT_SAMPLES, "boundary": truth["boundary"], "ior": truth["ior"], "roughness": ROUGHNESS}
+        options = {
+            "samples": AMBIENT_SAMPLES,
+            "boundary": truth["boundary"],
+            "ior": truth["ior"],
+            "roughness": ROUGHNESS,
+        }
         constant = {"type": "constant", "radiance": 1.0}
-        around = {c.name: seen_under(constant, surfaces, tissue, c, **options) for c in description.cameras if c.name in case.cameras}
+        around = {
+            c.name: seen_under(constant, surfaces, tissue, c, **options)
+            for c in description.cameras
+            if c.name in case.cameras
+        }
         np.savez(kept, allow_pickle=False, **around)
     channel = description.channels.index(CHANNEL)
-    fitted = [np.load(source / image.file)[..., channel] for image in description.images if case.is_fitted(image.camera, image.light)]
+    fitted = [
+        np.load(source / image.file)[..., channel]
+        for image in description.images
+        if case.is_fitted(image.camera, image.light)
+    ]
     mean = float(np.concatenate([image[image > 0] for image in fitted]).mean())
     with np.load(kept) as stored:
         # The surroundings themselves are seen beside the tooth and are masked in a capture.
-        on_tooth = {camera: np.where(_tooth_pixels(source, description, camera), stored[camera], 0.0) for camera in stored.files}
+        on_tooth = {
+            camera: np.where(_tooth_pixels(source, description, camera), stored[camera], 0.0) for camera in stored.files
+        }
     return {camera: fraction * mean * image / image[image > 0].mean() for camera, image in on_tooth.items()}
 
 
 def _tooth_pixels(source: Path, description: FolderCapture, camera: str) -> NDArray[np.bool_]:
-    return np.any([np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera], axis=0)
+    return np.any(
+        [np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera],
+        axis=0,
+    )
 
 
 def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Row:
@@ -119,8 +143,12 @@ def table(rows: Sequence[Row]) -> str:
     head = "| ambient light | σs' enamel, per mm | 1 − α' enamel | σs' dentin, per mm | 1 − α' dentin | fit | held out |\n|---|---|---|---|---|---|---|\n"
     lines = ["| truth | " + " | ".join(f"{rows[0][quantity]['truth']:.3g}" for quantity in QUANTITIES) + " | | |"]
     for row in rows:
-        found = " | ".join(f"{row[q]['value']:.3g}" + ("" if row[q]["se"] is None else f" ± {row[q]['se']:.1g}") for q in QUANTITIES)
-        lines.append(f"| {100 * row['fraction']:.0f} % | {found} | {100 * row['fit_error']:.1f} % | {100 * row['held_out_error']:.1f} % |")
+        found = " | ".join(
+            f"{row[q]['value']:.3g}" + ("" if row[q]["se"] is None else f" ± {row[q]['se']:.1g}") for q in QUANTITIES
+        )
+        lines.append(
+            f"| {100 * row['fraction']:.0f} % | {found} | {100 * row['fit_error']:.1f} % | {100 * row['held_out_error']:.1f} % |"
+        )
     return head + "\n".join(lines) + "\n"
 
 
@@ -134,10 +162,16 @@ def plot(rows: Sequence[Row]) -> NDArray[np.uint8]:
     for one, leaf in zip(axes, ("sigma_s_reduced", "absorption_share"), strict=True):
         for part in ("enamel", "dentin"):
             found = [row[f"{part}.{leaf}"] for row in rows]
-            values, errors = (np.array([(point[key] or 0.0) / point["truth"] for point in found]) for key in ("value", "se"))
+            values, errors = (
+                np.array([(point[key] or 0.0) / point["truth"] for point in found]) for key in ("value", "se")
+            )
             one.errorbar([100 * row["fraction"] for row in rows], values, errors, marker="o", capsize=3, label=part)
         one.axhline(1.0, color="0.6", linewidth=1)
-        one.set(title="σs'" if leaf == "sigma_s_reduced" else "1 − α'", xlabel="ambient light, % of the mean radiance", ylabel="found over true")
+        one.set(
+            title="σs'" if leaf == "sigma_s_reduced" else "1 − α'",
+            xlabel="ambient light, % of the mean radiance",
+            ylabel="found over true",
+        )
         one.legend()
     stream = io.BytesIO()
     write_png(figure, stream)

@@ -99,12 +99,19 @@ def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str
         InputError: the case names a camera or light that the capture lacks, or nothing is left to fit.
     """
     description = read_record(source / "capture.json", FolderCapture)
-    for kind, wanted, known in (("camera", case.cameras, description.cameras), ("light", case.fitted_lights, description.lights)):
+    for kind, wanted, known in (
+        ("camera", case.cameras, description.cameras),
+        ("light", case.fitted_lights, description.lights),
+    ):
         for name in wanted:
             if name not in {one.name for one in known}:
-                raise InputError(f"Figure's fit {case.name} names {kind} {name}, which its capture does not have; it has {len(known)}.")
+                raise InputError(
+                    f"Figure's fit {case.name} names {kind} {name}, which its capture does not have; it has {len(known)}."
+                )
     images = [
-        image.model_copy(update={"held_out": not case.is_fitted(image.camera, image.light)}) for image in description.images if image.camera in case.cameras
+        image.model_copy(update={"held_out": not case.is_fitted(image.camera, image.light)})
+        for image in description.images
+        if image.camera in case.cameras
     ]
     if all(image.held_out for image in images):
         raise InputError(f"Figure's fit {case.name} holds every image out; name cameras and lights to fit.")
@@ -135,4 +142,6 @@ def run_dentine(*arguments: str) -> None:
     """
     done = subprocess.run([sys.executable, "-m", "services", *arguments], check=False)  # noqa: S603 - our own command
     if done.returncode:
-        raise InputError(f"dentine {arguments[0]} ended with status {done.returncode} for a reason given above; remove that, and run this again.")
+        raise InputError(
+            f"dentine {arguments[0]} ended with status {done.returncode} for a reason given above; remove that, and run this again."
+        )

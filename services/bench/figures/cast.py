@@ -83,14 +83,33 @@ class Cast:
             description = read_record(self.scan / "capture.json", FolderCapture)
             towards = np.mean([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in description.cameras], axis=0)
             (tooth,) = (self.scan / "teeth").iterdir()
-            for name, mesh in tooth_surfaces(tooth / "outer.ply", tooth / "dentin.ply", tuple(towards.tolist())).items():
+            for name, mesh in tooth_surfaces(
+                tooth / "outer.ply", tooth / "dentin.ply", tuple(towards.tolist())
+            ).items():
                 write_mesh(files[name], mesh)
         return {name: str(file) for name, file in files.items()}
 
-    def _isolated(self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], channels: int = 1) -> Case:
+    def _isolated(
+        self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], channels: int = 1
+    ) -> Case:
         # A fit of an isolated tooth with known dentin, three cameras and eighteen lights.
-        capture = self._phantom(f"tooth{channels}", self.effort.tooth_mm, self.effort.photo_samples, cameras=3, lights=18, channels=channels, **self._incisor())
-        return Case(name, capture, cameras, fitted, lights, {"dentin": "known", "pixel_step": self.effort.step} | dict(self.effort.tooth_job))
+        capture = self._phantom(
+            f"tooth{channels}",
+            self.effort.tooth_mm,
+            self.effort.photo_samples,
+            cameras=3,
+            lights=18,
+            channels=channels,
+            **self._incisor(),
+        )
+        return Case(
+            name,
+            capture,
+            cameras,
+            fitted,
+            lights,
+            {"dentin": "known", "pixel_step": self.effort.step} | dict(self.effort.tooth_job),
+        )
 
     @property
     def front(self) -> Case:
@@ -111,7 +130,9 @@ class Cast:
     @property
     def stained(self) -> Case:
         """A stained incisor."""
-        capture = self._phantom("stained", self.effort.tooth_mm, 2 * self.effort.photo_samples, cameras=2, lights=12, stains=True, seed=4)
+        capture = self._phantom(
+            "stained", self.effort.tooth_mm, 2 * self.effort.photo_samples, cameras=2, lights=12, stains=True, seed=4
+        )
         options = {"dentin": "known", "pixel_step": self.effort.step, "stains": True} | dict(self.effort.tooth_job)
         return Case("stained", capture, ("c0", "c1"), ("c0", "c1"), SPREAD_LIGHTS, options)
 
@@ -119,12 +140,29 @@ class Cast:
     def lone_view(self) -> Case:
         """The procedural incisor from one side, nine lights of twelve fitted: small, for what takes many fits."""
         capture = self._phantom("lone-view", self.effort.lone_mm, 2 * self.effort.photo_samples, cameras=1, lights=12)
-        return Case("lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job))
+        return Case(
+            "lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job)
+        )
 
     def jaw(self, subject: int, fitted: tuple[str, ...] = ("c0", "c1", "c2")) -> Case:
         """A whole jaw of a random subject."""
-        capture = self._phantom(f"jaw{subject}", self.effort.jaw_mm, self.effort.jaw_photo_samples, cameras=3, lights=6, jaw=True, subject=subject)
-        return Case(f"jaw{subject}", capture, ("c0", "c1", "c2"), fitted, JAW_LIGHTS, {"kind": "jaw", "dentin": "known"} | dict(self.effort.jaw_job))
+        capture = self._phantom(
+            f"jaw{subject}",
+            self.effort.jaw_mm,
+            self.effort.jaw_photo_samples,
+            cameras=3,
+            lights=6,
+            jaw=True,
+            subject=subject,
+        )
+        return Case(
+            f"jaw{subject}",
+            capture,
+            ("c0", "c1", "c2"),
+            fitted,
+            JAW_LIGHTS,
+            {"kind": "jaw", "dentin": "known"} | dict(self.effort.jaw_job),
+        )
 
     @staticmethod
     def _phantom(name: str, pixel_mm: float, samples: int, **options: Any) -> Capture:

@@ -30,9 +30,14 @@ def front_and_side(cast: Cast) -> Drawn:
     """Fig. 8: nine front lights fitted; a side view and nine side lights were not."""
     comparisons = Fitted(cast.front.fitted(cast.work)).compared(cast.effort.shown_samples)
     groups = [("c1", FRONT_LIGHTS), ("c2", FRONT_LIGHTS), ("c1", SIDE_LIGHTS)]
-    rows = [[drawn for camera, lights in groups for drawn in _drawn(comparisons, (camera, lights[n]))] for n in range(len(FRONT_LIGHTS))]
+    rows = [
+        [drawn for camera, lights in groups for drawn in _drawn(comparisons, (camera, lights[n]))]
+        for n in range(len(FRONT_LIGHTS))
+    ]
     columns = [
-        column for name in ("front view", "side view", "side lights") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+        column
+        for name in ("front view", "side view", "side lights")
+        for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
     ]
     errors = [error_of(comparisons, [(camera, light) for light in lights]) for camera, lights in groups]
     return Drawn(
@@ -49,7 +54,11 @@ def stages(cast: Cast) -> Drawn:
     homogeneous = similar_tissue(fitted.stage_tissue(channel, "homogeneous"), SIMILAR_G)
     found = [
         fitted.compared(cast.effort.shown_samples, optics)
-        for optics in ({channel: homogeneous}, {channel: fitted.stage_tissue(channel, "exact")}, {channel: fitted.optics(channel)})
+        for optics in (
+            {channel: homogeneous},
+            {channel: fitted.stage_tissue(channel, "exact")},
+            {channel: fitted.optics(channel)},
+        )
     ]
     names = ("homogeneous", "both media", "with stains")
     shown = [("c0", "l0"), ("c1", "l1"), ("c0", "l6"), ("c1", "l3")]
@@ -60,13 +69,21 @@ def stages(cast: Cast) -> Drawn:
         white = white_level(photo, valid)
         drawn = [tone_map(np.where(valid[..., None], picture.render, 0.0), white) for picture in pictures]
         rows.append(
-            [*drawn, tone_map(np.where(valid[..., None], photo, 0.0), white), *(signed_map(p.residual, RESIDUAL_LIMIT * white, valid) for p in pictures)]
+            [
+                *drawn,
+                tone_map(np.where(valid[..., None], photo, 0.0), white),
+                *(signed_map(p.residual, RESIDUAL_LIMIT * white, valid) for p in pictures),
+            ]
         )
     images = [(camera, light) for camera in ("c0", "c1") for light in SPREAD_LIGHTS]
     others = [image for image in found[0] if image not in images]
     losses = [loss_of(one, images) for one in found]
     heads = [f"{name}: {loss:.3f}" for name, loss in zip(names, losses, strict=True)]
-    columns = [*(Column(head) for head in heads), Column("photograph", starts_group=True), *(Column(name, name == names[0]) for name in names)]
+    columns = [
+        *(Column(head) for head in heads),
+        Column("photograph", starts_group=True),
+        *(Column(name, name == names[0]) for name in names),
+    ]
     unseen = ", ".join(_percent(error_of(one, others)) for one in found)
     return Drawn(
         mosaic(rows, columns, [f"{camera} {light}" for camera, light in shown], scale=4),
@@ -78,13 +95,24 @@ def stages(cast: Cast) -> Drawn:
 
 def five_lights(cast: Cast) -> Drawn:
     """Fig. 10: three cameras and five lights fitted, five lights unseen."""
-    comparisons, cameras = Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples), ("c0", "c1", "c2")
+    comparisons, cameras = (
+        Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples),
+        ("c0", "c1", "c2"),
+    )
     rows = [
-        [drawn for lights in (FIVE_LIGHTS, FIVE_OTHERS) for camera in cameras for drawn in _drawn(comparisons, (camera, lights[n]), difference=False)]
+        [
+            drawn
+            for lights in (FIVE_LIGHTS, FIVE_OTHERS)
+            for camera in cameras
+            for drawn in _drawn(comparisons, (camera, lights[n]), difference=False)
+        ]
         for n in range(len(FIVE_LIGHTS))
     ]
     columns = [Column(name, name == "photo") for _ in range(2 * len(cameras)) for name in ("photo", "fit")]
-    fit, unseen = (error_of(comparisons, [(camera, light) for camera in cameras for light in lights]) for lights in (FIVE_LIGHTS, FIVE_OTHERS))
+    fit, unseen = (
+        error_of(comparisons, [(camera, light) for camera in cameras for light in lights])
+        for lights in (FIVE_LIGHTS, FIVE_OTHERS)
+    )
     return Drawn(
         mosaic(rows, columns, scale=2),
         f"One tooth in colour ({cast.tooth_name}, dentin known), fitted to three cameras under five lights (left half): error {_percent(fit)}; "
@@ -95,11 +123,19 @@ def five_lights(cast: Cast) -> Drawn:
 def unseen_camera(cast: Cast) -> Drawn:
     """Fig. 13: two cameras fitted, the third is shown."""
     comparisons = Fitted(cast.two_cameras.fitted(cast.work)).compared(cast.effort.shown_samples)
-    rows = [[drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))] for light in FIVE_LIGHTS]
-    columns = [
-        column for name in ("c0, not fitted", "c1, fitted", "c2, fitted") for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+    rows = [
+        [drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))]
+        for light in FIVE_LIGHTS
     ]
-    seen, unseen = (error_of(comparisons, [(camera, light) for camera in cameras for light in FIVE_LIGHTS]) for cameras in (("c1", "c2"), ("c0",)))
+    columns = [
+        column
+        for name in ("c0, not fitted", "c1, fitted", "c2, fitted")
+        for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
+    ]
+    seen, unseen = (
+        error_of(comparisons, [(camera, light) for camera in cameras for light in FIVE_LIGHTS])
+        for cameras in (("c1", "c2"), ("c0",))
+    )
     return Drawn(
         mosaic(rows, columns, FIVE_LIGHTS, scale=3),
         f"Two cameras fitted (c1 and c2, five lights; {cast.tooth_name}, dentin known), the third (c0, left) was not: error {_percent(seen)} on the fitted "

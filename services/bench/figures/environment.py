@@ -37,7 +37,9 @@ def under_an_environment(cast: Cast) -> Drawn:
     fitted = Fitted(cast.five_lights.fitted(cast.work))
     environment = read_environment(memorial() or MEMORIAL)
     (tooth,), (dentin,) = fitted.observations.teeth, fitted.dentins()
-    surfaces = {"outer": tooth.outer} | ({} if dentin is None else {"dentin": Mesh(dentin.vertices_mm(fitted.report.shape), dentin.base.faces)})
+    surfaces = {"outer": tooth.outer} | (
+        {} if dentin is None else {"dentin": Mesh(dentin.vertices_mm(fitted.report.shape), dentin.base.faces)}
+    )
     camera = finer(fitted.observations.manifest.cameras[1], cast.effort.environment_px)
     rows = []
     for roughness in (None, ROUGHNESS):
@@ -47,7 +49,12 @@ def under_an_environment(cast: Cast) -> Drawn:
             for k, channel in enumerate(fitted.channels):
                 tissue = fitted.optics(channel)
                 assert isinstance(tissue, Tissue)
-                options = {"samples": cast.effort.environment_samples, "boundary": fitted.spec.boundary, "ior": fitted.spec.ior, "roughness": roughness}
+                options = {
+                    "samples": cast.effort.environment_samples,
+                    "boundary": fitted.spec.boundary,
+                    "ior": fitted.spec.ior,
+                    "roughness": roughness,
+                }
                 light = environment_light(environment[..., k], turn)
                 channels.append(seen_under(light, surfaces, similar_tissue(tissue, SIMILAR_G), camera, **options))  # type: ignore[arg-type]
             images.append(np.stack(channels, axis=-1))

@@ -78,7 +78,11 @@ class Fitted:
     def observations(self) -> Observations:
         """What it saw, a jaw's teeth with the dentin that was assumed."""
         found = read_observations(job_of(self.folder)[0], self.spec)
-        return found if self.spec.kind == "tooth" else replace(found, teeth=fitted_teeth(found.folder, found.manifest, self.spec, self.report))
+        return (
+            found
+            if self.spec.kind == "tooth"
+            else replace(found, teeth=fitted_teeth(found.folder, found.manifest, self.spec, self.report))
+        )
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -96,7 +100,12 @@ class Fitted:
     def stage_tissue(self, channel: str, stage: str) -> Tissue:
         """A tooth's media as a stage ended."""
         history = json.loads((self._stage[0] / "history.json").read_text())
-        return replace(tissue_of([step for step in history if (step["channel"], step["stage"]) == (channel, stage)][-1]["parameters"]), shape=self.report.shape)
+        return replace(
+            tissue_of(
+                [step for step in history if (step["channel"], step["stage"]) == (channel, stage)][-1]["parameters"]
+            ),
+            shape=self.report.shape,
+        )
 
     def dentins(self) -> list[DentinShape | None]:
         """Of each tooth."""
@@ -108,9 +117,15 @@ class Fitted:
     def renderer(self, channel: str) -> Engine:
         """The scene under all lights."""
         stains = kept_stains(self._stage[0])
-        return Engine(channel_scene(self.observations, channel, self.dentins(), self.spec, None if stains is None else stains.corners_uv))
+        return Engine(
+            channel_scene(
+                self.observations, channel, self.dentins(), self.spec, None if stains is None else stains.corners_uv
+            )
+        )
 
-    def compared(self, samples: int, optics: Mapping[str, Tissue | Mouth] | None = None, cameras: tuple[str, ...] | None = None) -> dict[Image, Comparison]:
+    def compared(
+        self, samples: int, optics: Mapping[str, Tissue | Mouth] | None = None, cameras: tuple[str, ...] | None = None
+    ) -> dict[Image, Comparison]:
         """Every image of some cameras under all lights beside its photograph.
 
         Args:
@@ -118,22 +133,40 @@ class Fitted:
             optics: by channel, instead of what was reported.
             cameras: default all.
         """
-        channels = [self._channel(channel, samples, self.optics(channel) if optics is None else optics[channel], cameras) for channel in self.channels]
+        channels = [
+            self._channel(channel, samples, self.optics(channel) if optics is None else optics[channel], cameras)
+            for channel in self.channels
+        ]
         return {image: _merged([found[image] for found in channels]) for image in channels[0]}
 
-    def _channel(self, channel: str, samples: int, optics: Tissue | Mouth, cameras: tuple[str, ...] | None) -> dict[Image, Comparison]:
+    def _channel(
+        self, channel: str, samples: int, optics: Tissue | Mouth, cameras: tuple[str, ...] | None
+    ) -> dict[Image, Comparison]:
         engine, found = self.renderer(channel), {}
         for number, view in enumerate(read_channel(self.observations, channel, self.spec)):
             if cameras is None or view.camera.name in cameras:
-                first, second = (engine.images(optics, View(view.camera, view.pixels), samples=samples, seed=7001 + 2 * number + k).mean for k in range(2))
+                first, second = (
+                    engine.images(
+                        optics, View(view.camera, view.pixels), samples=samples, seed=7001 + 2 * number + k
+                    ).mean
+                    for k in range(2)
+                )
                 for light, record in enumerate(self.observations.manifest.lights):
-                    found[view.camera.name, record.name] = _comparison(view, record.name, light, first[light], second[light])
+                    found[view.camera.name, record.name] = _comparison(
+                        view, record.name, light, first[light], second[light]
+                    )
         return found
 
 
-def _comparison(view: ViewStack, name: str, light: int, first: NDArray[np.float64], second: NDArray[np.float64]) -> Comparison:
+def _comparison(
+    view: ViewStack, name: str, light: int, first: NDArray[np.float64], second: NDArray[np.float64]
+) -> Comparison:
     width, height = view.camera.size
-    photo, render, valid = np.zeros((height, width, 1)), np.zeros((height, width, 1)), np.zeros((height, width), dtype=bool)
+    photo, render, valid = (
+        np.zeros((height, width, 1)),
+        np.zeros((height, width, 1)),
+        np.zeros((height, width), dtype=bool),
+    )
     x, y = view.pixels.T
     photo[y, x, 0], render[y, x, 0], valid[y, x] = view.reference[light], 0.5 * (first + second), view.valid[light]
     sums = error_sums(first, second, view.reference[light], view.variance[light], view.valid[light])
@@ -143,6 +176,10 @@ def _comparison(view: ViewStack, name: str, light: int, first: NDArray[np.float6
 def _merged(channels: list[Comparison]) -> Comparison:
     # One picture of all channels.
     pictures = [one.picture for one in channels]
-    photo, render = (np.concatenate([getattr(picture, name) for picture in pictures], axis=-1) for name in ("photo", "render"))
+    photo, render = (
+        np.concatenate([getattr(picture, name) for picture in pictures], axis=-1) for name in ("photo", "render")
+    )
     valid = np.all([picture.valid for picture in pictures], axis=0)
-    return Comparison(replace(pictures[0], photo=photo, render=render, valid=valid), sum((one.sums for one in channels), ErrorSums()))
+    return Comparison(
+        replace(pictures[0], photo=photo, render=render, valid=valid), sum((one.sums for one in channels), ErrorSums())
+    )

@@ -75,7 +75,9 @@ VIEWS = {
 def procedural_sky(height: int = 32) -> Image:
     """An environment (H, 2 H, 3) for who has none: bright overhead, warm at the horizon, dim below."""
     up = np.cos(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
-    zenith, horizon, ground = (np.array(colour) for colour in ((0.55, 0.65, 0.80), (0.75, 0.70, 0.64), (0.16, 0.15, 0.14)))
+    zenith, horizon, ground = (
+        np.array(colour) for colour in ((0.55, 0.65, 0.80), (0.75, 0.70, 0.64), (0.16, 0.15, 0.14))
+    )
     column = np.where(up > 0, horizon + (zenith - horizon) * np.sqrt(np.maximum(up, 0)), ground)
     return np.broadcast_to(column, (height, 2 * height, 3)).copy()
 
@@ -91,7 +93,11 @@ def gallery_scene(view: GalleryView, tooth: Path, environment: Path | None, size
     place = mi.ScalarTransform4f
     if environment is not None and not environment.is_file():
         raise InputError(f"Environment image {environment} does not exist; give an equirectangular EXR or HDR file.")
-    picture = {"filename": str(environment)} if environment is not None else {"bitmap": mi.Bitmap(procedural_sky().astype(np.float32))}
+    picture = (
+        {"filename": str(environment)}
+        if environment is not None
+        else {"bitmap": mi.Bitmap(procedural_sky().astype(np.float32))}
+    )
     heights_mm = read_mesh(tooth / "outer.ply").vertices_mm[:, 2]
     table_mm = max(float(heights_mm.min()) - TABLE_GAP_MM, float(heights_mm.max()) - SHOWN_MM)
     scene: SceneDict = {
@@ -100,12 +106,18 @@ def gallery_scene(view: GalleryView, tooth: Path, environment: Path | None, size
         "lamp": {
             "type": "rectangle",
             "to_world": place().look_at(view.lamp_mm, [0, 0, 0], [0, 0, 1]).scale(view.lamp_half_mm),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [view.lamp_radiance * c for c in (1.0, 0.96, 0.90)]}},
+            "emitter": {
+                "type": "area",
+                "radiance": {"type": "rgb", "value": [view.lamp_radiance * c for c in (1.0, 0.96, 0.90)]},
+            },
         },
         "table": {
             "type": "rectangle",
             "to_world": place().translate([0, 0, table_mm]).scale([200, 200, 1]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [view.table * c for c in (0.9, 1.0, 1.15)]}},
+            "bsdf": {
+                "type": "diffuse",
+                "reflectance": {"type": "rgb", "value": [view.table * c for c in (0.9, 1.0, 1.15)]},
+            },
         },
         "enamel": {"type": "ply", "filename": str(tooth / "outer.ply")},
         "camera": {
@@ -134,7 +146,9 @@ def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDi
     for part, ids in (("enamel", enamel), ("dentin", dentin)):
         if ids is not None:
             media = tuple(getattr(tissue, part) for tissue in TRUE_TISSUE.values())
-            properties |= {part: ids} | medium_properties(part, media if exact else tuple(similar_medium(medium, SIMILAR_G) for medium in media))
+            properties |= {part: ids} | medium_properties(
+                part, media if exact else tuple(similar_medium(medium, SIMILAR_G) for medium in media)
+            )
     return properties
 
 
@@ -175,7 +189,12 @@ def render(scene: Any, integrator: SceneDict, samples: int, sensor: int = 0, see
     chosen, passes = mi.load_dict(integrator), max(1, samples // PASS_SAMPLES)
     total = np.zeros(())
     for number in range(passes):
-        image = np.array(mi.render(scene, sensor=sensor, integrator=chosen, spp=max(1, samples // passes), seed=1009 * seed + number), dtype=np.float64)
+        image = np.array(
+            mi.render(
+                scene, sensor=sensor, integrator=chosen, spp=max(1, samples // passes), seed=1009 * seed + number
+            ),
+            dtype=np.float64,
+        )
         total = total + image[..., :3] / passes
     bad = int(np.count_nonzero(~np.isfinite(total)))
     if bad:
@@ -221,18 +240,38 @@ def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, floa
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the gallery; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m services.bench.figures.gallery", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m services.bench.figures.gallery", description=__doc__.split("\n\n")[0]
+    )
     parser.add_argument("--out", type=Path, default=Path("gallery"), help="folder of the pictures (default: gallery)")
-    parser.add_argument("--views", nargs="+", choices=tuple(VIEWS), default=tuple(VIEWS), help="which views (default: all)")
+    parser.add_argument(
+        "--views", nargs="+", choices=tuple(VIEWS), default=tuple(VIEWS), help="which views (default: all)"
+    )
     parser.add_argument("--samples", type=int, default=256, help="paths per pixel (default: 256)")
-    parser.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), default=SIZE_PX, help="pixels (default: 320 400)")
-    parser.add_argument("--exact", action="store_true", help="the media themselves, not similar ones of lower mean cosine: slower, noisier, hardly different")
-    parser.add_argument("--outer", type=Path, help="another tooth's enamel surface, mm; z occlusal and y buccal, or give --buccal")
+    parser.add_argument(
+        "--size", type=int, nargs=2, metavar=("W", "H"), default=SIZE_PX, help="pixels (default: 320 400)"
+    )
+    parser.add_argument(
+        "--exact",
+        action="store_true",
+        help="the media themselves, not similar ones of lower mean cosine: slower, noisier, hardly different",
+    )
+    parser.add_argument(
+        "--outer", type=Path, help="another tooth's enamel surface, mm; z occlusal and y buccal, or give --buccal"
+    )
     parser.add_argument("--dentin", type=Path, help="its dentin surface")
-    parser.add_argument("--buccal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where its front looks; the tooth is then turned upright")
+    parser.add_argument(
+        "--buccal",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="where its front looks; the tooth is then turned upright",
+    )
     parser.add_argument("--environment", type=Path, help="equirectangular EXR or HDR image instead of a plain sky")
     parser.add_argument("--scene", type=Path, help="your own Mitsuba XML scene, mm")
-    parser.add_argument("--enamel", default="enamel", help="with --scene: ids of the shapes around enamel, comma separated")
+    parser.add_argument(
+        "--enamel", default="enamel", help="with --scene: ids of the shapes around enamel, comma separated"
+    )
     parser.add_argument("--core", help="with --scene: ids of the shapes around dentin")
     parser.add_argument("--variant", choices=("llvm", "cuda"), default="llvm", help="where to render (default: llvm)")
     options = parser.parse_args(arguments)

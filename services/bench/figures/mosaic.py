@@ -29,11 +29,15 @@ class Column:
 def photo_and_fit(picture: Picture, *, difference: bool = True) -> list[Image8]:
     """Photograph and fit in the photograph's tone, and fit minus photograph in blue and orange."""
     white = white_level(picture.photo, picture.valid)
-    drawn = [tone_map(np.where(picture.valid[..., None], image, 0.0), white) for image in (picture.photo, picture.render)]
+    drawn = [
+        tone_map(np.where(picture.valid[..., None], image, 0.0), white) for image in (picture.photo, picture.render)
+    ]
     return drawn + ([signed_map(picture.residual, RESIDUAL_LIMIT * white, picture.valid)] if difference else [])
 
 
-def mosaic(rows: Sequence[Sequence[Image8 | None]], columns: Sequence[Column], names: Sequence[str] = (), *, scale: int = 3) -> Image8:
+def mosaic(
+    rows: Sequence[Sequence[Image8 | None]], columns: Sequence[Column], names: Sequence[str] = (), *, scale: int = 3
+) -> Image8:
     """Rows of pictures (H, W, 3), each pixel ``scale`` pixels wide; smaller ones are centred in their cell.
 
     Args:
@@ -45,9 +49,13 @@ def mosaic(rows: Sequence[Sequence[Image8 | None]], columns: Sequence[Column], n
         InputError: a row has another number of pictures than there are columns, or of rows and names.
     """
     if not rows or any(len(row) != len(columns) for row in rows) or (names and len(names) != len(rows)):
-        raise InputError(f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name for each; correct it.")
+        raise InputError(
+            f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name for each; correct it."
+        )
     heights = [scale * max((image.shape[0] for image in row if image is not None), default=1) for row in rows]
-    widths = [scale * max((row[k].shape[1] for row in rows if row[k] is not None), default=1) for k in range(len(columns))]  # type: ignore[union-attr]
+    widths = [
+        scale * max((row[k].shape[1] for row in rows if row[k] is not None), default=1) for k in range(len(columns))
+    ]  # type: ignore[union-attr]
     font = ImageFont.load_default(FONT_PX)
     label_px = GAP_PX + int(max((font.getlength(name) for name in names), default=0))
     lefts, x = list[int](), label_px + GAP_PX
@@ -79,4 +87,11 @@ def cropped(picture: Picture, margin_px: int = 1) -> Picture:
     if not len(rows):
         return picture
     window = tuple(slice(max(int(axis[0]) - margin_px, 0), int(axis[-1]) + 1 + margin_px) for axis in (rows, columns))
-    return Picture(picture.camera, picture.light, picture.held_out, picture.photo[window], picture.render[window], picture.valid[window])
+    return Picture(
+        picture.camera,
+        picture.light,
+        picture.held_out,
+        picture.photo[window],
+        picture.render[window],
+        picture.valid[window],
+    )

@@ -34,7 +34,10 @@ def read_environment(path: Path) -> Array:
     prepare_device()
     import mitsuba as mi
 
-    image = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False), dtype=np.float64)
+    image = np.array(
+        mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False),
+        dtype=np.float64,
+    )
     height = len(image)
     solid_angle = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
     return image * (solid_angle.sum() * image.shape[1] * 3 / (image * solid_angle).sum())
@@ -51,7 +54,15 @@ def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:
 
 
 def seen_under(
-    light: dict[str, Any], surfaces: Surfaces, tissue: Tissue, camera: Camera, *, samples: int, boundary: str, ior: float, roughness: float | None
+    light: dict[str, Any],
+    surfaces: Surfaces,
+    tissue: Tissue,
+    camera: Camera,
+    *,
+    samples: int,
+    boundary: str,
+    ior: float,
+    roughness: float | None,
 ) -> Array:
     """Radiance (H, W) of one channel.
 
@@ -64,7 +75,9 @@ def seen_under(
 
     register_integrator()
     parts = {"enamel": "outer"} | ({"dentin": "dentin"} if "dentin" in surfaces else {})
-    integrator: dict[str, Any] = {"type": "dentine", "boundary": boundary, "ior": ior} | ({} if roughness is None else {"roughness": roughness})
+    integrator: dict[str, Any] = {"type": "dentine", "boundary": boundary, "ior": ior} | (
+        {} if roughness is None else {"roughness": roughness}
+    )
     for part, name in parts.items():
         integrator |= {part: name} | medium_properties(part, (tissue.medium(part),))
     with tempfile.TemporaryDirectory() as folder:

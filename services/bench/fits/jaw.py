@@ -46,7 +46,9 @@ class Case:
 
 
 FULL = Case(1.0, 512, 64, {"max_samples_per_pixel": 256})
-QUICK = Case(3.0, 32, 32, {"samples_per_pixel": 8, "max_samples_per_pixel": 16, "max_steps": 2, "search_candidates": 400})
+QUICK = Case(
+    3.0, 32, 32, {"samples_per_pixel": 8, "max_samples_per_pixel": 16, "max_steps": 2, "search_candidates": 400}
+)
 
 
 class JawRow(Row):
@@ -106,7 +108,9 @@ def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_photographs(folder / "capture", case)
-        options = {"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | dict(case.options)
+        options = {"kind": "jaw", "capture": folder / "capture", "boundary": "matched", "dentin": "known"} | dict(
+            case.options
+        )
         truth = known_mouth(jaw_surfaces(SUBJECT), CHANNEL, SUBJECT)
         judge = Judge(prepared_jaw(folder / "job", JobSpec.model_validate(options)), truth, keep, case.judge_samples)
         timed_fit(judge)
@@ -118,7 +122,14 @@ def write_photographs(folder: Path, case: Case) -> None:
     from services.phantom.jaw import write_jaw_phantom
 
     write_jaw_phantom(
-        folder, subject=SUBJECT, pixel_mm=case.pixel_mm, cameras=CAMERAS, lights=LIGHTS, held_out=HELD_OUT, samples=case.photograph_samples, renderer="mitsuba"
+        folder,
+        subject=SUBJECT,
+        pixel_mm=case.pixel_mm,
+        cameras=CAMERAS,
+        lights=LIGHTS,
+        held_out=HELD_OUT,
+        samples=case.photograph_samples,
+        renderer="mitsuba",
     )
     random = np.random.default_rng(SUBJECT)
     for image in read_record(folder / "capture.json", FolderCapture).images:
@@ -138,7 +149,9 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     observations = read_observations(job, spec)
     dentins = jaw_dentins(observations.teeth, observations.manifest.cameras, spec)
     scene = channel_scene(observations, CHANNEL, dentins, spec)
-    return PreparedTooth(job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene))
+    return PreparedTooth(
+        job, spec, observations, label_views(read_channel(observations, CHANNEL, spec), observations), Engine(scene)
+    )
 
 
 def timed_fit(judge: Judge) -> FitReport:
@@ -153,12 +166,16 @@ def timed_fit(judge: Judge) -> FitReport:
         nonlocal paused, step
         if event.kind == "step" and event.data["tooth"] is None:
             begun, step = time.process_time(), int(event.data["step"])
-            judge.row(begun - started - paused, mouth_of(event.data["parameters"], judge.truth), event.data["stage"], step)
+            judge.row(
+                begun - started - paused, mouth_of(event.data["parameters"], judge.truth), event.data["stage"], step
+            )
             paused += time.process_time() - begun
 
     context = LocalContext(judge.case.job, listener=listen)
     started = time.process_time()
-    report = JawDriver(Attempt(judge.case.spec, context, StageWriter(judge.case.job, "fit", 1), ENGINE)).run(time.time())
+    report = JawDriver(Attempt(judge.case.spec, context, StageWriter(judge.case.job, "fit", 1), ENGINE)).run(
+        time.time()
+    )
     judge.row(time.process_time() - started - paused, reported_mouth(report, judge.truth), "final", step)
     return report
 
@@ -170,9 +187,15 @@ def mouth_of(values: Mapping[str, float], like: Mouth) -> Mouth:
         like: a mouth of the same parts.
     """
     one = Medium(1.0, 0.5)
-    shapes = [tuple(value for name, value in values.items() if name.startswith(f"{k}.shape.")) for k in range(len(like.teeth))]
-    mouth = Mouth(tuple(Tissue(one, one, shape) for shape in shapes), None if like.gums is None else one, like.reflectance)
-    known = {name: value for name, value in values.items() if name.rpartition(".")[2] in {*MEDIUM_FIELDS, "reflectance"}}
+    shapes = [
+        tuple(value for name, value in values.items() if name.startswith(f"{k}.shape.")) for k in range(len(like.teeth))
+    ]
+    mouth = Mouth(
+        tuple(Tissue(one, one, shape) for shape in shapes), None if like.gums is None else one, like.reflectance
+    )
+    known = {
+        name: value for name, value in values.items() if name.rpartition(".")[2] in {*MEDIUM_FIELDS, "reflectance"}
+    }
     for k in range(len(like.teeth)):
         if f"{k}.dentin.sigma" not in known:
             known |= {f"{k}.dentin.{leaf}": known[f"{k}.enamel.{leaf}"] for leaf in MEDIUM_FIELDS}
@@ -181,8 +204,12 @@ def mouth_of(values: Mapping[str, float], like: Mouth) -> Mouth:
 
 def reported_mouth(report: FitReport, like: Mouth) -> Mouth:
     """The mouth of a jaw's report, whose teeth are in the order of the capture."""
-    tables = {f"{k}.": tooth.parameters[CHANNEL] for k, tooth in enumerate(report.teeth.values())} | {"": report.parameters[CHANNEL]}
-    return mouth_of({prefix + name: estimate.value for prefix, table in tables.items() for name, estimate in table.items()}, like)
+    tables = {f"{k}.": tooth.parameters[CHANNEL] for k, tooth in enumerate(report.teeth.values())} | {
+        "": report.parameters[CHANNEL]
+    }
+    return mouth_of(
+        {prefix + name: estimate.value for prefix, table in tables.items() for name, estimate in table.items()}, like
+    )
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
@@ -193,14 +220,29 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     seconds = [row["seconds"] for row in rows]
     for label, name in (("held out", "error"), ("fitted", "fitted_error")):
         images.plot(seconds, [100 * row[name] for row in rows], "o-", markersize=4, label=label)
-    ends = [row for row, after in zip(rows, [*rows[1:], None], strict=True) if after is None or after["stage"] != row["stage"]]
-    images.plot([row["seconds"] for row in ends], [100 * row["error"] for row in ends], "ko", fillstyle="none", markersize=9, linestyle="none")
+    ends = [
+        row
+        for row, after in zip(rows, [*rows[1:], None], strict=True)
+        if after is None or after["stage"] != row["stage"]
+    ]
+    images.plot(
+        [row["seconds"] for row in ends],
+        [100 * row["error"] for row in ends],
+        "ko",
+        fillstyle="none",
+        markersize=9,
+        linestyle="none",
+    )
     for row in ends:
-        images.annotate(row["stage"], (row["seconds"], 100 * row["error"]), textcoords="offset points", xytext=(4, 6), fontsize=7)
+        images.annotate(
+            row["stage"], (row["seconds"], 100 * row["error"]), textcoords="offset points", xytext=(4, 6), fontsize=7
+        )
     finish(images, "processor time, s", "error of the images, %")
     for part, leaf in QUANTITIES:
         name = f"{part}.{leaf}"
         middle = [100 * statistics.median(abs(tooth[name]) for tooth in row["off"].values()) for row in rows]
-        media.plot(seconds, middle, "o-", markersize=4, label=f"{part}, {'1 - α′' if leaf == 'alpha_reduced' else 'σs′'}")
+        media.plot(
+            seconds, middle, "o-", markersize=4, label=f"{part}, {'1 - α′' if leaf == 'alpha_reduced' else 'σs′'}"
+        )
     finish(media, "processor time, s", "median error over teeth, %")
     return figure

@@ -28,7 +28,9 @@ LEAVES = {"sigma": "sigma_t.value.value", "alpha": "albedo.value.value"}
 class StockFit:
     """One fit at one learning rate, resumable step by step."""
 
-    def __init__(self, case: PreparedTooth, folder: Path, rate: float, samples: int = SAMPLES, start: Medium = START) -> None:
+    def __init__(
+        self, case: PreparedTooth, folder: Path, rate: float, samples: int = SAMPLES, start: Medium = START
+    ) -> None:
         """Load one scene per fitted light; the clock runs from here."""
         import drjit as dr
         import mitsuba as mi
@@ -49,7 +51,9 @@ class StockFit:
         signal = 0.0
         for light in np.flatnonzero(~view.held_out):
             where, intensity = positions[light], float(intensities[light])
-            scene = load_scene(nested_scene({"tooth": files}, self._start, (view.camera,), where, intensity, samples=samples))
+            scene = load_scene(
+                nested_scene({"tooth": files}, self._start, (view.camera,), where, intensity, samples=samples)
+            )
             reference, counts = np.zeros((2, height, width, 1), dtype=np.float32)
             counts[y, x, 0] = view.valid[light]
             reference[y, x, 0] = np.where(view.valid[light], view.reference[light], 0.0)

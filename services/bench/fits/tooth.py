@@ -70,7 +70,11 @@ class Judge:
     def row(self, peer: str, seconds: float, tissue: Tissue, stage: str, **more: Any) -> ToothRow:
         """Judge and keep one point."""
         fitted, held_out = self.case.errors(tissue, samples=self.samples, seed=11)
-        values = {f"{part}.{leaf}": getattr(getattr(tissue, part), leaf) for part in ("enamel", "dentin") for leaf in ("sigma", "alpha", "sigma_s_reduced")}
+        values = {
+            f"{part}.{leaf}": getattr(getattr(tissue, part), leaf)
+            for part in ("enamel", "dentin")
+            for leaf in ("sigma", "alpha", "sigma_s_reduced")
+        }
         row = ToothRow(
             benchmark="tooth", peer=peer, seconds=seconds, error=held_out.resolved_error or 0.0, error_se=held_out.error_se or 0.0,
             fitted_error=fitted.resolved_error or 0.0, stage=stage, parameters=values, **more,
@@ -99,7 +103,9 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
         ours = our_fit(judge, folder / "ours", OURS, tooth.spec)
         peers = {PEER: stock_fit(judge, folder, *((QUICK_CHOICE_S, QUICK_LIMIT_S) if quick else (CHOICE_S, LIMIT_S)))}
         if "solver" in JobSpec.model_fields:
-            peers[OUR_ADAM] = our_fit(judge, folder / "adam", OUR_ADAM, tooth.spec.model_copy(update={"solver": "adam"}))
+            peers[OUR_ADAM] = our_fit(
+                judge, folder / "adam", OUR_ADAM, tooth.spec.model_copy(update={"solver": "adam"})
+            )
         target = max(MARGIN * ours[-1].error, tooth.resolution())
         for rows in peers.values():
             judge.rows.append(summary(ours, rows, target))
@@ -122,7 +128,9 @@ def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothR
         nonlocal paused
         if event.kind == "step":
             begun = time.process_time()
-            rows.append(judge.row(peer, begun - started - paused, tissue_of(event.data["parameters"]), event.data["stage"]))
+            rows.append(
+                judge.row(peer, begun - started - paused, tissue_of(event.data["parameters"]), event.data["stage"])
+            )
             paused += time.process_time() - begun
 
     folder.mkdir()
@@ -186,7 +194,14 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
         label = peer if rate is None else f"{peer}, rate {rate:g}"
         if (end := ratios.get(peer)) is not None and end["rate"] == rate:
             label += f", {'over ' if end['lower_bound'] else ''}{end['efficiency_ratio']:.3g} times our time"
-        axes.plot([row["seconds"] for row in mine], [100 * row["error"] for row in mine], "o-", color=f"C{number}", markersize=4, label=label)
+        axes.plot(
+            [row["seconds"] for row in mine],
+            [100 * row["error"] for row in mine],
+            "o-",
+            color=f"C{number}",
+            markersize=4,
+            label=label,
+        )
     finish(axes, "processor time, s", "held-out error, %")
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15))
     figure.set_size_inches(6.0, 6.0)

@@ -39,13 +39,23 @@ def sensor_noise(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(image > 0, (NOISE_RELATIVE * image) ** 2 + (NOISE_FLOOR * image.max()) ** 2, 0.0)
 
 
-def photograph(mean: NDArray[np.float64], variance: NDArray[np.float64], random: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def photograph(
+    mean: NDArray[np.float64], variance: NDArray[np.float64], random: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """A rendered image with a camera's noise added, and its variance with that noise's, both as stored."""
     added = sensor_noise(mean)
-    return (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32), (variance + added).astype(np.float32)
+    return (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32), (variance + added).astype(
+        np.float32
+    )
 
 
-def write_photograph(source: Path, target: Path, files: tuple[str, str], random: np.random.Generator, added: NDArray[np.float64] | float = 0.0) -> None:
+def write_photograph(
+    source: Path,
+    target: Path,
+    files: tuple[str, str],
+    random: np.random.Generator,
+    added: NDArray[np.float64] | float = 0.0,
+) -> None:
     """Store a rendered image, with something added, as a camera's photograph, and its variance beside it.
 
     Args:
@@ -84,7 +94,10 @@ class PreparedTooth:
         fitted, held_out = ErrorSums(), ErrorSums()
         for number, view in enumerate(self.views):
             seen = View(view.camera, view.pixels)
-            first, second = (self.engine.images(tissue, seen, samples=samples, seed=7919 * number + 2 * seed + k).mean for k in range(2))
+            first, second = (
+                self.engine.images(tissue, seen, samples=samples, seed=7919 * number + 2 * seed + k).mean
+                for k in range(2)
+            )
             held = view.held_out[:, None]
             fitted += error_sums(first, second, view.reference, view.variance, view.valid & ~held)
             held_out += error_sums(first, second, view.reference, view.variance, view.valid & held)
@@ -94,7 +107,8 @@ class PreparedTooth:
         """The error that the photographs' own noise can look like, one standard deviation."""
         chosen = [view.valid & (view.held_out[:, None] == held_out) for view in self.views]
         reference, variance = (
-            np.concatenate([getattr(view, name)[one] for view, one in zip(self.views, chosen, strict=True)]) for name in ("reference", "variance")
+            np.concatenate([getattr(view, name)[one] for view, one in zip(self.views, chosen, strict=True)])
+            for name in ("reference", "variance")
         )
         return float((2 * variance @ variance) ** 0.25 / np.sqrt(reference @ reference - variance.sum()))
 
@@ -117,7 +131,14 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
     observations = read_observations(job, spec)
     (tooth,) = observations.teeth
     dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
-    recipe = single_tooth(tooth.outer, dentin, observations.light_positions_mm, observations.light_intensities(channel), spec.boundary, spec.ior)
+    recipe = single_tooth(
+        tooth.outer,
+        dentin,
+        observations.light_positions_mm,
+        observations.light_intensities(channel),
+        spec.boundary,
+        spec.ior,
+    )
     return PreparedTooth(job, spec, observations, read_channel(observations, channel, spec), Engine(recipe))
 
 
@@ -130,7 +151,13 @@ def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> Prepar
         source = folder / "phantom"
         write_phantom(source, cameras=1, samples=PHANTOM_SAMPLES, renderer="mitsuba", subject=1)
     write_noisy(source, folder / "capture", seed)
-    options = {"capture": folder / "capture", "boundary": "matched", "dentin": "known", "pixel_step": pixel_step, "seed": seed}
+    options = {
+        "capture": folder / "capture",
+        "boundary": "matched",
+        "dentin": "known",
+        "pixel_step": pixel_step,
+        "seed": seed,
+    }
     return prepared_tooth(folder / "job", JobSpec.model_validate(options))
 
 

@@ -79,7 +79,9 @@ def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
     with (
         tempfile.TemporaryDirectory() as name,
         dask.config.set({**DASK_CONFIG, "distributed.worker.daemon": False}),
-        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
         Client(cluster) as client,
     ):
         began = time.perf_counter()

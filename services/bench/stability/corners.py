@@ -58,7 +58,9 @@ class Corners:
     def media(self) -> list[list[Medium]]:
         """The media of either layer, one per set."""
         fields = (self.sigma, 1 - self.absorbed, self.beta, self.g1, self.g2)
-        return [[Medium(*values) for values in zip(*(field[k].tolist() for field in fields), strict=True)] for k in range(2)]
+        return [
+            [Medium(*values) for values in zip(*(field[k].tolist() for field in fields), strict=True)] for k in range(2)
+        ]
 
 
 def draw(count: int, seed: int) -> Corners:
@@ -82,7 +84,9 @@ def draw(count: int, seed: int) -> Corners:
     narrow, weak = one_of(-1, 1) * (1 - decades(NARROWEST, 1e-2)), one_of(-1, 1) * decades(1e-8, 1e-2)
     g_end = one_of(0, 1 - NARROWEST, NARROWEST - 1)
     free = [one_of(-1, 1) * (1 - decades(NARROWEST, 1.0)) for _ in range(2)]
-    boundary = np.where(within("faces"), rng.integers(THIN, SMOOTH + 1, count), rng.integers(MATCHED, SMOOTH + 1, count))
+    boundary = np.where(
+        within("faces"), rng.integers(THIN, SMOOTH + 1, count), rng.integers(MATCHED, SMOOTH + 1, count)
+    )
     nearly_one = 1 + decades(1e-4, IOR[1] - 1)[0]
     ior = np.select(
         [boundary == MATCHED, within("all at an end"), within("faces")],
@@ -91,7 +95,10 @@ def draw(count: int, seed: int) -> Corners:
     )
     return Corners(
         region=region,
-        sigma=pick({"clear": decades(SIGMA[0], 1e-2), "opaque": decades(1e2, SIGMA[1]), "all at an end": one_of(*SIGMA)}, decades(*SIGMA)),
+        sigma=pick(
+            {"clear": decades(SIGMA[0], 1e-2), "opaque": decades(1e2, SIGMA[1]), "all at an end": one_of(*SIGMA)},
+            decades(*SIGMA),
+        ),
         absorbed=pick(
             {
                 "alpha near 1": np.where(rng.random(count) < 0.3, 0.0, decades(MIN_ABSORBED, 1e-4)),
@@ -100,10 +107,19 @@ def draw(count: int, seed: int) -> Corners:
             },
             decades(MIN_ABSORBED, 1.0),
         ),
-        beta=pick({"unequal lobes": np.abs(one_of(0, 1) - decades(1e-7, 1e-2)), "all at an end": one_of(0, 1, 1e-7)}, rng.random(pair)),
-        g1=pick({"g near 1": narrow, "g near 0": weak, "unequal lobes": np.abs(narrow), "all at an end": g_end}, free[0]),
-        g2=pick({"g near 1": -narrow, "g near 0": -weak, "unequal lobes": -np.abs(narrow), "all at an end": -g_end}, free[1]),
-        width_mm=pick({"thin layer": decades(WIDTH_MM[0], 1e-2), "all at an end": one_of(*WIDTH_MM)}, decades(*WIDTH_MM)),
+        beta=pick(
+            {"unequal lobes": np.abs(one_of(0, 1) - decades(1e-7, 1e-2)), "all at an end": one_of(0, 1, 1e-7)},
+            rng.random(pair),
+        ),
+        g1=pick(
+            {"g near 1": narrow, "g near 0": weak, "unequal lobes": np.abs(narrow), "all at an end": g_end}, free[0]
+        ),
+        g2=pick(
+            {"g near 1": -narrow, "g near 0": -weak, "unequal lobes": -np.abs(narrow), "all at an end": -g_end}, free[1]
+        ),
+        width_mm=pick(
+            {"thin layer": decades(WIDTH_MM[0], 1e-2), "all at an end": one_of(*WIDTH_MM)}, decades(*WIDTH_MM)
+        ),
         boundary=boundary,
         ior=ior,
         diffuse=rng.random(count) < 0.5,

@@ -19,7 +19,9 @@ SEMI_AXES_MM = np.array([3.0, 2.0, 4.0])
 BOX_MM = 4.0
 DISTANCE_MM = 600.0
 PIXELS = 8
-DIRECTIONS = np.array([[0.16, 0.98, 0.08], [0.84, 0.5, 0.17], [-0.87, 0.35, -0.35], [0, -0.99, 0.16], [0.08, 0.16, 0.98]])
+DIRECTIONS = np.array(
+    [[0.16, 0.98, 0.08], [0.84, 0.5, 0.17], [-0.87, 0.35, -0.35], [0, -0.99, 0.16], [0.08, 0.16, 0.98]]
+)
 """Towards the lights."""
 TISSUE = Tissue(Medium(3, 0.99, 0.9, 0.8, -0.2), Medium(8, 0.98, g1=0.7))
 LARGEST_Z = 4.5
@@ -57,17 +59,31 @@ def scenes() -> Iterator[Scene]:
     outer, dentin = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.3)
     plain = _recipe(outer, dentin)
     yield Scene("slivers", _recipe(with_slivers(outer), with_slivers(dentin)), TISSUE, plain, TISSUE)
-    yield Scene("slivers, thin faces", replace(_recipe(with_slivers(outer), dentin), boundary="thin"), TISSUE, replace(plain, boundary="thin"), TISSUE)
+    yield Scene(
+        "slivers, thin faces",
+        replace(_recipe(with_slivers(outer), dentin), boundary="thin"),
+        TISSUE,
+        replace(plain, boundary="thin"),
+        TISSUE,
+    )
     thinnest, all_dentin = ellipsoid(SEMI_AXES_MM - 1e-3), Tissue(TISSUE.dentin, TISSUE.dentin)
     yield Scene("enamel of 1 um", _recipe(outer, thinnest), TISSUE, _recipe(outer, None), all_dentin)
     yield Scene("almost no absorption", plain, Tissue(Medium(10, 1 - 1e-7, g1=0.9), Medium(30, 1 - 1e-7, g1=0.99)))
-    yield Scene("narrow lobes", plain, Tissue(Medium(100, 0.9, 0.5, 0.9999, -0.9999), Medium(1e-4, 0.5, 0.5, 0.9999, -0.9999)))
+    yield Scene(
+        "narrow lobes", plain, Tissue(Medium(100, 0.9, 0.5, 0.9999, -0.9999), Medium(1e-4, 0.5, 0.5, 0.9999, -0.9999))
+    )
     in_planes = np.array([[300.0, 2, 0], [300, 0, 2], [2, 300, -2], [-300, 2, 2], [0, -2, 300]])
     for boundary in ("matched", "thin"):
-        yield Scene(f"along faces, {boundary}", replace(_recipe(_box(), None), light_positions_mm=in_planes, boundary=boundary), TISSUE)
+        yield Scene(
+            f"along faces, {boundary}",
+            replace(_recipe(_box(), None), light_positions_mm=in_planes, boundary=boundary),
+            TISSUE,
+        )
     tips = np.array([[0, 0, 1.0], [0, 0, -1.0]]) * (SEMI_AXES_MM[2] + 1e-3)
     yield Scene("lights 1 um away", replace(plain, light_positions_mm=tips, light_intensities=np.ones(2)), TISSUE)
-    far, farther = (replace(plain, light_positions_mm=_towards_lights(d), light_intensities=np.full(5, d**2)) for d in (1e5, 1e9))
+    far, farther = (
+        replace(plain, light_positions_mm=_towards_lights(d), light_intensities=np.full(5, d**2)) for d in (1e5, 1e9)
+    )
     yield Scene("lights 1000 km away", farther, TISSUE, far, TISSUE)
 
 

@@ -100,7 +100,9 @@ def fresnel_reflectance(corners: Corners, rng: np.random.Generator) -> Floats:
     right = truth(eta)
     steepness = np.abs(truth(eta * (1 + ROUNDING)) - truth(eta * (1 - ROUNDING))) / ROUNDING
     differs = eta != 1
-    return np.abs(kernel(fresnel.reflectance, cosine, eta) - np.where(differs, right, 0)) / np.where(differs, right + steepness, 1)
+    return np.abs(kernel(fresnel.reflectance, cosine, eta) - np.where(differs, right, 0)) / np.where(
+        differs, right + steepness, 1
+    )
 
 
 def _depths(corners: Corners) -> Floats:
@@ -174,11 +176,26 @@ FORMULAS = (
     Formula("phase score", phase_score, 20 * ROUNDING, "a dozen roundings"),
     Formula("phase sampling", phase_sampling, 20 * ROUNDING, "a dozen roundings"),
     Formula("Fresnel", fresnel_reflectance, 20 * ROUNDING, "a dozen roundings"),
-    Formula("1 - exp(-x)", collision, 40 * ROUNDING, "2 roundings of exp, magnified 20-fold at x = 0.05 where the series ends"),
-    Formula("-log(1 - p)", free_flight, 100 * ROUNDING, "1 rounding of 1 - p and 1 of log, magnified 50-fold at p = 0.02 where the series ends"),
+    Formula(
+        "1 - exp(-x)",
+        collision,
+        40 * ROUNDING,
+        "2 roundings of exp, magnified 20-fold at x = 0.05 where the series ends",
+    ),
+    Formula(
+        "-log(1 - p)",
+        free_flight,
+        100 * ROUNDING,
+        "1 rounding of 1 - p and 1 of log, magnified 50-fold at p = 0.02 where the series ends",
+    ),
     Formula("transmittance", transmittance, 3 * DARK * ROUNDING, "3 roundings of a depth of up to 40"),
     Formula("albedo power", albedo_power, 3 * DARK * ROUNDING, "3 roundings of an exponent of up to 40"),
-    Formula("dual domain", dual_domain, 20 * 2.0**-53 * np.log(1e16), "float64: a dozen roundings of numbers and of exponents up to 16 ln 10"),
+    Formula(
+        "dual domain",
+        dual_domain,
+        20 * 2.0**-53 * np.log(1e16),
+        "float64: a dozen roundings of numbers and of exponents up to 16 ln 10",
+    ),
 )
 
 

@@ -87,7 +87,10 @@ class LaneTotals:
 
     def non_finite(self) -> NDArray[np.int64]:
         """Numbers of each set that are NaN or infinite, (N,)."""
-        return np.asarray(np.count_nonzero(~np.isfinite(self.totals), axis=1) + np.count_nonzero(~np.isfinite(self.derivatives), axis=(0, 2)))
+        return np.asarray(
+            np.count_nonzero(~np.isfinite(self.totals), axis=1)
+            + np.count_nonzero(~np.isfinite(self.derivatives), axis=(0, 2))
+        )
 
 
 def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
@@ -99,7 +102,14 @@ def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
 def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient: bool = True) -> LaneTotals:
     """All sets at once, one lane each."""
     geometry = SlabGeometry(tuple(corners.width_mm), moving_border=True)
-    walk = Walk(geometry, Media(corners.media()), None, LaneStart(corners, seed), stress_plan(most_steps, gradient=gradient), 1.0)
+    walk = Walk(
+        geometry,
+        Media(corners.media()),
+        None,
+        LaneStart(corners, seed),
+        stress_plan(most_steps, gradient=gradient),
+        1.0,
+    )
     # A smooth face seen from within is a face of index 1 / n: so one kernel serves all three kinds.
     ior = mi.Float(corners.ior.astype(np.float32))
     walk.ior = dr.select(mi.Bool(corners.boundary == SMOOTH), dr.rcp(ior), ior)
@@ -111,7 +121,11 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
     """Rows of formulas by region, of the walk by region, and of difficult scenes; the tables go to standard error."""
     prepare_device()
     corners = draw(2200 if quick else 12_100, seed=1)
-    rows = formula_rows(corners) + walk_rows(corners, most_steps=256 if quick else 16_384) + scene_rows(samples=64 if quick else 4096)
+    rows = (
+        formula_rows(corners)
+        + walk_rows(corners, most_steps=256 if quick else 16_384)
+        + scene_rows(samples=64 if quick else 4096)
+    )
     print(as_table(rows), file=sys.stderr)
     return [row.model_dump() for row in rows]
 
@@ -121,9 +135,13 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     from services.bench.plots import draw_errors, grid
 
     figure, (formulas, walk, scenes) = grid(3)
-    of = {part: [row for row in rows if row["benchmark"] == f"stability-{part}"] for part in ("formula", "walk", "scene")}
+    of = {
+        part: [row for row in rows if row["benchmark"] == f"stability-{part}"] for part in ("formula", "walk", "scene")
+    }
     names = [row["quantity"] for row in of["formula"]]
-    formulas.plot(names, [row["error"] for row in of["formula"]], "o", color="C0", markersize=5, label="worst of each region")
+    formulas.plot(
+        names, [row["error"] for row in of["formula"]], "o", color="C0", markersize=5, label="worst of each region"
+    )
     formulas.plot(names, [row["bound"] for row in of["formula"]], "_", color="C1", markersize=24, label="bound")
     formulas.set(yscale="log", ylabel="relative error", title="stability-formula")
     formulas.tick_params(axis="x", rotation=90)
@@ -153,7 +171,9 @@ def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[Stabi
     begun = time.perf_counter()
     lanes = trace(corners, paths=PATHS, most_steps=most_steps, seed=seed)
     seconds = time.perf_counter() - begun
-    entering = 1 - np.where(corners.diffuse, specular_share(corners.ior, "diffuse"), specular_share(corners.ior, "normal"))
+    entering = 1 - np.where(
+        corners.diffuse, specular_share(corners.ior, "diffuse"), specular_share(corners.ior, "normal")
+    )
     bad = lanes.non_finite()
     rows = []
     for region, here in _parts(corners):
@@ -192,15 +212,22 @@ def _parts(corners: Corners) -> list[tuple[str, NDArray[np.bool_]]]:
 
 def as_table(rows: list[StabilityRow]) -> str:
     """Three tables: worst relative error by region and formula, what the walk did in each region, and the scenes."""
-    formulas, walks, views = ([row for row in rows if row.benchmark == f"stability-{part}"] for part in ("formula", "walk", "scene"))
+    formulas, walks, views = (
+        [row for row in rows if row.benchmark == f"stability-{part}"] for part in ("formula", "walk", "scene")
+    )
     names = list(dict.fromkeys(row.quantity for row in formulas))
     errors = {(row.region, row.quantity): row.error for row in formulas}
     return "\n\n".join(
         (
-            _table(("region", *names), [(region, *(f"{errors[region, name]:.1e}" for name in names)) for region in REGIONS]),
+            _table(
+                ("region", *names), [(region, *(f"{errors[region, name]:.1e}" for name in names)) for region in REGIONS]
+            ),
             _table(
                 ("region", "sets", "not finite", "cut short", "R + T + cut - entering"),
-                [(r.region, r.sets, r.non_finite, f"{r.cut:.1e}", f"{r.gain:+.1e} ± {r.gain_error:.0e}") for r in walks],
+                [
+                    (r.region, r.sets, r.non_finite, f"{r.cut:.1e}", f"{r.gain:+.1e} ± {r.gain_error:.0e}")
+                    for r in walks
+                ],
             ),
             _table(
                 ("scene", "numbers", "not finite", "negative", "z"),

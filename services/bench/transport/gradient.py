@@ -54,20 +54,37 @@ def media_rows(*, quick: bool) -> list[GradientRow]:
     reference = engine.images(OTHER_TISSUE, view, samples=256 if quick else 1024, seed=7).mean
 
     counts, peer_counts, repeats = ((32, 128), (16, 64), 3) if quick else ((64, 128, 256), (16, 64), 4)
-    pairs = [our_gradient(engine, TISSUE, view, reference, names, chosen, samples=samples, repeats=repeats) for samples in counts]
+    pairs = [
+        our_gradient(engine, TISSUE, view, reference, names, chosen, samples=samples, repeats=repeats)
+        for samples in counts
+    ]
     ours = pairs[-1][0]
-    rows = [row for samples, (whole, _) in zip(counts, pairs, strict=True) for row in _rows("dentine", names, samples, whole, ours.mean)]
+    rows = [
+        row
+        for samples, (whole, _) in zip(counts, pairs, strict=True)
+        for row in _rows("dentine", names, samples, whole, ours.mean)
+    ]
     scale = len(reference) / len(chosen)
     with tempfile.TemporaryDirectory() as folder:
         for samples in peer_counts:
             peer = _stock_gradient(Path(folder), stack, view, reference, chosen, samples=samples, repeats=repeats)
-            scaled = Estimate(peer.mean * scale, peer.variance * scale, peer.mean_variance * scale, peer.seconds * scale)
+            scaled = Estimate(
+                peer.mean * scale, peer.variance * scale, peer.mean_variance * scale, peer.seconds * scale
+            )
             rows += _rows("mitsuba-prbvolpath", names, samples, scaled, ours.mean)
     return rows + _summary(names, pairs, peer, scaled)
 
 
 def our_gradient(
-    engine: Engine, tissue: Tissue, view: View, reference: Array, names: tuple[str, ...], chosen: NDArray[np.int64], *, samples: int, repeats: int
+    engine: Engine,
+    tissue: Tissue,
+    view: View,
+    reference: Array,
+    names: tuple[str, ...],
+    chosen: NDArray[np.int64],
+    *,
+    samples: int,
+    repeats: int,
 ) -> tuple[Estimate, Estimate]:
     """The gradient over all lights, and over the chosen ones alone (its time is that of all).
 
@@ -77,7 +94,10 @@ def our_gradient(
     """
 
     def once(repeat: int) -> Array:
-        passes = [engine.jacobian(tissue, view, names, samples=samples // PASSES, seed=repeat * PASSES + k, batches=1) for k in range(PASSES)]
+        passes = [
+            engine.jacobian(tissue, view, names, samples=samples // PASSES, seed=repeat * PASSES + k, batches=1)
+            for k in range(PASSES)
+        ]
         # The mean over all pairs of two passes: the product of the means less each pass's product with itself.
         residuals = [one.mean - reference for one in passes]
         alone = sum(one.jacobian * residual for one, residual in zip(passes, residuals, strict=True))
@@ -91,32 +111,60 @@ def our_gradient(
     return of_parts(terms.sum(axis=2), seconds), of_parts(terms[:, :, chosen].sum(axis=2), seconds)
 
 
-def _stock_gradient(folder: Path, stack: IncisorStack, view: View, reference: Array, chosen: NDArray[np.int64], *, samples: int, repeats: int) -> Estimate:
+def _stock_gradient(
+    folder: Path,
+    stack: IncisorStack,
+    view: View,
+    reference: Array,
+    chosen: NDArray[np.int64],
+    *,
+    samples: int,
+    repeats: int,
+) -> Estimate:
     seconds, by_light = 0.0, []
     for light in chosen.tolist():
         gradient = StockGradient(stack.stock_scene(folder, TISSUE, light), TISSUE, view)
         gradient(reference[light], samples=samples, seed=0)
         begun = time.process_time()
-        by_light.append([gradient(reference[light], samples=samples, seed=1 + light * repeats + repeat) for repeat in range(repeats)])
+        by_light.append(
+            [
+                gradient(reference[light], samples=samples, seed=1 + light * repeats + repeat)
+                for repeat in range(repeats)
+            ]
+        )
         seconds += (time.process_time() - begun) / repeats
     return of_parts(np.array(by_light).transpose(1, 2, 0), seconds)
 
 
 def _rows(peer: str, names: tuple[str, ...], samples: int, estimate: Estimate, gradient: Array) -> list[GradientRow]:
     errors = np.sqrt(estimate.variance) / np.abs(gradient)
-    common: dict[str, Any] = {"benchmark": "transport-gradient", "peer": peer, "seconds": estimate.seconds, "samples": samples}
-    single = [GradientRow(**common, error=e, parameter=n, gradient=g) for n, e, g in zip(names, errors.tolist(), estimate.mean.tolist(), strict=True)]
+    common: dict[str, Any] = {
+        "benchmark": "transport-gradient",
+        "peer": peer,
+        "seconds": estimate.seconds,
+        "samples": samples,
+    }
+    single = [
+        GradientRow(**common, error=e, parameter=n, gradient=g)
+        for n, e, g in zip(names, errors.tolist(), estimate.mean.tolist(), strict=True)
+    ]
     return [*single, GradientRow(**common, error=float(np.exp(np.mean(np.log(errors)))))]
 
 
-def _summary(names: tuple[str, ...], pairs: list[tuple[Estimate, Estimate]], peer: Estimate, scaled: Estimate) -> list[GradientRow]:
+def _summary(
+    names: tuple[str, ...], pairs: list[tuple[Estimate, Estimate]], peer: Estimate, scaled: Estimate
+) -> list[GradientRow]:
     few, known = pairs[-1][1], pairs[-1][0].mean
     whole = min((ours for ours, _ in pairs), key=lambda ours: abs(np.mean(np.log(scaled.variance / ours.variance))))
     z = (peer.mean - few.mean) / np.sqrt(peer.mean_variance + few.mean_variance)
     # The size of the gradient is common to both and drops out.
     ratios = scaled.variance * scaled.seconds / (whole.variance * whole.seconds)
     errors = np.sqrt(scaled.variance) / np.abs(known)
-    common: dict[str, Any] = {"benchmark": "transport-gradient-summary", "peer": "mitsuba-prbvolpath", "seconds": scaled.seconds}
+    common: dict[str, Any] = {
+        "benchmark": "transport-gradient-summary",
+        "peer": "mitsuba-prbvolpath",
+        "seconds": scaled.seconds,
+    }
     single = [
         GradientRow(**common, error=error, parameter=name, z=score, efficiency_ratio=ratio)
         for name, error, score, ratio in zip(names, errors.tolist(), z.tolist(), ratios.tolist(), strict=True)

@@ -60,7 +60,11 @@ class IncisorStack:
             write_mesh(files[0], self.outer)
             write_mesh(files[1], self.dentin)
         where, intensity = self.light_positions_mm[light], float(self.light_intensities[light])
-        return load_scene(nested_scene({"tooth": files}, tissue, (self.camera,), where, intensity, boundary="matched", ior=1.0, samples=samples))
+        return load_scene(
+            nested_scene(
+                {"tooth": files}, tissue, (self.camera,), where, intensity, boundary="matched", ior=1.0, samples=samples
+            )
+        )
 
 
 def incisor_stack(lights: int) -> IncisorStack:
@@ -68,5 +72,8 @@ def incisor_stack(lights: int) -> IncisorStack:
     incisor = build_incisor()
     (camera,) = dome_cameras(1, PIXEL_MM, (incisor.outer,))
     rig = dome_lights(lights, ("green",), seed=1)
-    positions, intensities = np.array([light.position_mm for light in rig]), np.array([light.intensity[0] for light in rig])
+    positions, intensities = (
+        np.array([light.position_mm for light in rig]),
+        np.array([light.intensity[0] for light in rig]),
+    )
     return IncisorStack(incisor.outer, incisor.dentin, camera, positions, intensities)

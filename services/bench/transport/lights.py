@@ -57,7 +57,9 @@ class Case:
         begun = time.process_time()
         estimates = [self.engine.images(TISSUE, view, samples=self.samples, seed=seed) for view in self.views]
         self.seconds.append((time.process_time() - begun) / len(estimates))
-        self.squared_errors.append(float(sum(e.variance.sum() for e in estimates) / sum(np.sum(e.mean**2) for e in estimates)))
+        self.squared_errors.append(
+            float(sum(e.variance.sum() for e in estimates) / sum(np.sum(e.mean**2) for e in estimates))
+        )
 
     @property
     def cost(self) -> float:
@@ -96,9 +98,15 @@ def light_rows(engine: Engine, view: View, counts: tuple[int, ...], rounds: int)
     rows = [case.row("transport-lights", one if case is group[-1] else None) for group in cases for case in group]
     for lights, group in zip(LIGHTS, cases[1:], strict=True):
         theirs = one.row("transport-lights")
-        times = {"seconds": theirs.seconds * lights, "lights": lights, "seconds_per_path": theirs.seconds_per_path * lights}
+        times = {
+            "seconds": theirs.seconds * lights,
+            "lights": lights,
+            "seconds_per_path": theirs.seconds_per_path * lights,
+        }
         ratio = lights * one.cost / group[-1].cost
-        rows.append(theirs.model_copy(update={"peer": PEER, **times, "relative_cost": float(lights), "efficiency_ratio": ratio}))
+        rows.append(
+            theirs.model_copy(update={"peer": PEER, **times, "relative_cost": float(lights), "efficiency_ratio": ratio})
+        )
     return rows
 
 
@@ -106,7 +114,10 @@ def pixel_rows(engine: Engine, view: View, samples: int, rounds: int) -> list[Li
     """The same tooth at the same paths per pixel; fewer pixels are a random choice of them, so that each choice sees all of the tooth."""
     order = np.random.default_rng(1).permutation(len(view))
     choices = [order[: len(view) // share] for share in SHARES]
-    cases = [Case(engine, [View(view.camera, view.pixels[chosen], spread_lights(PIXEL_LIGHTS))], samples) for chosen in choices]
+    cases = [
+        Case(engine, [View(view.camera, view.pixels[chosen], spread_lights(PIXEL_LIGHTS))], samples)
+        for chosen in choices
+    ]
     _measure(cases, rounds)
     return [case.row("transport-pixels") for case in cases]
 
@@ -122,20 +133,26 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
 
     figure, (errors, by_lights, by_pixels) = grid(3)
     lights = [row for row in rows if row["benchmark"] == "transport-lights" and row["peer"] != PEER]
-    draw_errors(errors, [{**row, "stack": f"{row['lights']:3d} light{'s'[: row['lights'] - 1]}"} for row in lights], by="stack")
+    draw_errors(
+        errors, [{**row, "stack": f"{row['lights']:3d} light{'s'[: row['lights'] - 1]}"} for row in lights], by="stack"
+    )
     errors.set_title("all images together")
 
     full = [row for row in lights if row["relative_cost"] is not None]
     counts = np.array([row["lights"] for row in full])
     by_lights.plot(counts, counts, "--", color="C1", linewidth=1, label=PEER)
     by_lights.plot(counts, [row["relative_cost"] for row in full], "o-", color="C0", label="variance x time")
-    by_lights.plot(counts, [row["seconds"] / full[0]["seconds"] for row in full], "s-", color="C2", label="time per path")
+    by_lights.plot(
+        counts, [row["seconds"] / full[0]["seconds"] for row in full], "s-", color="C2", label="time per path"
+    )
     by_lights.set_title("all images, relative to one light")
     finish(by_lights, "lights", "relative to one light")
 
     finest = [row for row in rows if row["benchmark"] == "transport-pixels"]
     pixels, seconds = np.array([(row["pixels"], row["seconds"]) for row in finest]).T
-    by_pixels.plot(pixels, seconds, "o-", color="C0", label=f"{PIXEL_LIGHTS} lights, {finest[0]['samples']} paths per pixel")
+    by_pixels.plot(
+        pixels, seconds, "o-", color="C0", label=f"{PIXEL_LIGHTS} lights, {finest[0]['samples']} paths per pixel"
+    )
     by_pixels.plot(pixels, seconds[-1] * pixels / pixels[-1], "--", color="C1", linewidth=1, label="in proportion")
     by_pixels.set_title("one view")
     finish(by_pixels, "pixels", "processor time, s")

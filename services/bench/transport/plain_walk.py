@@ -45,18 +45,28 @@ class PlainWalk(Walk):
         scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         crosses = walker.active & ~scatters & hit.valid
         beyond = geometry.advance(walker.origin, walker.omega, hit, crosses)
-        walker.origin = dr.select(scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin))
+        walker.origin = dr.select(
+            scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin)
+        )
         walker.place = dr.select(crosses, geometry.beyond(walker.place, walker.omega, hit), walker.place)
         (count,) = walker.so_far.counts
         walker.so_far.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
         # Connect to the lights, then turn.
-        self._connect(walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False)), tally)
-        onward = PhaseFunction(self.media, medium).sample(walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32())
+        self._connect(
+            walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False)), tally
+        )
+        onward = PhaseFunction(self.media, medium).sample(
+            walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32()
+        )
         walker.omega = dr.select(scatters, onward, walker.omega)
 
         # Faint paths survive in proportion to what they carry.
-        share = walker.weight * dr.exp(mi.Float(walker.so_far.counts[0]) * self.media.log_alpha[0]) / (ROULETTE_WEIGHT * walker.reference)
+        share = (
+            walker.weight
+            * dr.exp(mi.Float(walker.so_far.counts[0]) * self.media.log_alpha[0])
+            / (ROULETTE_WEIGHT * walker.reference)
+        )
         faded = (share < 1) & (walker.rng.next_float32() >= share)
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
         ended = walker.active & ((~scatters & ~crosses) | faded)

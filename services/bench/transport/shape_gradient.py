@@ -56,11 +56,18 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
     return rows
 
 
-def _gradients(engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int) -> list[Estimate]:
+def _gradients(
+    engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int
+) -> list[Estimate]:
     """The derivative to every mode by light and importance on the border; each is charged its share of the time."""
     engine.shape_gradient(tissue, view, picture, samples=16, seed=0)
     begun = time.process_time()
-    found = np.stack([engine.shape_gradient(tissue, view, picture, samples=samples, seed=100 + repeat).gradient for repeat in range(repeats)])
+    found = np.stack(
+        [
+            engine.shape_gradient(tissue, view, picture, samples=samples, seed=100 + repeat).gradient
+            for repeat in range(repeats)
+        ]
+    )
     seconds = (time.process_time() - begun) / repeats / found.shape[1]
     return [of_parts(found[:, [mode], None], seconds) for mode in range(found.shape[1])]
 
@@ -70,25 +77,43 @@ def _scores(engine: Engine, tissue: Tissue, view: View, picture: Array, samples:
     names = tuple(f"shape.{k}" for k in range(len(tissue.shape)))
     engine.jacobian(tissue, view, names, samples=samples, seed=0)
     begun = time.process_time()
-    slopes = np.stack([engine.jacobian(tissue, view, names, samples=samples, seed=100 + repeat).jacobian for repeat in range(repeats)])
+    slopes = np.stack(
+        [engine.jacobian(tissue, view, names, samples=samples, seed=100 + repeat).jacobian for repeat in range(repeats)]
+    )
     seconds = (time.process_time() - begun) / repeats / len(names)
     by_pixel = (slopes * picture).sum(axis=2)
     return [of_parts(by_pixel[:, [mode]], seconds) for mode in range(len(names))]
 
 
-def _differences(engine: Engine, tissue: Tissue, view: View, mode: int, step: float, picture: Array, samples: int, repeats: int) -> Estimate:
+def _differences(
+    engine: Engine, tissue: Tissue, view: View, mode: int, step: float, picture: Array, samples: int, repeats: int
+) -> Estimate:
     # Random numbers are common to the two sides of a difference, and to no other step.
     seconds, sides, first_seed = 0.0, [], 1000 + round(1000 * step)
     for sign in (1, -1):
         moved = tissue.with_values({f"shape.{mode}": tissue.shape[mode] + sign * step})
         engine.images(moved, view, samples=16, seed=0)
         begun = time.process_time()
-        sides.append(np.stack([engine.images(moved, view, samples=samples, seed=first_seed + repeat).mean for repeat in range(repeats)]))
+        sides.append(
+            np.stack(
+                [
+                    engine.images(moved, view, samples=samples, seed=first_seed + repeat).mean
+                    for repeat in range(repeats)
+                ]
+            )
+        )
         seconds += (time.process_time() - begun) / repeats
     return of_parts(((sides[0] - sides[1]) * picture).sum(axis=1)[:, None] / (2 * step), seconds)
 
 
-def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, scores: Estimate, differences: dict[float, Estimate]) -> list[GradientRow]:
+def _compare(
+    tissue: str,
+    mode: int,
+    samples: tuple[int, int],
+    ours: Estimate,
+    scores: Estimate,
+    differences: dict[float, Estimate],
+) -> list[GradientRow]:
     # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias, from their own steps alone.
     steps = np.array([*differences])
     values = np.array([d.mean[0] for d in differences.values()])
@@ -102,7 +127,9 @@ def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, s
 
     derivative = np.average([theirs, ours.mean[0]], weights=[1 / covariance[0, 0], 1 / ours.mean_variance[0]])
     wanted = (WANTED_ERROR * derivative) ** 2
-    costs = {h: d.seconds * d.variance[0] / max(wanted - curvature_squared * h**4, 1e-300) for h, d in differences.items()}
+    costs = {
+        h: d.seconds * d.variance[0] / max(wanted - curvature_squared * h**4, 1e-300) for h, d in differences.items()
+    }
     best = min(costs, key=lambda h: costs[h])
     our_cost = ours.seconds * ours.variance[0] / max(wanted - our_bias_squared, 1e-300)
     z = float((theirs - ours.mean[0]) / np.sqrt(noise_squared))
@@ -119,7 +146,12 @@ def _compare(tissue: str, mode: int, samples: tuple[int, int], ours: Estimate, s
     rows += [row(f"central differences, step {h:g}", d, paths) for h, d in differences.items()]
     summary = row(f"central differences, step {best:g}", differences[best], paths)
     ratio = float(costs[best] / our_cost)
-    return [*rows, summary.model_copy(update={"benchmark": f"transport-gradient {tissue}-summary", "efficiency_ratio": ratio, "z": z})]
+    return [
+        *rows,
+        summary.model_copy(
+            update={"benchmark": f"transport-gradient {tissue}-summary", "efficiency_ratio": ratio, "z": z}
+        ),
+    ]
 
 
 def _resolved(bias: float, variance: float) -> float:

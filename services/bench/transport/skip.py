@@ -75,9 +75,14 @@ def cases() -> list[Case]:
 
     incisor = build_incisor()
     rig = dome_lights(LIGHTS, ("green",), seed=1)
-    positions, intensities = np.array([light.position_mm for light in rig]), np.array([light.intensity[0] for light in rig])
+    positions, intensities = (
+        np.array([light.position_mm for light in rig]),
+        np.array([light.intensity[0] for light in rig]),
+    )
     homogeneous = single_tooth(incisor.outer, None, positions, intensities)
-    few = replace(homogeneous, light_positions_mm=positions[list(FEW_LIGHTS)], light_intensities=intensities[list(FEW_LIGHTS)])
+    few = replace(
+        homogeneous, light_positions_mm=positions[list(FEW_LIGHTS)], light_intensities=intensities[list(FEW_LIGHTS)]
+    )
     dentin = dentin_blend_shape(incisor.outer)
     modelled = Mesh(dentin.vertices_mm(TISSUE.shape), dentin.base.faces)
     plain, unable = Engine(homogeneous), PlainEngine(homogeneous)
@@ -85,7 +90,11 @@ def cases() -> list[Case]:
     stainable = Engine(replace(homogeneous, teeth=(replace(tooth, stain_uv=coordinates),)))
     stained = replace(TISSUE, shape=(), stain=Stain(np.full((4, 4), 0.8)))
     blend = Engine(single_tooth(incisor.outer, dentin, positions, intensities))
-    known = Engine(single_tooth(incisor.outer, DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape))), positions, intensities))
+    known = Engine(
+        single_tooth(
+            incisor.outer, DentinShape(modelled, np.zeros((0, *modelled.vertices_mm.shape))), positions, intensities
+        )
+    )
     camera = dome_cameras(1, PIXEL_MM, (incisor.outer,))[0]
     every_pixel, (crop, cropped_camera) = _view(camera), _crop(camera)
     one, unused, tabulated, ready, two, layered = (
@@ -113,10 +122,20 @@ def cases() -> list[Case]:
         Case("dentin", images(plain, unused), bare, images(known)),
         Case("second lobe", images(plain, ready), bare, images(plain, two)),
         Case("phase table", images(plain, tabulated), bare, images(plain, Tissue(tabulated.dentin, ONE_LOBE))),
-        Case("thin faces", images(Engine(replace(homogeneous, boundary="thin", ior=1.0))), bare, images(Engine(replace(homogeneous, boundary="thin")))),
+        Case(
+            "thin faces",
+            images(Engine(replace(homogeneous, boundary="thin", ior=1.0))),
+            bare,
+            images(Engine(replace(homogeneous, boundary="thin"))),
+        ),
         Case("stains", images(stainable), bare, images(stainable, stained)),
         Case("order bins", images(plain), bare, orders),
-        Case("unseen lights", images(plain, view=replace(every_pixel, lights=FEW_LIGHTS)), images(Engine(few)), images(plain)),
+        Case(
+            "unseen lights",
+            images(plain, view=replace(every_pixel, lights=FEW_LIGHTS)),
+            images(Engine(few)),
+            images(plain),
+        ),
         Case("masked pixels", images(plain, view=crop), images(plain, view=_view(cropped_camera)), images(plain)),
     ]
 
@@ -148,12 +167,24 @@ def _compare(case: Case, samples: int) -> list[SkipRow]:
     seconds_on = time.perf_counter() - begun
 
     # One image's error, from the variances of all of them.
-    errors = [np.sqrt(np.mean([(e.variance.sum() / np.sum(e.mean**2)) for w, e in estimates if w == which])) for which in (0, 1)]
+    errors = [
+        np.sqrt(np.mean([(e.variance.sum() / np.sum(e.mean**2)) for w, e in estimates if w == which]))
+        for which in (0, 1)
+    ]
     ratio = float(np.median(seconds[:, 0] / seconds[:, 1]))
     name, (ours, theirs) = f"transport-skip {case.name}", np.median(seconds, axis=0)
     peer = SkipRow(benchmark=name, peer="without", seconds=theirs, error=errors[1], operations=without)
-    summary = {"efficiency_ratio": float(errors[1] ** 2 / errors[0] ** 2 / ratio), "time_ratio": ratio, "operations_on": on, "seconds_on": seconds_on}
-    return [SkipRow(benchmark=name, peer="dentine", seconds=ours, error=errors[0], operations=off), peer, peer.model_copy(update=summary)]
+    summary = {
+        "efficiency_ratio": float(errors[1] ** 2 / errors[0] ** 2 / ratio),
+        "time_ratio": ratio,
+        "operations_on": on,
+        "seconds_on": seconds_on,
+    }
+    return [
+        SkipRow(benchmark=name, peer="dentine", seconds=ours, error=errors[0], operations=off),
+        peer,
+        peer.model_copy(update=summary),
+    ]
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:

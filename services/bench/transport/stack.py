@@ -38,7 +38,11 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
         peers.extend(_peer(Path(folder), stack, view, peer_lights, samples) for samples in counts)
     rows += peers
     efficiency = [np.mean([1 / (row.seconds * row.error**2) for row in group]) for group in (ours, peers)]
-    rows.append(peers[-1].model_copy(update={"benchmark": "transport-stack-summary", "efficiency_ratio": float(efficiency[0] / efficiency[1])}))
+    rows.append(
+        peers[-1].model_copy(
+            update={"benchmark": "transport-stack-summary", "efficiency_ratio": float(efficiency[0] / efficiency[1])}
+        )
+    )
     return [row.model_dump() for row in rows]
 
 
@@ -55,8 +59,15 @@ def _peer(folder: Path, stack: IncisorStack, view: View, count: int, samples: in
         seconds += time.perf_counter() - begun
         mean.append(image[y, x])
         variance.append(spread[y, x])
-    return _row("mitsuba-prbvolpath", seconds * len(stack.light_positions_mm) / count, np.array(mean), np.array(variance))
+    return _row(
+        "mitsuba-prbvolpath", seconds * len(stack.light_positions_mm) / count, np.array(mean), np.array(variance)
+    )
 
 
 def _row(peer: str, seconds: float, mean: NDArray[np.float64], variance: NDArray[np.float64]) -> Row:
-    return Row(benchmark="transport-stack", peer=peer, seconds=seconds, error=float(np.sqrt(variance.sum()) / np.linalg.norm(mean)))
+    return Row(
+        benchmark="transport-stack",
+        peer=peer,
+        seconds=seconds,
+        error=float(np.sqrt(variance.sum()) / np.linalg.norm(mean)),
+    )

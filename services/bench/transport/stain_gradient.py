@@ -64,7 +64,9 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
             return float((image * residual).sum())
 
         begun = time.process_time()
-        differences = np.array([(shifted(STEP, 200 + repeat) - shifted(-STEP, 200 + repeat)) / (2 * STEP) for repeat in range(repeats)])
+        differences = np.array(
+            [(shifted(STEP, 200 + repeat) - shifted(-STEP, 200 + repeat)) / (2 * STEP) for repeat in range(repeats)]
+        )
         theirs = (time.process_time() - begun) / repeats
         gap = values.mean() - differences.mean()
         z = float(-gap / np.sqrt((values.var(ddof=1) + differences.var(ddof=1)) / repeats))
@@ -72,8 +74,22 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
         ratios.append(ratio)
         size_of = abs(float(values.mean()))
         common: dict[str, Any] = {"benchmark": "transport-gradient stains", "parameter": name, "samples": samples}
-        rows.append(GradientRow(**common, peer="dentine", seconds=share, error=float(values.std(ddof=1)) / size_of, gradient=float(values.mean())))
-        peer = GradientRow(**common, peer=PEER, seconds=theirs, error=float(differences.std(ddof=1)) / size_of, gradient=float(differences.mean()))
+        rows.append(
+            GradientRow(
+                **common,
+                peer="dentine",
+                seconds=share,
+                error=float(values.std(ddof=1)) / size_of,
+                gradient=float(values.mean()),
+            )
+        )
+        peer = GradientRow(
+            **common,
+            peer=PEER,
+            seconds=theirs,
+            error=float(differences.std(ddof=1)) / size_of,
+            gradient=float(differences.mean()),
+        )
         summary = {"benchmark": "transport-gradient stains-summary", "efficiency_ratio": ratio, "z": z}
         rows += [peer, peer.model_copy(update=summary)]
     means = {"parameter": None, "gradient": None, "z": None, "efficiency_ratio": float(np.exp(np.mean(np.log(ratios))))}

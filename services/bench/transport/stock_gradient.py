@@ -17,7 +17,10 @@ from services.fit.transport.scene.recipe import View
 def shared_names(tissue: Tissue) -> tuple[str, ...]:
     """Parameters that both have: those of a second lobe only where there is one."""
     media = {"enamel": tissue.enamel, "dentin": tissue.dentin}
-    fields = {part: ("sigma", "alpha", "beta", "g1", "g2") if medium.beta < 1 else ("sigma", "alpha", "g1") for part, medium in media.items()}
+    fields = {
+        part: ("sigma", "alpha", "beta", "g1", "g2") if medium.beta < 1 else ("sigma", "alpha", "g1")
+        for part, medium in media.items()
+    }
     return tuple(f"{part}.{field}" for part, names in fields.items() for field in names)
 
 
@@ -53,7 +56,9 @@ class StockGradient:
         residual[self._y, self._x, 0] = image[self._y, self._x] - reference
         for key in self._keys:
             dr.set_grad(self._params[key], 0)
-        self._scene.integrator().render_backward(self._scene, self._params, mi.TensorXf(residual), seed=2 * seed + 1, spp=samples)
+        self._scene.integrator().render_backward(
+            self._scene, self._params, mi.TensorXf(residual), seed=2 * seed + 1, spp=samples
+        )
         gradients = [float(dr.grad(self._params[key])[0]) for key in self._keys]
         # Mitsuba's weight is that of the second lobe.
         return np.array([-g if name.endswith(".beta") else g for name, g in zip(self.names, gradients, strict=True)])

@@ -41,12 +41,21 @@ class SubjectMotion:
 
         # Drift along one direction with a sway across it; the norm is at most 1.
         along, across = math.sin(math.pi / 2 * progress), SWAY_SHARE * math.sin(2 * math.pi * progress)
-        drift = np.array([along * math.cos(direction) - across * math.sin(direction), along * math.sin(direction) + across * math.cos(direction)])
+        drift = np.array(
+            [
+                along * math.cos(direction) - across * math.sin(direction),
+                along * math.sin(direction) + across * math.cos(direction),
+            ]
+        )
         drift /= math.hypot(1, SWAY_SHARE)
 
         # One wave across the image bends it; the norm of (cos, cos)/√2 is at most 1.
         y, x = (np.arange(height)[:, None] + 0.5) / height, (np.arange(width)[None, :] + 0.5) / width
-        warp = along * np.stack([np.cos(math.pi * (x + y) + phase_x), np.cos(math.pi * (x - y) + phase_y)], axis=-1) / math.sqrt(2)
+        warp = (
+            along
+            * np.stack([np.cos(math.pi * (x + y) + phase_x), np.cos(math.pi * (x - y) + phase_y)], axis=-1)
+            / math.sqrt(2)
+        )
         return self.motion_px * ((1 - WARP_SHARE) * drift + WARP_SHARE * warp)
 
 

@@ -42,5 +42,7 @@ class Cameras(Protocol):
     def __enter__(self) -> Self:
         """Open the cameras."""
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Release the cameras."""

@@ -32,14 +32,18 @@ class SensorModel:
     def __init__(self, spec: SimulatedCameraSpec, peak_radiance: float, level: float, exposure_s: float) -> None:
         self.spec = spec
         self.full_scale = 2**spec.bits - 1
-        self.radiance_per_count = peak_radiance * level * exposure_s / (PEAK_FRACTION * (self.full_scale - spec.black_level))
+        self.radiance_per_count = (
+            peak_radiance * level * exposure_s / (PEAK_FRACTION * (self.full_scale - spec.black_level))
+        )
 
     def expose(self, radiance_s: NDArray[np.float32], noise_seed: Sequence[int] | None) -> NDArray[np.uint16]:
         """Counts of an image of level x radiance x seconds; without a seed the sensor is free of noise."""
         signal = radiance_s / self.radiance_per_count
         if noise_seed is not None:
             deviation = np.hypot(self.spec.noise_relative * signal, self.spec.noise_floor * self.full_scale)
-            signal = signal + deviation * np.random.default_rng([self.spec.seed, *noise_seed]).standard_normal(signal.shape, dtype=np.float32)
+            signal = signal + deviation * np.random.default_rng([self.spec.seed, *noise_seed]).standard_normal(
+                signal.shape, dtype=np.float32
+            )
         return np.clip(np.rint(self.spec.black_level + signal), 0, self.full_scale).astype(np.uint16)
 
 
@@ -70,7 +74,9 @@ class SimulatedCameras:
         self._observer = DomeObserver(*self._address)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._observer is not None:
             self._observer.close()
 
@@ -118,7 +124,14 @@ class SimulatedCameras:
 class PlaybackCameras:
     """``Cameras`` that play a folder's images for the planned lights, whatever the dome does: no motion, no noise."""
 
-    def __init__(self, stills: Stills, rig: RigSpec, level: float, plan: Sequence[PlannedFrame], wait: Callable[[float], None] = time.sleep) -> None:
+    def __init__(
+        self,
+        stills: Stills,
+        rig: RigSpec,
+        level: float,
+        plan: Sequence[PlannedFrame],
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
         self._stills, self._plan, self._wait = stills, plan, wait
         self._sensor = SensorModel(rig.simulation, stills.peak_radiance, level, rig.exposure_s)
         self._frame = 0
@@ -129,7 +142,9 @@ class PlaybackCameras:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Nothing to release."""
 
     def arm(self, exposure_s: float, frame: int) -> None:  # noqa: ARG002

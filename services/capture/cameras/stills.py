@@ -53,13 +53,19 @@ def _find(folder: Path, description: FolderCapture) -> dict[tuple[int, int], Pat
     for entry in description.images:
         for kind, name, known in (("camera", entry.camera, cameras), ("light", entry.light, lights)):
             if name not in known:
-                raise CaptureInputError(f"Image {entry.file} in {folder / 'capture.json'} names unknown {kind} '{name}'; known are {', '.join(known)}.")
+                raise CaptureInputError(
+                    f"Image {entry.file} in {folder / 'capture.json'} names unknown {kind} '{name}'; known are {', '.join(known)}."
+                )
         path = folder / entry.file
         if not path.is_file():
-            raise CaptureInputError(f"Image {path} of camera {entry.camera} and light {entry.light} does not exist; restore the file.")
+            raise CaptureInputError(
+                f"Image {path} of camera {entry.camera} and light {entry.light} does not exist; restore the file."
+            )
         files[cameras[entry.camera], lights[entry.light]] = path
     for camera, i in cameras.items():
         for light, j in lights.items():
             if (i, j) not in files:
-                raise CaptureInputError(f"{folder / 'capture.json'} has no image of camera {camera} and light {light}; add it or remove the light.")
+                raise CaptureInputError(
+                    f"{folder / 'capture.json'} has no image of camera {camera} and light {light}; add it or remove the light."
+                )
     return files

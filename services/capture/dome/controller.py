@@ -49,7 +49,9 @@ def all_off(host: str, port: int) -> DomeStatus:
             problem = LinkError(f"light {status.lit[0]} still emits")
     finally:
         link.close()
-    raise error_kind(problem)(f"The dome at {host}:{port} is not confirmed dark ({problem}); press its emergency stop or cut its power.") from problem
+    raise error_kind(problem)(
+        f"The dome at {host}:{port} is not confirmed dark ({problem}); press its emergency stop or cut its power."
+    ) from problem
 
 
 class DomeObserver:

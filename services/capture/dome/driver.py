@@ -25,7 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.capture.dome import registers as reg
-from services.capture.dome.controller import DARK_ATTEMPTS, REPLY_TIMEOUT_S, OtherDeviceError, error_kind, fault_names, read_status, require_dome
+from services.capture.dome.controller import (
+    DARK_ATTEMPTS,
+    REPLY_TIMEOUT_S,
+    OtherDeviceError,
+    error_kind,
+    fault_names,
+    read_status,
+    require_dome,
+)
 from services.capture.dome.keepalive import KeepAlive
 from services.capture.dome.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
 from services.capture.dome.protocol import ExposureBudget, Rgb
@@ -69,7 +77,9 @@ class ModbusDome:
         self._catch_signals()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             # An exception may have struck between a request and its answer: start from a clean connection.
             if kind is not None:
@@ -99,7 +109,9 @@ class ModbusDome:
             self._account()
             self._require_wanted()
             if not lights or lights.stop > self._light_count or lights.start < 0:
-                raise RigError(f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the plan.")
+                raise RigError(
+                    f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the plan."
+                )
             self._budget.require(lights, level, on_s)
             self._require_safe()
             self._keepalive.require_alive()
@@ -127,7 +139,9 @@ class ModbusDome:
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.EXPOSURE_TRIGGER, [1])
             if self._link.read(reg.TRIGGER_COUNT)[0] != (before + 1) & 0xFFFF:
-                raise RigError(f"The dome at {self.address} did not trigger the cameras; check the controller and run again.")
+                raise RigError(
+                    f"The dome at {self.address} did not trigger the cameras; check the controller and run again."
+                )
 
     def dark(self) -> None:
         """Switch every light off and check it. All-off alone is repeated: it can only make things safer."""
@@ -200,7 +214,9 @@ class ModbusDome:
                         self._require_armed()
                         self._require_safe()
                         self._require_no_fault()
-                raise error_kind(problem)(f"Dome failure: {problem}; lights were switched off, check the controller and its network.") from problem
+                raise error_kind(problem)(
+                    f"Dome failure: {problem}; lights were switched off, check the controller and its network."
+                ) from problem
             raise
 
     def _confirmed(self) -> Rgb:
@@ -226,7 +242,9 @@ class ModbusDome:
         try:
             require_dome(self._link)
         except (OtherDeviceError, RefusedError) as answer:
-            raise RigError(f"The device at {self.address} does not answer as a dome controller; correct rig.dome.") from answer
+            raise RigError(
+                f"The device at {self.address} does not answer as a dome controller; correct rig.dome."
+            ) from answer
         except LinkError:
             with self._dark_on_error():
                 raise
@@ -234,15 +252,21 @@ class ModbusDome:
     def _identify(self) -> None:
         firmware = self._link.read(reg.FIRMWARE)[0]
         if firmware >> 8 != reg.FIRMWARE_MAJOR:
-            raise RigError(f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR}; update one of them.")
+            raise RigError(
+                f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR}; update one of them."
+            )
         self._light_count = self._link.read(reg.LIGHT_COUNT)[0]
         if not 1 <= self._light_count <= reg.MAX_LIGHTS:
-            raise RigError(f"The dome at {self.address} reports {self._light_count} lights, outside 1 to {reg.MAX_LIGHTS}; check its configuration.")
+            raise RigError(
+                f"The dome at {self.address} reports {self._light_count} lights, outside 1 to {reg.MAX_LIGHTS}; check its configuration."
+            )
 
     def _require_safe(self) -> None:
         closed, pressed = self._link.read(reg.INTERLOCK_CLOSED, 2)
         if pressed:
-            raise InterlockError(f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and run again.")
+            raise InterlockError(
+                f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and run again."
+            )
         if not closed:
             raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
 
@@ -252,13 +276,17 @@ class ModbusDome:
 
     def _require_armed(self) -> None:
         if self._link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS:
-            raise RigStoppedError(f"ALL OFF was pressed for the dome at {self.address} and it stays dark; start again when the subject is ready.")
+            raise RigStoppedError(
+                f"ALL OFF was pressed for the dome at {self.address} and it stays dark; start again when the subject is ready."
+            )
 
     def _require_no_fault(self) -> None:
         faults = reg.FaultBit(self._link.read(reg.FAULTS)[0])
         if faults:
             self._require_armed()
-            raise RigError(f"The dome at {self.address} reports {' and '.join(fault_names(faults))}; remove the cause and run again.")
+            raise RigError(
+                f"The dome at {self.address} reports {' and '.join(fault_names(faults))}; remove the cause and run again."
+            )
 
     def _rgb(self, register: reg.Register) -> NDArray[np.int64]:
         return np.asarray(self._link.read(register, 3 * self._light_count), dtype=np.int64).reshape(-1, 3)
@@ -268,7 +296,9 @@ class ModbusDome:
             self._link.write(register, values)
         held = self._link.read(register)
         if held != values:
-            raise ReadbackError(f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the controller.")
+            raise ReadbackError(
+                f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the controller."
+            )
 
     def _account(self) -> None:
         lit, self._lit = self._lit, None

@@ -48,7 +48,9 @@ class KeepAlive:
     def require_alive(self) -> None:
         """Raise RigError when no feed has succeeded for a watchdog period."""
         if self._stop.is_set() or time.monotonic() > self._fed_at_s + self._watchdog_s:
-            raise RigError(f"The dome's watchdog is no longer fed ({self._problem or 'stopped'}); check the network and run again.")
+            raise RigError(
+                f"The dome's watchdog is no longer fed ({self._problem or 'stopped'}); check the network and run again."
+            )
 
     def _feed(self) -> None:
         while not self._stop.wait(self._watchdog_s / FEEDS_PER_WATCHDOG):

@@ -71,7 +71,9 @@ class ModbusLink:
             NoReplyError, RefusedError, WrongReplyError.
         """
         if register.space == "coil":
-            answer = self._transact(register, partial(self._client.write_coil, register.address, bool(values[0]), device_id=UNIT))
+            answer = self._transact(
+                register, partial(self._client.write_coil, register.address, bool(values[0]), device_id=UNIT)
+            )
             if answer.address != register.address:
                 self._discard(register, "echoes another address")
             return
@@ -107,7 +109,9 @@ class ModbusLink:
                 self._client.close()
                 raise NoReplyError(f"the controller at {self.address} does not answer for {register.name}") from problem
             if answer.isError():
-                raise RefusedError(f"the controller at {self.address} refuses {register.name} with Modbus exception {answer.exception_code}")
+                raise RefusedError(
+                    f"the controller at {self.address} refuses {register.name} with Modbus exception {answer.exception_code}"
+                )
             return answer
 
     def _discard(self, register: Register, what: str) -> None:

@@ -34,7 +34,9 @@ class FaultOrder:
 
     def take(self, space: Space, address: int, count: int) -> FaultKind:
         """The fault this request meets, if any, and one time less."""
-        meant = self.space == reg.ANY_SPACE or (self.space == reg.SPACE_CODE[space] and address <= self.address < address + count)
+        meant = self.space == reg.ANY_SPACE or (
+            self.space == reg.SPACE_CODE[space] and address <= self.address < address + count
+        )
         if self.times == 0 or not meant:
             return FaultKind.NONE
         self.times -= 1
@@ -119,7 +121,9 @@ class DomeModel:
             if first < last:
                 touched.add(register.name)
                 if space == "holding":
-                    held[register.name][first - register.address : last - register.address] = values[first - address : last - address]
+                    held[register.name][first - register.address : last - register.address] = values[
+                        first - address : last - address
+                    ]
         if space == "coil":
             return self._pulse(touched) if values[0] else 0
         if reg.ACTIVE_LIGHT.name in touched:
@@ -192,4 +196,7 @@ class DomeModel:
 
     def _bank_currents_ma(self) -> list[float]:
         emitted, per_bank = self.outputs(), 3 * reg.LIGHTS_PER_BANK
-        return [FULL_LED_MA * sum(emitted[bank * per_bank : (bank + 1) * per_bank]) / reg.FULL_SCALE for bank in range(reg.MAX_BANKS)]
+        return [
+            FULL_LED_MA * sum(emitted[bank * per_bank : (bank + 1) * per_bank]) / reg.FULL_SCALE
+            for bank in range(reg.MAX_BANKS)
+        ]

@@ -51,7 +51,9 @@ class Dome(Protocol):
     def __enter__(self) -> Self:
         """Connect, check safety, arm the watchdog."""
 
-    def __exit__(self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Go dark, whatever happened."""
 
 

@@ -79,29 +79,70 @@ class Register:
 IDENTITY = Register("identity", "input", 0, 1, "1", f"always 0x{IDENTITY_VALUE:04X}")
 FIRMWARE = Register("firmware", "input", 1, 1, "1", f"major x 256 + minor; this map is major {FIRMWARE_MAJOR}")
 LIGHT_COUNT = Register("light_count", "input", 2, 1, "1", f"lights fitted, at most {MAX_LIGHTS}")
-FAULTS = Register("faults", "input", 3, 1, "bits", ", ".join(f"{bit.value} {bit.name.lower().replace('_', ' ')}" for bit in FaultBit if bit.name))
+FAULTS = Register(
+    "faults",
+    "input",
+    3,
+    1,
+    "bits",
+    ", ".join(f"{bit.value} {bit.name.lower().replace('_', ' ')}" for bit in FaultBit if bit.name),
+)
 TRIGGER_COUNT = Register("trigger_count", "input", 4, 1, "1", "exposure triggers since power-on, modulo 65536")
-BANK_TEMPERATURE = Register("bank_temperature", "input", 16, MAX_BANKS, "0.1 degC", f"heat sink of each bank of {LIGHTS_PER_BANK} lights")
+BANK_TEMPERATURE = Register(
+    "bank_temperature", "input", 16, MAX_BANKS, "0.1 degC", f"heat sink of each bank of {LIGHTS_PER_BANK} lights"
+)
 BANK_CURRENT = Register("bank_current", "input", 32, MAX_BANKS, "mA", "supply current of each bank")
-OUTPUTS = Register("outputs", "input", 1000, 3 * MAX_LIGHTS, "1/65535", "light emitted now: R, G, B of light 0, of light 1, ...")
+OUTPUTS = Register(
+    "outputs", "input", 1000, 3 * MAX_LIGHTS, "1/65535", "light emitted now: R, G, B of light 0, of light 1, ..."
+)
 
 INTERLOCK_CLOSED = Register("interlock_closed", "discrete", 0, 1, "1", "1 when the interlock loop is closed")
 EMERGENCY_STOP = Register("emergency_stop", "discrete", 1, 1, "1", "1 when the emergency stop is pressed")
-SUPPLY_ON = Register("supply_on", "discrete", 2, 1, "1", "1 when the LED supply relay is closed: watchdog fed, no fault, interlock closed")
+SUPPLY_ON = Register(
+    "supply_on",
+    "discrete",
+    2,
+    1,
+    "1",
+    "1 when the LED supply relay is closed: watchdog fed, no fault, interlock closed",
+)
 
 ALL_OFF = Register("all_off", "coil", 0, 1, "1", "write 1: every level becomes 0; reads 0")
-EXPOSURE_TRIGGER = Register("exposure_trigger", "coil", 1, 1, "1", "write 1: pulse on the cameras' trigger line; reads 0")
-FAULT_RESET = Register("fault_reset", "coil", 2, 1, "1", "write 1: clear latched faults whose cause is gone; levels stay 0; reads 0")
+EXPOSURE_TRIGGER = Register(
+    "exposure_trigger", "coil", 1, 1, "1", "write 1: pulse on the cameras' trigger line; reads 0"
+)
+FAULT_RESET = Register(
+    "fault_reset", "coil", 2, 1, "1", "write 1: clear latched faults whose cause is gone; levels stay 0; reads 0"
+)
 
 KEEPALIVE = Register("keepalive", "holding", 0, 1, "1", "any write feeds the watchdog; nothing else does")
 WATCHDOG_MS = Register(
-    "watchdog_ms", "holding", 1, 1, "ms", f"go dark when not fed for this long; {STOPPED_MS} keeps the supply open whatever is fed (ALL OFF)"
+    "watchdog_ms",
+    "holding",
+    1,
+    1,
+    "ms",
+    f"go dark when not fed for this long; {STOPPED_MS} keeps the supply open whatever is fed (ALL OFF)",
 )
-STROBE_MS = Register("strobe_ms", "holding", 16, 1, "ms", "a level goes dark by itself this long after it was written; 0 for no limit")
+STROBE_MS = Register(
+    "strobe_ms", "holding", 16, 1, "ms", "a level goes dark by itself this long after it was written; 0 for no limit"
+)
 ACTIVE_LIGHT = Register(
-    "active_light", "holding", 17, 1, "1", f"fast path: on write this light takes active_level and all others 0; {ALL_LIGHTS} all, {NO_LIGHT} none"
+    "active_light",
+    "holding",
+    17,
+    1,
+    "1",
+    f"fast path: on write this light takes active_level and all others 0; {ALL_LIGHTS} all, {NO_LIGHT} none",
 )
-ACTIVE_LEVEL = Register("active_level", "holding", 18, 3, "1/65535", "R, G, B of the fast path; written in one transaction with active_light")
+ACTIVE_LEVEL = Register(
+    "active_level",
+    "holding",
+    18,
+    3,
+    "1/65535",
+    "R, G, B of the fast path; written in one transaction with active_light",
+)
 LEVELS = Register("levels", "holding", 1000, 3 * MAX_LIGHTS, "1/65535", "commanded R, G, B of light 0, of light 1, ...")
 FAULT_ORDER = Register(
     "fault_order",

@@ -34,7 +34,9 @@ _SPACES: dict[int, Space] = {
 }
 
 
-def serve_dome(host: str, port: int, lights: int, watchdog_s: float, announce: Callable[[str, int], None] | None = None) -> None:
+def serve_dome(
+    host: str, port: int, lights: int, watchdog_s: float, announce: Callable[[str, int], None] | None = None
+) -> None:
     """Serve one simulated dome until SIGINT or SIGTERM.
 
     Args:
@@ -47,14 +49,21 @@ def serve_dome(host: str, port: int, lights: int, watchdog_s: float, announce: C
         RigError: the port cannot be opened, or no dome has so many lights.
     """
     if not 1 <= lights <= reg.MAX_LIGHTS:
-        raise RigError(f"A dome with {lights} lights cannot be simulated, the register map holds 1 to {reg.MAX_LIGHTS}; correct --lights.")
+        raise RigError(
+            f"A dome with {lights} lights cannot be simulated, the register map holds 1 to {reg.MAX_LIGHTS}; correct --lights."
+        )
     asyncio.run(_serve(host, port, DomeModel(lights, watchdog_s), announce, with_parent=False))
 
 
 @contextmanager
 def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1") -> Iterator[tuple[str, int]]:
     """A simulated dome in a process of its own on a free port; yields its address. It ends when this process does."""
-    command = [sys.executable, "-m", "services.capture.dome.simulator", json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s})]
+    command = [
+        sys.executable,
+        "-m",
+        "services.capture.dome.simulator",
+        json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s}),
+    ]
     # A session of its own: Ctrl-C must reach the driver, which still needs the dome to go dark.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as process:  # noqa: S603
         assert process.stdin is not None
@@ -77,7 +86,9 @@ def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1"
             process.kill()
 
 
-def order_fault(host: str, port: int, kind: FaultKind, argument: int = 0, times: int = 1, on: reg.Register | None = None) -> None:
+def order_fault(
+    host: str, port: int, kind: FaultKind, argument: int = 0, times: int = 1, on: reg.Register | None = None
+) -> None:
     """Make the simulator at this address fail.
 
     Args:
@@ -102,7 +113,15 @@ class _Shell:
         self._model = model
         self._spoil_reply = FaultKind.NONE
 
-    async def action(self, function: int, start: int, address: int, count: int, registers: list[int], values: list[int] | list[bool] | None) -> ExcCodes | None:
+    async def action(
+        self,
+        function: int,
+        start: int,
+        address: int,
+        count: int,
+        registers: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
         """Called by pymodbus before each read and write."""
         space, span = _SPACES[function], count if values is None else len(values)
         is_order = space == "holding" and address == reg.FAULT_ORDER.address
@@ -143,11 +162,18 @@ class _Shell:
                 registers[register.address - start : register.end - start] = values
 
 
-async def _serve(host: str, port: int, model: DomeModel, announce: Callable[[str, int], None] | None, *, with_parent: bool) -> None:
+async def _serve(
+    host: str, port: int, model: DomeModel, announce: Callable[[str, int], None] | None, *, with_parent: bool
+) -> None:
     shell, loop, stop = _Shell(model), asyncio.get_running_loop(), asyncio.Event()
     coils, discretes = ([SimData(0, values=[False] * 16, datatype=DataType.BITS)] for _ in range(2))
     holdings, inputs = (
-        [SimData(r.address, count=r.count, values=0, datatype=DataType.REGISTERS) for r in reg.TABLE if r.space == space] for space in ("holding", "input")
+        [
+            SimData(r.address, count=r.count, values=0, datatype=DataType.REGISTERS)
+            for r in reg.TABLE
+            if r.space == space
+        ]
+        for space in ("holding", "input")
     )
     device = SimDevice(id=UNIT, simdata=(coils, discretes, holdings, inputs), action=shell.action)
     server = ModbusTcpServer(device, address=(host, port), trace_packet=shell.packet)

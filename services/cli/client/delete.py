@@ -12,4 +12,8 @@ def delete(job_id: JobId, server: Server = None, as_json: Json = False) -> None:
     """Delete a job that has ended, with all its files; prints the receipt."""
     with connect(server) as client:
         receipt = client.delete(job_id)
-    print(json.dumps(receipt) if as_json else f"deleted: {job_id}, {receipt['files']} files of {receipt['bytes']} bytes, digest {receipt['digest']}")
+    print(
+        json.dumps(receipt)
+        if as_json
+        else f"deleted: {job_id}, {receipt['files']} files of {receipt['bytes']} bytes, digest {receipt['digest']}"
+    )

@@ -14,8 +14,15 @@ from services.cli.client.watch import watch_job
 
 
 def demo(
-    server: Annotated[str | None, typer.Option(help="Server to run it on, such as http://127.0.0.1:8000; default: this machine, without a server.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results, where no server is given; the same folder goes on with it.")] = Path("demo"),
+    server: Annotated[
+        str | None,
+        typer.Option(
+            help="Server to run it on, such as http://127.0.0.1:8000; default: this machine, without a server."
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder of the results, where no server is given; the same folder goes on with it.")
+    ] = Path("demo"),
     name: Annotated[str, typer.Option(help="Label of the job on the server.")] = "Demonstration",
     as_json: Json = False,
 ) -> None:

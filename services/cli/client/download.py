@@ -14,7 +14,9 @@ from services.core.errors import InputError
 
 def download(
     job_id: JobId,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.zip", help="Where to write it; default: dentine-ID.zip here.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.zip", help="Where to write it; default: dentine-ID.zip here.")
+    ] = None,
     server: Server = None,
 ) -> None:
     """Download all files of a job as one zip: report, parameters, asset and pictures."""

@@ -21,9 +21,13 @@ MAX_AT_ONCE = 500
 
 def jobs(
     server: Server = None,
-    state: Annotated[list[str] | None, typer.Option(help="Only jobs in this state, such as failed; may be given several times.")] = None,
+    state: Annotated[
+        list[str] | None, typer.Option(help="Only jobs in this state, such as failed; may be given several times.")
+    ] = None,
     kind: Annotated[str | None, typer.Option(help="Only jobs of this kind: tooth or jaw.")] = None,
-    capture: Annotated[str | None, typer.Option(help="Only jobs with this text in the path of their capture or rig's mouth.")] = None,
+    capture: Annotated[
+        str | None, typer.Option(help="Only jobs with this text in the path of their capture or rig's mouth.")
+    ] = None,
     limit: Annotated[int, typer.Option(min=1, help="Most jobs to list.")] = 50,
     as_json: Json = False,
 ) -> None:

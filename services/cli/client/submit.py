@@ -16,9 +16,15 @@ from services.cli.client.watch import watch_job
 def submit(
     job: JobFile,
     server: Server = None,
-    send: Annotated[bool, typer.Option("--upload", help="Upload the job's capture, or its rig's mouth, first.")] = False,
-    calibration: Annotated[str | None, typer.Option(metavar="NAME", help="Calibration that the server stores, in place of the job's own.")] = None,
-    key: Annotated[str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")] = None,
+    send: Annotated[
+        bool, typer.Option("--upload", help="Upload the job's capture, or its rig's mouth, first.")
+    ] = False,
+    calibration: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Calibration that the server stores, in place of the job's own.")
+    ] = None,
+    key: Annotated[
+        str | None, typer.Option(help="Idempotency key; submitting twice with one key makes one job.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Label of the job, up to 80 characters.")] = None,
     follow: Annotated[bool, typer.Option("--watch", help="Watch the job until it ends.")] = False,
     as_json: Json = False,

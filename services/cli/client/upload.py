@@ -36,7 +36,9 @@ def upload_folder(client: Client, folder: Path, subject: str | None = None) -> U
     with UploadView() as view:
         uploaded = client.upload(folder, view, subject)
     if uploaded.left_out:
-        names = ", ".join(uploaded.left_out[:3]) + (f" and {len(uploaded.left_out) - 3} more" if len(uploaded.left_out) > 3 else "")
+        names = ", ".join(uploaded.left_out[:3]) + (
+            f" and {len(uploaded.left_out) - 3} more" if len(uploaded.left_out) > 3 else ""
+        )
         print(f"Left out, as no part of a capture: {names}.", file=sys.stderr)
     return uploaded
 

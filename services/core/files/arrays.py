@@ -25,13 +25,19 @@ def map_radiance(path: Path, shape: tuple[int, int, int], what: str) -> NDArray[
     """
     try:
         image = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as problem:  # a header of another's making raises what it likes: sizes beyond any integer, brackets without end
+    except (
+        Exception
+    ) as problem:  # a header of another's making raises what it likes: sizes beyond any integer, brackets without end
         reason = str(problem) or type(problem).__name__
-        raise CaptureInputError(f"{what} cannot be read as npy ({reason}); it may be truncated, so restore or export it again.") from problem
+        raise CaptureInputError(
+            f"{what} cannot be read as npy ({reason}); it may be truncated, so restore or export it again."
+        ) from problem
     if not isinstance(image, np.ndarray) or not np.issubdtype(image.dtype, np.floating):
         raise CaptureInputError(f"{what} does not hold floating-point radiance; export linear values as float32.")
     if image.shape != shape and not (shape[2] == 1 and image.shape == shape[:2]):
-        raise CaptureInputError(f"{what} has shape {image.shape} instead of {shape} (height, width, channels); export it at the camera's size.")
+        raise CaptureInputError(
+            f"{what} has shape {image.shape} instead of {shape} (height, width, channels); export it at the camera's size."
+        )
     return image.reshape(shape)
 
 
@@ -47,5 +53,7 @@ def as_float32(image: NDArray[np.floating[Any]], what: str) -> NDArray[np.float3
         too_large = np.isfinite(image) & ~np.isfinite(single)
         if too_large.any():
             largest = float(np.abs(image[too_large]).max())
-            raise CaptureInputError(f"{what} holds {largest:.3g}, beyond single precision ({MAX_FLOAT32:.2g}); scale the radiance down.")
+            raise CaptureInputError(
+                f"{what} holds {largest:.3g}, beyond single precision ({MAX_FLOAT32:.2g}); scale the radiance down."
+            )
     return single

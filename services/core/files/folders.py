@@ -21,7 +21,9 @@ def require_folder(path: Path, option: str) -> None:
     if not nearest.is_dir():
         raise InputError(f"{option} {path} cannot be a folder, as {nearest} is a file; name another one.")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"{option} {path} cannot be written, as {nearest} takes no new file; correct its permissions or name another one.")
+        raise InputError(
+            f"{option} {path} cannot be written, as {nearest} takes no new file; correct its permissions or name another one."
+        )
 
 
 def require_outside(path: Path, source: Path | None, option: str) -> None:
@@ -31,4 +33,6 @@ def require_outside(path: Path, source: Path | None, option: str) -> None:
         InputError: the folder is the source or lies in it.
     """
     if source is not None and path.resolve().is_relative_to(source.resolve()):
-        raise InputError(f"{option} {path} lies in {source}, which the results are made from; name a folder outside of it.")
+        raise InputError(
+            f"{option} {path} lies in {source}, which the results are made from; name a folder outside of it."
+        )

@@ -73,7 +73,11 @@ def _npy(head: bytes) -> Declared:
     if any(length < 0 for length in shape):
         raise ValueError("its header declares a negative length")
     array_bytes = math.prod(shape) * dtype.itemsize
-    return Declared(f"{' x '.join(map(str, shape)) or 'one'} numbers of {dtype.itemsize} bytes", array_bytes, stream.tell() + array_bytes)
+    return Declared(
+        f"{' x '.join(map(str, shape)) or 'one'} numbers of {dtype.itemsize} bytes",
+        array_bytes,
+        stream.tell() + array_bytes,
+    )
 
 
 def png_header(head: bytes) -> PngHeader:
@@ -124,7 +128,9 @@ def tiff_layout(head: bytes) -> TiffLayout:
 def _tiff(head: bytes) -> Declared:
     layout = tiff_layout(head)
     if layout.start >= len(head):
-        raise ValueError(f"its directory lies beyond the first {HEADER_BYTES} bytes; write it with the directory in front")
+        raise ValueError(
+            f"its directory lies beyond the first {HEADER_BYTES} bytes; write it with the directory in front"
+        )
     (count,) = struct.unpack_from(layout.count, head, layout.start)
     first = layout.start + struct.calcsize(layout.count)
     tags = {}
@@ -203,4 +209,6 @@ def _exr_channels(value: bytes) -> list[int]:
     return widths
 
 
-_READERS: Mapping[str, Callable[[bytes], Declared]] = MappingProxyType({".npy": _npy, ".png": _png, ".tif": _tiff, ".tiff": _tiff, ".exr": _exr})
+_READERS: Mapping[str, Callable[[bytes], Declared]] = MappingProxyType(
+    {".npy": _npy, ".png": _png, ".tif": _tiff, ".tiff": _tiff, ".exr": _exr}
+)

@@ -19,9 +19,56 @@ _SOFTWARE = b"Software"
 _TIFF_PLAIN = frozenset(
     {
         *range(254, 260),  # size, depth, compression, photometry
-        *(262, 263, 264, 265, 266, 273, 274, 277, 278, 279, 280, 281, 282, 283, 284, 286, 287, 288, 289, 290, 291, 292, 293, 296, 297),  # strips, orientation
+        *(
+            262,
+            263,
+            264,
+            265,
+            266,
+            273,
+            274,
+            277,
+            278,
+            279,
+            280,
+            281,
+            282,
+            283,
+            284,
+            286,
+            287,
+            288,
+            289,
+            290,
+            291,
+            292,
+            293,
+            296,
+            297,
+        ),  # strips, orientation
         305,  # the program that wrote it
-        *(301, 317, 318, 319, 320, 321, 322, 323, 324, 325, 330, 332, 334, 336, 338, 339, 340, 341, 342, 347),  # tiles, colours, sample formats
+        *(
+            301,
+            317,
+            318,
+            319,
+            320,
+            321,
+            322,
+            323,
+            324,
+            325,
+            330,
+            332,
+            334,
+            336,
+            338,
+            339,
+            340,
+            341,
+            342,
+            347,
+        ),  # tiles, colours, sample formats
         *(529, 530, 531, 532, 33421, 33422, 34675),  # YCbCr, mosaic, colour profile
     }
 )
@@ -47,8 +94,28 @@ _TIFF_NAMES: Mapping[int, str] = MappingProxyType(
 )
 _EXR_PLAIN = frozenset(
     {
-        *("channels", "compression", "dataWindow", "displayWindow", "originalDataWindow", "lineOrder", "pixelAspectRatio", "screenWindowCenter"),
-        *("screenWindowWidth", "tiles", "type", "name", "version", "chunkCount", "view", "multiView", "chromaticities", "whiteLuminance"),
+        *(
+            "channels",
+            "compression",
+            "dataWindow",
+            "displayWindow",
+            "originalDataWindow",
+            "lineOrder",
+            "pixelAspectRatio",
+            "screenWindowCenter",
+        ),
+        *(
+            "screenWindowWidth",
+            "tiles",
+            "type",
+            "name",
+            "version",
+            "chunkCount",
+            "view",
+            "multiView",
+            "chromaticities",
+            "whiteLuminance",
+        ),
         *("adoptedNeutral", "envmap", "wrapmodes", "dwaCompressionLevel", "maxSamplesPerPixel"),
     }
 )
@@ -158,4 +225,6 @@ def _exr(stream: BinaryIO) -> Iterator[str]:
             yield repr(name)[1:-1]
 
 
-_READERS: Mapping[str, Callable[[BinaryIO], Iterator[str]]] = MappingProxyType({".png": _png, ".tif": _tiff, ".tiff": _tiff, ".exr": _exr})
+_READERS: Mapping[str, Callable[[BinaryIO], Iterator[str]]] = MappingProxyType(
+    {".png": _png, ".tif": _tiff, ".tiff": _tiff, ".exr": _exr}
+)

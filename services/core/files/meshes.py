@@ -12,7 +12,9 @@ from services.core.errors import CaptureInputError, MeshError
 from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh, Tooth, teeth_folder
 
-FDI_NUMBERS = frozenset(10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6))
+FDI_NUMBERS = frozenset(
+    10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6)
+)
 """Permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""
 TOOTH_EXTENT_MM = (2.0, 45.0)
 """The longest tooth that was ever measured has 37 mm."""
@@ -61,7 +63,11 @@ def read_labelled_mesh(path: Path) -> tuple[Mesh, dict[str, NDArray[Any]]]:
         # The only place where trimesh keeps properties of a PLY file's faces.
         properties = loaded.metadata["_ply_raw"]["face"]["data"]
         names = properties.dtype.names if isinstance(properties, np.ndarray) else tuple(properties)
-        arrays = {name: np.asarray(properties[name]).reshape(-1) for name in names if name not in ("vertex_indices", "vertex_index")}
+        arrays = {
+            name: np.asarray(properties[name]).reshape(-1)
+            for name in names
+            if name not in ("vertex_indices", "vertex_index")
+        }
         return Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32)), arrays
     except Exception as problem:
         raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
@@ -82,9 +88,13 @@ def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, index.reshape(-1, 3)
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "u", "v"))
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}element face {len(faces)}\n"
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}element face {len(faces)}\n"
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(f"{head}property list uchar int vertex_indices\nend_header\n".encode() + vertices.tobytes() + faces.tobytes())
+    path.write_bytes(
+        f"{head}property list uchar int vertex_indices\nend_header\n".encode() + vertices.tobytes() + faces.tobytes()
+    )
 
 
 def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, ...]:
@@ -93,10 +103,16 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, .
     Raises:
         CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
     """
-    numbers = fdi if fdi is not None else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
+    numbers = (
+        fdi
+        if fdi is not None
+        else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
+    )
     if unknown := next((number for number in numbers if number not in FDI_NUMBERS), None):
         what = f"{root / 'teeth' / str(unknown)} is of tooth {unknown}, which is no FDI number"
-        raise CaptureInputError(f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on to 85.")
+        raise CaptureInputError(
+            f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on to 85."
+        )
     if not numbers:
         raise CaptureInputError(f"No tooth mesh below {root / 'teeth'}; put teeth/<FDI>/outer.ply there.")
     teeth = []

@@ -19,7 +19,11 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 
-NUMBER_TYPES = {f"{kind}{bits}": f"{letter}{bits // 8}" for kind, letter in (("Int", "i"), ("UInt", "u")) for bits in (8, 16, 32, 64)} | {
+NUMBER_TYPES = {
+    f"{kind}{bits}": f"{letter}{bits // 8}"
+    for kind, letter in (("Int", "i"), ("UInt", "u"))
+    for bits in (8, 16, 32, 64)
+} | {
     "Float32": "f4",
     "Float64": "f8",
 }
@@ -55,26 +59,39 @@ def read_polydata(path: Path) -> PolyData:
     try:
         return _polydata(path, path.read_bytes())
     except (expat.ExpatError, KeyError, ValueError, IndexError, zlib.error, binascii.Error) as problem:
-        raise CaptureInputError(f"Mesh file {path} is truncated or no VTK XML file ({problem}); export it again as VTK PolyData (.vtp).") from problem
+        raise CaptureInputError(
+            f"Mesh file {path} is truncated or no VTK XML file ({problem}); export it again as VTK PolyData (.vtp)."
+        ) from problem
 
 
 def _polydata(path: Path, content: bytes) -> PolyData:
     head, payload = _split(content)
     document = _parse(head)
     if document.file.get("type") != "PolyData":
-        raise CaptureInputError(f"Mesh file {path} holds VTK {document.file.get('type', 'data of no type')}; export the surface as PolyData (.vtp).")
+        raise CaptureInputError(
+            f"Mesh file {path} holds VTK {document.file.get('type', 'data of no type')}; export the surface as PolyData (.vtp)."
+        )
     compressor = document.file.get("compressor", COMPRESSOR)
     if compressor != COMPRESSOR:
-        raise CaptureInputError(f"Mesh file {path} is compressed by {compressor}; export it with zlib compression or none.")
+        raise CaptureInputError(
+            f"Mesh file {path} is compressed by {compressor}; export it with zlib compression or none."
+        )
     if len(document.pieces) != 1:
         raise CaptureInputError(f"Mesh file {path} is in {len(document.pieces)} pieces; export it as one.")
 
     counts = {key: int(value) for key, value in document.pieces[0].items()}
-    arrays = {(section, attributes["Name"]): _values(attributes, text, document, payload) for section, attributes, text in document.arrays}
+    arrays = {
+        (section, attributes["Name"]): _values(attributes, text, document, payload)
+        for section, attributes, text in document.arrays
+    }
     (points,) = (values for (section, _), values in arrays.items() if section == "Points")
     connectivity, offsets = (arrays["Polys", name].astype(np.int64) for name in ("connectivity", "offsets"))
-    if counts.get("NumberOfStrips", 0) or not np.array_equal(np.diff(offsets, prepend=0), np.full(counts["NumberOfPolys"], 3)):
-        raise CaptureInputError(f"Mesh file {path} holds polygons or strips besides triangles; triangulate it and export it again.")
+    if counts.get("NumberOfStrips", 0) or not np.array_equal(
+        np.diff(offsets, prepend=0), np.full(counts["NumberOfPolys"], 3)
+    ):
+        raise CaptureInputError(
+            f"Mesh file {path} holds polygons or strips besides triangles; triangulate it and export it again."
+        )
     triangles = connectivity.reshape(counts["NumberOfPolys"], 3)
     points = points.astype(np.float64).reshape(counts["NumberOfPoints"], 3)
     if len(triangles) == 0:
@@ -131,7 +148,11 @@ def _parse(head: bytes) -> _Document:
 
 
 def _values(attributes: dict[str, str], text: str, document: _Document, payload: bytes) -> NDArray[Any]:
-    kind, form, columns = NUMBER_TYPES[attributes["type"]], attributes["format"], int(attributes.get("NumberOfComponents", 1))
+    kind, form, columns = (
+        NUMBER_TYPES[attributes["type"]],
+        attributes["format"],
+        int(attributes.get("NumberOfComponents", 1)),
+    )
     if form == "ascii":
         values = np.array(text.split(), dtype=kind)
     else:
@@ -139,7 +160,9 @@ def _values(attributes: dict[str, str], text: str, document: _Document, payload:
         header = order + NUMBER_TYPES[document.file.get("header_type", "UInt32")]
         encoded = form == "binary" or document.appended.get("encoding") != "raw"
         source = text.strip().encode() if form == "binary" else payload[int(attributes["offset"]) :]
-        values = np.frombuffer(_decoded(source, header, encoded=encoded, compressed="compressor" in document.file), order + kind)
+        values = np.frombuffer(
+            _decoded(source, header, encoded=encoded, compressed="compressor" in document.file), order + kind
+        )
     return values.reshape(-1, columns) if columns > 1 else values
 
 

@@ -54,22 +54,37 @@ class Offset:
     def sentence(self, what: str) -> str:
         """What is wrong and what to do."""
         steps = [(self.right_mm, "right", "left"), (self.down_mm, "down", "up")]
-        parts = [f"{abs(size):.1f} mm {name if size > 0 else other}" for size, name, other in steps if abs(size) >= 0.3 * self.length_mm]
-        apart = f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, MIN_SE_MM):.1g} mm by the noise of both"
+        parts = [
+            f"{abs(size):.1f} mm {name if size > 0 else other}"
+            for size, name, other in steps
+            if abs(size) >= 0.3 * self.length_mm
+        ]
+        apart = (
+            f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, MIN_SE_MM):.1g} mm by the noise of both"
+        )
         return (
             f"In camera {self.camera} images and {what} are {apart} (the images lie {' and '.join(parts)}); "
             "how far along the line of sight cannot be seen in this way; recalibrate the camera or register the mesh again."
         )
 
 
-def clearest_offset(evaluation: Evaluation, observations: Observations, views: tuple[ViewStack, ...], channel: str, tooth: int | None = None) -> Offset | None:
+def clearest_offset(
+    evaluation: Evaluation,
+    observations: Observations,
+    views: tuple[ViewStack, ...],
+    channel: str,
+    tooth: int | None = None,
+) -> Offset | None:
     """The offset of the camera that shows one most clearly, or None where none does.
 
     Args:
         evaluation: of the final answer, with the images to compare.
         tooth: position of the one tooth of a jaw to look at; None for all that was fitted.
     """
-    found = [_offset(view, pixel_mm, images, tooth) for view, pixel_mm, images in _compared(evaluation, observations, views, channel)]
+    found = [
+        _offset(view, pixel_mm, images, tooth)
+        for view, pixel_mm, images in _compared(evaluation, observations, views, channel)
+    ]
     return max((offset for offset in found if offset is not None), key=lambda offset: offset.gain, default=None)
 
 
@@ -124,7 +139,9 @@ def _is_clear(found: FoundOffset, pixel_mm: float) -> bool:
 
 
 def _in_mm(camera: str, found: FoundOffset, pixel_mm: float) -> Offset:
-    return Offset(camera, found.right_px * pixel_mm, found.down_px * pixel_mm, found.length_se_px * pixel_mm, found.gain)
+    return Offset(
+        camera, found.right_px * pixel_mm, found.down_px * pixel_mm, found.length_se_px * pixel_mm, found.gain
+    )
 
 
 def offsets_told(
@@ -142,5 +159,9 @@ def offsets_told(
         what: whose mesh, such as "the mesh of tooth 11".
         tooth: position of the one tooth of a jaw to look at; None for all that was fitted.
     """
-    found = {c: clearest_offset(evaluations[c], observations, views[c], c, tooth) for c, error in errors.items() if error > LOOKED_AT}
+    found = {
+        c: clearest_offset(evaluations[c], observations, views[c], c, tooth)
+        for c, error in errors.items()
+        if error > LOOKED_AT
+    }
     return [f"{channel}: {offset.sentence(what)}" for channel, offset in found.items() if offset is not None]

@@ -96,7 +96,9 @@ class Evaluation:
 def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = ()) -> Evaluation:
     """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else."""
     seeds = passes.seeds(label, "evaluate-1"), passes.seeds(label, "evaluate-2")
-    found: list[BlockErrors] = passes.run(f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown)
+    found: list[BlockErrors] = passes.run(
+        f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown
+    )
     passes.record([block.trace for block in found])
     fitted, held_out = ErrorSums(), ErrorSums()
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = {}
@@ -110,8 +112,13 @@ def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, s
         for image, values in block.renders.items():
             pieces.setdefault(image, []).append((block.pixels, values))
             spreads.setdefault(image, []).append(block.spreads[image])
-    renders = {image: (np.concatenate([p for p, _ in some]), np.concatenate([v for _, v in some])) for image, some in pieces.items()}
-    return Evaluation(fitted, held_out, renders, parts, {image: np.concatenate(some) for image, some in spreads.items()})
+    renders = {
+        image: (np.concatenate([p for p, _ in some]), np.concatenate([v for _, v in some]))
+        for image, some in pieces.items()
+    }
+    return Evaluation(
+        fitted, held_out, renders, parts, {image: np.concatenate(some) for image, some in spreads.items()}
+    )
 
 
 @dataclass(frozen=True)
@@ -132,14 +139,24 @@ def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], sho
     start, block = time.time(), read_block(task.block)
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
-    first, second = (host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed).mean for seed in seeds)
+    first, second = (
+        host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed).mean
+        for seed in seeds
+    )
 
     def sums(pixels: NDArray[np.bool_]) -> tuple[ErrorSums, ErrorSums]:
-        fitted, held_out = (error_sums(first, second, block.reference, block.variance, chosen & pixels) for chosen in (block.fit_weight > 0, block.held_out))
+        fitted, held_out = (
+            error_sums(first, second, block.reference, block.variance, chosen & pixels)
+            for chosen in (block.fit_weight > 0, block.held_out)
+        )
         return fitted, held_out
 
     fitted, held_out = sums(np.ones(len(block.view), dtype=bool))
-    parts = {} if block.parts is None else {int(part): sums(block.parts.shown == part) for part in np.unique(block.parts.shown)}
+    parts = (
+        {}
+        if block.parts is None
+        else {int(part): sums(block.parts.shown == part) for part in np.unique(block.parts.shown)}
+    )
     camera = block.view.camera.name
     seen = [(name, light) for name, light in shown if name == camera]
     renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in seen}

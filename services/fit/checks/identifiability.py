@@ -54,10 +54,15 @@ def _is_told(estimate: Estimate) -> bool:
     return estimate.determined and estimate.se is not None and estimate.se <= TOLD * abs(estimate.value)
 
 
-def _sentence(seen: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool) -> str:
+def _sentence(
+    seen: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool
+) -> str:
     def values(name: str, what: str) -> str:
         found = [(channel, tables[channel][name]) for channel in channels]
-        texts = [("" if len(found) == 1 else f"{channel} ") + (_value(e) if what == "value" else _limits(e)) for channel, e in found]
+        texts = [
+            ("" if len(found) == 1 else f"{channel} ") + (_value(e) if what == "value" else _limits(e))
+            for channel, e in found
+        ]
         return ", ".join(texts)
 
     opening = "This capture" if alone else f"In {_listed(channels)} this capture"
@@ -92,7 +97,12 @@ def _alike(correlations: Mapping[str, Correlation]) -> str:
             if leaf_a in COORDINATES and leaf_b in COORDINATES and abs(one.matrix[a][b]) >= EXCHANGEABLE:
                 (word_a, sign_a), (word_b, sign_b) = COORDINATES[leaf_a], COORDINATES[leaf_b]
                 less = one.matrix[a][b] * sign_a * sign_b < 0
-                found.append((abs(one.matrix[a][b]), f"More {part_a} {word_a} with {'less' if less else 'more'} {part_b} {word_b} would look almost the same."))
+                found.append(
+                    (
+                        abs(one.matrix[a][b]),
+                        f"More {part_a} {word_a} with {'less' if less else 'more'} {part_b} {word_b} would look almost the same.",
+                    )
+                )
     return max(found)[1] if found else ""
 
 

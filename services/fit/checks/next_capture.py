@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera
 from services.core.records import Estimate
 from services.fit.checks.identifiability import QUANTITIES, in_words
-from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block, read_recipe, write_block, write_recipe
+from services.fit.execution.blocks import (
+    Block,
+    BlockTask,
+    StoredFile,
+    read_block,
+    read_recipe,
+    write_block,
+    write_recipe,
+)
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
@@ -75,7 +83,14 @@ class Probe:
 
 
 def advice(
-    problem: StackProblem[Tissue], known: Uncertainty, folder: Path, parts: Sequence[str], sensor: Sensor, weight: float, samples: int, pixel_step: int = 1
+    problem: StackProblem[Tissue],
+    known: Uncertainty,
+    folder: Path,
+    parts: Sequence[str],
+    sensor: Sensor,
+    weight: float,
+    samples: int,
+    pixel_step: int = 1,
 ) -> tuple[str, tuple[Candidate, ...]]:
     """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where none would.
 
@@ -95,7 +110,9 @@ def advice(
     run, label, pending = problem.passes.executor, f"{problem.passes.seeds.channel}-advice", []
     for index, probe in enumerate(probes):
         task = BlockTask(probe.block, index, recipe, label, similar, samples)
-        pending.append(run.submit(f"{label}-{index}", advice_task, task, how, seeds, known.sandwich, images, probe, sensor, weight))
+        pending.append(
+            run.submit(f"{label}-{index}", advice_task, task, how, seeds, known.sandwich, images, probe, sensor, weight)
+        )
     parts_found: list[tuple[dict[str, tuple[Addition, Addition]], TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts_found])
     sums: dict[str, tuple[Addition, Addition]] = {}
@@ -121,12 +138,16 @@ def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate
     return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(names[0])} by more than a tenth."
 
 
-def predicted(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate) -> dict[str, tuple[float, float]]:
+def predicted(
+    tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate
+) -> dict[str, tuple[float, float]]:
     """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice, differ by noise alone."""
 
     def after(added: Addition) -> dict[str, float]:
         assert known.sandwich is not None
-        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added))))
+        return relative_errors(
+            estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added)))
+        )
 
     whole, *halves = (after(added) for added in (candidate.whole, *(half.scaled(2) for half in candidate.halves)))
     return {name: (value, 0.5 * abs(halves[0][name] - halves[1][name])) for name, value in whole.items()}
@@ -134,7 +155,11 @@ def predicted(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidat
 
 def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
     """Standard errors over values of what a report leads with."""
-    return {name: e.se / abs(e.value) for name, e in table.items() if name.rpartition(".")[2] in QUANTITIES and e.se is not None and e.se > 0 and e.value != 0}
+    return {
+        name: e.se / abs(e.value)
+        for name, e in table.items()
+        if name.rpartition(".")[2] in QUANTITIES and e.se is not None and e.se > 0 and e.value != 0
+    }
 
 
 def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) -> tuple[StoredFile, tuple[Probe, ...]]:
@@ -146,11 +171,15 @@ def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) 
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     distance = float(np.median(np.linalg.norm(recipe.light_positions_mm - centre, axis=1)))
     axes = np.asarray(first.camera_from_world)[:3, :3] * np.array([[1.0], [-1.0], [-1.0]])
-    added = np.array([centre + distance * (np.asarray(d, dtype=float) / np.linalg.norm(d)) @ axes for d in LIGHTS.values()])
+    added = np.array(
+        [centre + distance * (np.asarray(d, dtype=float) / np.linalg.norm(d)) @ axes for d in LIGHTS.values()]
+    )
     more = replace(
         recipe,
         light_positions_mm=np.vstack([recipe.light_positions_mm, added]),
-        light_intensities=np.concatenate([recipe.light_intensities, np.full(len(added), np.median(recipe.light_intensities))]),
+        light_intensities=np.concatenate(
+            [recipe.light_intensities, np.full(len(added), np.median(recipe.light_intensities))]
+        ),
     )
     light_words = tuple(f"A light {words}" for words in LIGHTS)
     probes = []
@@ -169,7 +198,13 @@ def _probe(folder: Path, camera: Camera, pixels: NDArray[np.int32], words: tuple
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
     shape = (len(words), len(chosen))
     counted = np.array([word != "" for word in words])
-    block = Block(View(camera, chosen), np.zeros(shape), np.ones(shape), np.where(counted[:, None], np.ones(shape), 0.0), np.zeros(shape, dtype=bool))
+    block = Block(
+        View(camera, chosen),
+        np.zeros(shape),
+        np.ones(shape),
+        np.where(counted[:, None], np.ones(shape), 0.0),
+        np.zeros(shape, dtype=bool),
+    )
     return Probe(write_block(folder, block), words, len(pixels) / len(chosen))
 
 
@@ -211,7 +246,10 @@ def advice_task(
     """What one view adds by candidate, from its even and its odd pixels."""
     start, block = time.time(), read_block(task.block)
     view, half = block.fitted_view, max(task.samples // 2, 1)
-    images = [np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64) for seed in image_seeds]
+    images = [
+        np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64)
+        for seed in image_seeds
+    ]
     slopes = [flat.reshape(len(flat), *images[0].shape) for flat in how.render(host, task, view, seeds, block.parts)]
     variance = sensor.variance(0.5 * (images[0] + images[1]))
     out = {}
@@ -221,7 +259,9 @@ def advice_task(
         for odd in (0, 1):
             first, second = (rows[:, lights, odd::2].reshape(len(rows), -1) for rows in slopes)
             renders = [image[lights, odd::2].reshape(-1) for image in images]
-            one = addition(known, (first, second), (renders[0], renders[1]), variance[lights, odd::2].reshape(-1), weight)
+            one = addition(
+                known, (first, second), (renders[0], renders[1]), variance[lights, odd::2].reshape(-1), weight
+            )
             halves.append(one.scaled(probe.ratio))
         out[words] = (halves[0], halves[1])
     return out, trace_row("advice", task, start)

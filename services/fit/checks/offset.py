@@ -93,7 +93,9 @@ class Slide:
         low = np.maximum(self.pixels.min(axis=0) - margin_px, 0)
         high = np.minimum(self.pixels.max(axis=0) + margin_px + 1, (width, height))
         window = np.s_[low[1] : high[1], low[0] : high[0]]
-        images = [Comparison(i.photo[window], i.variance[window], i.render[window], i.spread[window]) for i in self.images]
+        images = [
+            Comparison(i.photo[window], i.variance[window], i.render[window], i.spread[window]) for i in self.images
+        ]
         return Slide(images, self.pixels - low)
 
     def unlikeness(self, shift: Shift) -> float:

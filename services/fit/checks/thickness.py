@@ -53,7 +53,9 @@ def uncertain_thickness(
         slopes[:, k] = (thickness(high) - thickness(low)) / (high[k] - low[k])
     values, of_mean = thickness(weights), slopes.mean(axis=0)
     errors = np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", slopes, covariance, slopes), 0.0))
-    return UncertainThickness(values, errors, float(values.mean()), float(np.sqrt(max(of_mean @ covariance @ of_mean, 0.0))))
+    return UncertainThickness(
+        values, errors, float(values.mean()), float(np.sqrt(max(of_mean @ covariance @ of_mean, 0.0)))
+    )
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,9 @@ class ThicknessMap:
     """Over what is seen, mm."""
 
 
-def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], covariance: NDArray[np.float64] | None, camera: Camera) -> ThicknessMap | None:
+def thickness_map(
+    outer: Mesh, shape: DentinShape, weights: tuple[float, ...], covariance: NDArray[np.float64] | None, camera: Camera
+) -> ThicknessMap | None:
     """What a camera sees of a fitted dentin; None where it does not see the tooth.
 
     Args:
@@ -77,7 +81,13 @@ def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], c
     if covariance is None:
         image = thickness_image(outer, Mesh(shape.vertices_mm(weights), shape.base.faces), camera)
         mean = float(image[np.isfinite(image)].mean()) if np.isfinite(image).any() else None
-        return None if mean is None else ThicknessMap(image, None, Estimate(value=mean, se=None, unit="mm", determined=len(shape.modes_mm) == 0))
+        return (
+            None
+            if mean is None
+            else ThicknessMap(
+                image, None, Estimate(value=mean, se=None, unit="mm", determined=len(shape.modes_mm) == 0)
+            )
+        )
     seen, points_mm = _seen(outer, camera)
     if not seen.any():
         return None
@@ -85,7 +95,9 @@ def thickness_map(outer: Mesh, shape: DentinShape, weights: tuple[float, ...], c
     return ThicknessMap(
         _image(seen, found.values_mm, camera),
         _image(seen, found.errors_mm, camera),
-        Estimate(value=found.mean_mm, se=found.mean_error_mm, unit="mm", determined=found.mean_error_mm < found.mean_mm / 2),
+        Estimate(
+            value=found.mean_mm, se=found.mean_error_mm, unit="mm", determined=found.mean_error_mm < found.mean_mm / 2
+        ),
     )
 
 

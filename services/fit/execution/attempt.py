@@ -57,9 +57,13 @@ class Attempt:
         """The journal of a fit of these inputs, continued where an earlier attempt stopped."""
         folder = self.context.root / CHECKPOINT
         folder.mkdir(parents=True, exist_ok=True)
-        journal = Journal(folder / "journal.jsonl", fingerprint(self.spec, self.engine, files), self.writer.require_lease)
+        journal = Journal(
+            folder / "journal.jsonl", fingerprint(self.spec, self.engine, files), self.writer.require_lease
+        )
         if journal.set_aside is not None:
-            self.log(f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name} and this fit starts anew.")
+            self.log(
+                f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name} and this fit starts anew."
+            )
         if journal.resumed:
             self.log(f"Attempt {self.context.attempt} continues after {journal.resumed} recorded results.")
         return journal
@@ -68,7 +72,9 @@ class Attempt:
     def workers(self) -> Iterator[Executor]:
         """Where tasks run, under keys of this attempt's own."""
         place = self.context.root / CHECKPOINT
-        prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[:12]
+        prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[
+            :12
+        ]
         with executor(self.context.root / CANCEL_FLAG, self.engine, prefix, WEIGHTS[self.spec.priority]) as run_on:
             yield run_on
 
@@ -97,7 +103,9 @@ class Attempt:
 
         return tell
 
-    def write_records(self, journal: Journal, observations: Observations, evaluations: Mapping[str, Evaluation], views: Views) -> None:
+    def write_records(
+        self, journal: Journal, observations: Observations, evaluations: Mapping[str, Evaluation], views: Views
+    ) -> None:
         """Write history, trace and pictures into the stage's folder."""
         folder = self.writer.folder
         history = [value for key, value in journal.entries.items() if "/history/" in key]
@@ -121,7 +129,10 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
     off = {c: worst_error(fit) for c, fit in fits.items()}
     unexplained = [c for c, error in off.items() if error > MAX_ERROR]
-    advice += [f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples." for c in unexplained]
+    advice += [
+        f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples."
+        for c in unexplained
+    ]
     return not unexplained and all(fit.solution.result.converged for fit in fits.values()), advice
 
 
@@ -129,7 +140,10 @@ def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> st
     """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
     parts = [numerics_name(), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority", "effort"})]
     for channel in files:
-        parts += [channel.channel, *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks))]
+        parts += [
+            channel.channel,
+            *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks)),
+        ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 

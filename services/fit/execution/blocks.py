@@ -46,7 +46,9 @@ class StoredFile:
         """
         content = self.path.read_bytes() if self.path.is_file() else b""
         if _digest(content) != self.digest:
-            raise CorruptStoreError(f"{self.path} is missing or altered; remove its folder so that the fit starts again.")
+            raise CorruptStoreError(
+                f"{self.path} is missing or altered; remove its folder so that the fit starts again."
+            )
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return dict(arrays)
 
@@ -92,7 +94,11 @@ class Block:
 
     def view_under(self, lights: NDArray[np.bool_]) -> View:
         """The view under some of the lights, (L,); under all where that leaves none."""
-        return replace(self.view, lights=tuple(np.flatnonzero(lights).tolist())) if lights.any() and not lights.all() else self.view
+        return (
+            replace(self.view, lights=tuple(np.flatnonzero(lights).tolist()))
+            if lights.any() and not lights.all()
+            else self.view
+        )
 
 
 @dataclass(frozen=True)
@@ -136,7 +142,15 @@ def read_block(stored: StoredFile) -> Block:
     view = View(camera, a["pixels"].astype(np.int32))
     parts = PixelParts(a["shown"].astype(np.int16), a["tooth"].astype(np.int16)) if "shown" in a else None
     cell = a["cell"].astype(np.int32) if "cell" in a else None
-    return Block(view, a["reference"].astype(float), a["variance"].astype(float), a["fit_weight"].astype(float), a["held_out"].astype(bool), parts, cell)
+    return Block(
+        view,
+        a["reference"].astype(float),
+        a["variance"].astype(float),
+        a["fit_weight"].astype(float),
+        a["held_out"].astype(bool),
+        parts,
+        cell,
+    )
 
 
 def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
@@ -176,7 +190,11 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
     a = stored.load()
 
     def mesh(name: str) -> Mesh | None:
-        return Mesh(a[f"{name}_vertices"].astype(float), a[f"{name}_faces"].astype(np.int32)) if f"{name}_faces" in a else None
+        return (
+            Mesh(a[f"{name}_vertices"].astype(float), a[f"{name}_faces"].astype(np.int32))
+            if f"{name}_faces" in a
+            else None
+        )
 
     def tooth(k: int) -> ToothSurfaces:
         outer, base = mesh(f"outer{k}"), mesh(f"dentin{k}")

@@ -168,7 +168,12 @@ class Stages(ABC, Generic[Optics]):
         """Limits of a stage on images of this resolution; it has converged within ``IMAGE_TOLERANCE``."""
         most = self.spec.max_samples_per_pixel
         samples = self.fewer(most) if level is self.files.full else most
-        return Options(max_steps=self.spec.max_steps, max_samples=samples, tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal, parts=self.things)
+        return Options(
+            max_steps=self.spec.max_steps,
+            max_samples=samples,
+            tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal,
+            parts=self.things,
+        )
 
     def short(self, steps: int) -> Options:
         """Limits of a stage that only prepares the next: so many steps, few samples."""
@@ -190,13 +195,22 @@ class Stages(ABC, Generic[Optics]):
         """Paths per pixel of full images, for as many in all as ``samples`` are per pixel of coarse ones."""
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), MIN_SAMPLES)
 
-    def _iterate(self, problem: StackProblem[Optics], options: Options, samples: int, before: Solution | None = None) -> tuple[Optics, Solution]:
+    def _iterate(
+        self, problem: StackProblem[Optics], options: Options, samples: int, before: Solution | None = None
+    ) -> tuple[Optics, Solution]:
         if problem.jacobian_g != problem.image_g:
             options = replace(options, slope_error=SLOPE_ERROR)
         solver = gauss_newton.GaussNewton(problem.domain, options)
-        return self._run(solver, gauss_newton, problem, solver.init(problem.domain.x_of(problem.base), min(samples, options.max_samples), before))
+        return self._run(
+            solver,
+            gauss_newton,
+            problem,
+            solver.init(problem.domain.x_of(problem.base), min(samples, options.max_samples), before),
+        )
 
-    def _run(self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1) -> tuple[Optics, Solution]:
+    def _run(
+        self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1
+    ) -> tuple[Optics, Solution]:
         # A solver's loop from its first state; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
         def advance(state: Any) -> Any:
             for _ in range(burst):
@@ -216,16 +230,32 @@ class Stages(ABC, Generic[Optics]):
 
     def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
         # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
-        samples = max(solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)))
+        samples = max(
+            solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel))
+        )
         equations = solution.equations
         if equations is None:
             self.pause()
-            stored, _ = self.journal.once(f"{self.scope}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record())
+            stored, _ = self.journal.once(
+                f"{self.scope}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record()
+            )
             equations = NormalEquations.of(stored)
         problem, solution, known = self._close(problem, solution, equations, samples)
         evaluation = self._evaluate("final", problem.base, self.fewer(self.spec.max_samples_per_pixel), self.files.full)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
-        return ChannelFit(problem.base, problem.domain, solution, equations, known, fitted, held_out, self.steps, evaluation, problem, samples)
+        return ChannelFit(
+            problem.base,
+            problem.domain,
+            solution,
+            equations,
+            known,
+            fitted,
+            held_out,
+            self.steps,
+            evaluation,
+            problem,
+            samples,
+        )
 
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
@@ -239,7 +269,10 @@ class Stages(ABC, Generic[Optics]):
 
         def compute() -> dict[str, Any]:
             sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
-            return {"sums": sums.record(), "step": last_step(problem, x, closing_model(domain, x, equations, sums), self.things, samples).tolist()}
+            return {
+                "sums": sums.record(),
+                "step": last_step(problem, x, closing_model(domain, x, equations, sums), self.things, samples).tolist(),
+            }
 
         self.pause()
         entry, _ = self.journal.once(f"{self.scope}/closing", compute)
@@ -247,7 +280,9 @@ class Stages(ABC, Generic[Optics]):
         measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
         return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
-    def _solve(self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float) -> tuple[Optics, Solution]:
+    def _solve(
+        self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float
+    ) -> tuple[Optics, Solution]:
         # A stage in similar media.
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
         return self._iterate(problem, self.in_similar_media(options), samples)
@@ -261,12 +296,18 @@ class Stages(ABC, Generic[Optics]):
         shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
         self._announce(stage, state.step, tissue, state.samples, state.verdict, shown)
 
-    def _announce(self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None) -> None:
+    def _announce(
+        self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None
+    ) -> None:
         # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
-        evaluation = self._evaluate(f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse)
+        evaluation = self._evaluate(
+            f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse
+        )
         fitted, held_out = evaluation.fitted, evaluation.held_out
         leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
-        values = {f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves} | self._others(tissue)
+        values = {
+            f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves
+        } | self._others(tissue)
         values = {self._told_name(name): value for name, value in values.items()}
         loss = fitted.loss or 0.0
         self.report(

@@ -38,7 +38,10 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
     first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
     slopes, borrowed = problem.slopes(x), np.array([c.kind == "shape" for c in problem.domain.coordinates])
-    ends = tuple((_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd)) for parts, (mean, sd) in held.items())
+    ends = tuple(
+        (_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd))
+        for parts, (mean, sd) in held.items()
+    )
     pending = []
     for task in problem.passes.tasks(label, tissue, samples):
         arguments = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
@@ -69,7 +72,9 @@ def closing_task(
     view = block.fitted_view
 
     def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:
-        return np.asarray(host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64).reshape(-1)
+        return np.asarray(
+            host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64
+        ).reshape(-1)
 
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
     few = max(task.samples // SHIFT_SAMPLES, 1)
@@ -91,4 +96,6 @@ def closing_task(
 
 def _with_cosine(tissue: Optics, parts: tuple[str, ...], dual: float) -> Optics:
     media = {part: similar_medium(tissue.medium(part), to_natural("g1", dual)) for part in parts}
-    return tissue.with_values({f"{part}.{leaf}": float(getattr(medium, leaf)) for part, medium in media.items() for leaf in MEDIUM_FIELDS})
+    return tissue.with_values(
+        {f"{part}.{leaf}": float(getattr(medium, leaf)) for part, medium in media.items() for leaf in MEDIUM_FIELDS}
+    )

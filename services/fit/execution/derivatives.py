@@ -38,7 +38,9 @@ class Reach:
     share: int
 
 
-REACH: Mapping[str, Reach] = MappingProxyType({"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)})
+REACH: Mapping[str, Reach] = MappingProxyType(
+    {"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)}
+)
 """By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that a wide difference is no derivative."""
 
 SLOPE_REACH = Reach(0.35, 0.35, 4)
@@ -72,7 +74,9 @@ class Differentiation:
     neighbours: Neighbours | None = None
     """Of a jaw's teeth."""
 
-    def render(self, host: EngineHost, task: BlockTask, view: View, seeds: Sequence[int], parts: PixelParts | None = None) -> tuple[Array, ...]:
+    def render(
+        self, host: EngineHost, task: BlockTask, view: View, seeds: Sequence[int], parts: PixelParts | None = None
+    ) -> tuple[Array, ...]:
         """Derivatives (F, L N) by each of the seeds; scores are of the task's media. All seeds see a surface before it is moved again.
 
         Args:
@@ -91,16 +95,24 @@ class Differentiation:
         slopes: list[dict[int, Array]] = [{} for _ in seeds]
         for secant in self.secants:
             samples = max(task.samples // secant.share, 1)
-            for found, low, high in zip(slopes, rendered(secant.low, samples), rendered(secant.high, samples), strict=True):
-                for coordinate, width, seen in zip(secant.coordinates, secant.widths, self._seen(secant, parts), strict=True):
+            for found, low, high in zip(
+                slopes, rendered(secant.low, samples), rendered(secant.high, samples), strict=True
+            ):
+                for coordinate, width, seen in zip(
+                    secant.coordinates, secant.widths, self._seen(secant, parts), strict=True
+                ):
                     found[coordinate] = ((high - low) * seen / width).reshape(-1)
 
         every = []
         for seed, found in zip(seeds, slopes, strict=True):
             if self.parameters:
                 samples = max(task.samples // self.share, 1)
-                estimate: JacobianEstimate = host.call("jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed)
-                rows = np.asarray(self.chain.T @ np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1))
+                estimate: JacobianEstimate = host.call(
+                    "jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed
+                )
+                rows = np.asarray(
+                    self.chain.T @ np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1)
+                )
             else:
                 rows = np.zeros((self.chain.shape[1], next(iter(found.values())).size))
             for coordinate, slope in found.items():
@@ -117,7 +129,9 @@ class Differentiation:
         return [self.neighbours.pixels(tooth, parts) for tooth in secant.teeth]
 
 
-def differentiation(domain: Domain, x: Array, base: Optics, jacobian_g: float | None, neighbours: Neighbours | None = None) -> Differentiation:
+def differentiation(
+    domain: Domain, x: Array, base: Optics, jacobian_g: float | None, neighbours: Neighbours | None = None
+) -> Differentiation:
     """How to differentiate a stage's images at x (F,).
 
     Args:
@@ -128,10 +142,15 @@ def differentiation(domain: Domain, x: Array, base: Optics, jacobian_g: float | 
     # Scores of extinction are noisy, but in a jaw they are of all teeth at once; and the images' own media are the closing measurement's, which wants slopes.
     differing = WITHOUT_SCORES if jacobian_g is None or isinstance(base, Mouth) else WITHOUT_SCORES | {"sigma"}
     is_secant = [c.kind in differing for c in domain.coordinates]
-    own = tuple(target for c, differs in zip(domain.coordinates, is_secant, strict=True) if not differs for target in c.targets)
+    own = tuple(
+        target for c, differs in zip(domain.coordinates, is_secant, strict=True) if not differs for target in c.targets
+    )
     names = own if jacobian_g is None else tuple(dict.fromkeys(n for p in own for n in _similar_parameters(p)))
     groups = _groups(domain, np.flatnonzero(is_secant), neighbours)
-    secants = [_secant(domain, x, group, base, tissue, jacobian_g, REACH[domain.coordinates[group[0]].kind]) for group in groups]
+    secants = [
+        _secant(domain, x, group, base, tissue, jacobian_g, REACH[domain.coordinates[group[0]].kind])
+        for group in groups
+    ]
     share = SCORES_SHARE if any(domain.coordinates[one.coordinates[0]].kind == "sigma" for one in secants) else 1
     return Differentiation(names, _chain(domain, x, base, names, jacobian_g), tuple(secants), share, neighbours)
 
@@ -140,7 +159,9 @@ def slopes(domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None
     """How to differentiate the images' own media at x (F,), except to blend weights."""
     tissue, cosines = domain.tissue_at(x, base), [k for k, c in enumerate(domain.coordinates) if c.kind == "cosine"]
     scored = _scored_parameters(domain)
-    secants = tuple(_secant(domain, x, group, base, tissue, None, SLOPE_REACH) for group in _groups(domain, cosines, neighbours))
+    secants = tuple(
+        _secant(domain, x, group, base, tissue, None, SLOPE_REACH) for group in _groups(domain, cosines, neighbours)
+    )
     return Differentiation(scored, _chain(domain, x, base, scored, None), secants, neighbours=neighbours)
 
 
@@ -169,12 +190,18 @@ def _similar_parameters(name: str) -> tuple[str, ...]:
     return (f"{part}.sigma", f"{part}.alpha") if leaf in {"sigma", "alpha"} else (name,)
 
 
-def _groups(domain: Domain, chosen: Sequence[int] | NDArray[np.int_], neighbours: Neighbours | None) -> list[tuple[int, ...]]:
+def _groups(
+    domain: Domain, chosen: Sequence[int] | NDArray[np.int_], neighbours: Neighbours | None
+) -> list[tuple[int, ...]]:
     # Coordinates that are moved at once: the same one of all teeth of one colour; any other alone.
     groups: dict[tuple[str, int], list[int]] = {}
     for k in chosen:
         tooth, leaf = _owner(domain, int(k))
-        key = (domain.coordinates[k].name, -1) if tooth is None or neighbours is None else (leaf, neighbours.colour(tooth))
+        key = (
+            (domain.coordinates[k].name, -1)
+            if tooth is None or neighbours is None
+            else (leaf, neighbours.colour(tooth))
+        )
         groups.setdefault(key, []).append(int(k))
     return [tuple(group) for group in groups.values()]
 
@@ -185,7 +212,15 @@ def _owner(domain: Domain, k: int) -> tuple[int | None, str]:
     return coordinate.tooth, coordinate.targets[0].partition(".")[2]
 
 
-def _secant(domain: Domain, x: Array, group: tuple[int, ...], base: Optics, tissue: Optics, jacobian_g: float | None, reach: Reach) -> Secant:
+def _secant(
+    domain: Domain,
+    x: Array,
+    group: tuple[int, ...],
+    base: Optics,
+    tissue: Optics,
+    jacobian_g: float | None,
+    reach: Reach,
+) -> Secant:
     # One-sided where a bound is near. A cosine's media are the images' own, as it is what similar media do not have.
     own = list(group)
     kind, (lower, upper) = domain.coordinates[own[0]].kind, (bound[own] for bound in domain.bounds)
@@ -201,7 +236,10 @@ def _secant(domain: Domain, x: Array, group: tuple[int, ...], base: Optics, tiss
     # Images are linear in the cosine itself farther than in its coordinate.
     widths = high - low
     if kind == "cosine":
-        natural = [(to_natural(kind, b) - to_natural(kind, a)) / natural_derivative(kind, at) for a, b, at in zip(low, high, x[own], strict=True)]
+        natural = [
+            (to_natural(kind, b) - to_natural(kind, a)) / natural_derivative(kind, at)
+            for a, b, at in zip(low, high, x[own], strict=True)
+        ]
         widths = np.array(natural)
     teeth = tuple(tooth for k in own if (tooth := domain.coordinates[k].tooth) is not None)
     return Secant(group, media(low), media(high), tuple(widths.tolist()), reach.share, teeth or None)

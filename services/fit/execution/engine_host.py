@@ -94,7 +94,9 @@ class ChildHost:
         """
         return self.call_until(lambda: False, method, recipe, *args, **options)
 
-    def call_until(self, is_cancelled: Callable[[], bool], method: str, recipe: StoredFile, *args: Any, **options: Any) -> Any:
+    def call_until(
+        self, is_cancelled: Callable[[], bool], method: str, recipe: StoredFile, *args: Any, **options: Any
+    ) -> Any:
         """The same, but the child is ended in mid-kernel, and JobCancelledError raised, once ``is_cancelled()``."""
         request = pickle.dumps((method, recipe, args, options))
         with self._lock:
@@ -108,7 +110,9 @@ class ChildHost:
                     while not process.pipe.poll(WATCH_S):
                         if is_cancelled():
                             self._end()
-                            raise JobCancelledError("The job was cancelled on request while it rendered; what it had published is kept.")
+                            raise JobCancelledError(
+                                "The job was cancelled on request while it rendered; what it had published is kept."
+                            )
                         self._require_open()
                         process.check_memory()
                     succeeded, value = pickle.loads(process.pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe

@@ -46,7 +46,9 @@ class EngineProcess:
             self._peak_bytes = max(self._peak_bytes, psutil.Process(self.pid).memory_info().rss)
         if self._memory_bytes is not None and self._peak_bytes > self._memory_bytes:
             share = f"{self._memory_bytes / 2**30:.1f} GiB"
-            raise MemoryKillError(f"The rendering process grew beyond its {share} of memory and was ended; {REMEDY}.", self._evidence())
+            raise MemoryKillError(
+                f"The rendering process grew beyond its {share} of memory and was ended; {REMEDY}.", self._evidence()
+            )
 
     def end(self) -> None:
         """Kill the process if it lives, and learn what ended it if it does not."""
@@ -63,10 +65,16 @@ class EngineProcess:
         if self.was_out_of_memory:
             return MemoryKillError(f"The system killed the rendering process for lack of memory; {REMEDY}.", evidence)
         how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-        return CrashError(f"The rendering process {how} twice in one task; look for its last words in the worker's log.", evidence)
+        return CrashError(
+            f"The rendering process {how} twice in one task; look for its last words in the worker's log.", evidence
+        )
 
     def _evidence(self) -> Evidence:
-        return {"exit_status": self._process.returncode, "peak_memory_bytes": self._peak_bytes, "memory_limit_bytes": self._memory_bytes}
+        return {
+            "exit_status": self._process.returncode,
+            "peak_memory_bytes": self._peak_bytes,
+            "memory_limit_bytes": self._memory_bytes,
+        }
 
 
 def memory_kills() -> int:

@@ -116,7 +116,11 @@ class DaskExecutor:
 
     def _most_at_once(self) -> int:
         able = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        threads = sum(worker["nthreads"] for worker in able if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items()))
+        threads = sum(
+            worker["nthreads"]
+            for worker in able
+            if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items())
+        )
         return TASKS_AHEAD * max(threads, 1)
 
 
@@ -218,5 +222,8 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: flo
     from distributed import worker_client
 
     name, share = f"{surroundings.key}-{prefix}", Share(weight)
-    with worker_client() as client, closing(DaskExecutor(client, factory, name, flag, surroundings.needs, share)) as run_on:
+    with (
+        worker_client() as client,
+        closing(DaskExecutor(client, factory, name, flag, surroundings.needs, share)) as run_on,
+    ):
         yield run_on

@@ -70,14 +70,19 @@ class Journal:
         try:
             self._append(_line({"key": key, "value": value}))
         except BaseException:
-            self._inode = None  # what was written of the line, if anything, goes with the file: the next result begins it anew
+            self._inode = (
+                None  # what was written of the line, if anything, goes with the file: the next result begins it anew
+            )
             raise
         self.entries[key] = value
         return value, True
 
     def _begin(self) -> None:
         """Write what is recorded so far into a file of this attempt's own."""
-        lines = [{"format": FORMAT_VERSION, "fingerprint": self._fingerprint}, *({"key": key, "value": value} for key, value in self.entries.items())]
+        lines = [
+            {"format": FORMAT_VERSION, "fingerprint": self._fingerprint},
+            *({"key": key, "value": value} for key, value in self.entries.items()),
+        ]
         write_atomic(self.path, b"".join(map(_line, lines)))
         self._inode = self.path.stat().st_ino
         if self._earlier != self.path:

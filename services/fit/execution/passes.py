@@ -71,16 +71,27 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     """Render a block twice, each time with half the samples, and subtract the reference."""
     start, block = time.time(), read_block(task.block)
     half = max(task.samples // 2, 1)
-    stacks: list[StackEstimate] = [host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds]
+    stacks: list[StackEstimate] = [
+        host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds
+    ]
     return Residual(stacks[0].mean - block.reference, stacks[1].mean - block.reference, trace_row("image", task, start))
 
 
-def jacobian_task(host: EngineHost, task: BlockTask, how: Differentiation, seeds: tuple[int, int], residual: Residual, near: Near | None) -> Products:
+def jacobian_task(
+    host: EngineHost,
+    task: BlockTask,
+    how: Differentiation,
+    seeds: tuple[int, int],
+    residual: Residual,
+    near: Near | None,
+) -> Products:
     """Render a block's derivatives with two seeds and multiply them by each other and by the residual."""
     start, block = time.time(), read_block(task.block)
     j1, j2 = how.render(host, task, block.fitted_view, seeds, block.parts)
     rendered, start = trace_row("jacobian", task, start), time.time()
-    r1, r2, variance, weight = (a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight))
+    r1, r2, variance, weight = (
+        a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight)
+    )
     regions = None if near is None else _regions(block, near)
     equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions)
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
@@ -92,34 +103,48 @@ def _regions(block: Block, near: Near) -> list[Region]:
     return [(near[tooth], np.tile(block.parts.tooth == tooth, lights)) for tooth in np.unique(block.parts.tooth)]
 
 
-def gradient_task(host: EngineHost, task: BlockTask, similar: Tissue, how: Differentiation, seeds: tuple[int, int]) -> tuple[Gradient, TraceRow]:
+def gradient_task(
+    host: EngineHost, task: BlockTask, similar: Tissue, how: Differentiation, seeds: tuple[int, int]
+) -> tuple[Gradient, TraceRow]:
     """A block's stochastic gradient: residual from one seed, derivatives from another."""
     start, block = time.time(), read_block(task.block)
-    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0])
+    stack: StackEstimate = host.call(
+        "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0]
+    )
     residual, weight = stack.mean - block.reference, block.fit_weight
     (rows,) = how.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1:], block.parts)
     loss = 0.5 * float((weight * (residual**2 - stack.variance)).sum())
     return Gradient(rows @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
 
 
-def compare_task(host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int], by_cells: bool = True) -> tuple[LossChange, TraceRow]:
+def compare_task(
+    host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int], by_cells: bool = True
+) -> tuple[LossChange, TraceRow]:
     """Render a block at two points with the same two seeds and compare their losses, of cells' means or pixel by pixel."""
     start, block = time.time(), read_block(task.block)
 
     def residuals(tissue: Tissue | Mouth) -> tuple[Array, Array]:
         first, second = (
-            (host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed).mean - block.reference).reshape(-1) for seed in seeds
+            (
+                host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed).mean
+                - block.reference
+            ).reshape(-1)
+            for seed in seeds
         )
         return first, second
 
     given = *residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1)
-    return loss_change(*given, len(block.reference), block.cell if by_cells else None), trace_row("compare", task, start)
+    return loss_change(*given, len(block.reference), block.cell if by_cells else None), trace_row(
+        "compare", task, start
+    )
 
 
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:
     """Render a block split by scattering order at albedo 1, (K, L, N)."""
     start, block = time.time(), read_block(task.block)
-    orders = host.call("order_images", task.recipe, task.tissue, block.fitted_view, bin_edges=edges, samples=task.samples, seed=seed)
+    orders = host.call(
+        "order_images", task.recipe, task.tissue, block.fitted_view, bin_edges=edges, samples=task.samples, seed=seed
+    )
     return np.asarray(orders, dtype=np.float64), trace_row("orders", task, start)
 
 
@@ -136,7 +161,9 @@ class Passes:
 
     def run(self, label: str, tissue: Tissue | Mouth, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
         """One task per block, results in block order."""
-        return self.executor.gather([self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)])
+        return self.executor.gather(
+            [self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)]
+        )
 
     def read_blocks(self) -> list[Block]:
         """The blocks themselves, in order."""
@@ -170,8 +197,23 @@ class StackProblem(Generic[Optics]):
         near = None if self.neighbours is None else self.neighbours.near(self.domain)
         pending = []
         for task in self.passes.tasks(label, tissue, samples):
-            image = run.submit(f"{label}-image-{task.index}", image_task, task, (self.seed(step, "image-1"), self.seed(step, "image-2")))
-            pending.append(run.submit(f"{label}-jacobian-{task.index}", jacobian_task, replace(task, tissue=similar), how, seeds, image, near))
+            image = run.submit(
+                f"{label}-image-{task.index}",
+                image_task,
+                task,
+                (self.seed(step, "image-1"), self.seed(step, "image-2")),
+            )
+            pending.append(
+                run.submit(
+                    f"{label}-jacobian-{task.index}",
+                    jacobian_task,
+                    replace(task, tissue=similar),
+                    how,
+                    seeds,
+                    image,
+                    near,
+                )
+            )
         products: list[Products] = run.gather(pending)
         self.passes.record([row for p in products for row in p.trace])
         total = products[0].equations
@@ -210,7 +252,11 @@ class StackProblem(Generic[Optics]):
         """Media of the image and of the derivatives, and how to differentiate."""
         tissue = self.domain.tissue_at(x, self.base)
         similar = tissue if self.jacobian_g is None else similar_tissue(tissue, self.jacobian_g)
-        return self._image_media(x), similar, differentiation(self.domain, x, self.base, self.jacobian_g, self.neighbours)
+        return (
+            self._image_media(x),
+            similar,
+            differentiation(self.domain, x, self.base, self.jacobian_g, self.neighbours),
+        )
 
     def slopes(self, x: Array) -> Differentiation:
         """How to differentiate the images' own media, except to blend weights."""

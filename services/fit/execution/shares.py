@@ -82,7 +82,11 @@ class Board:
         """Begin at the lowest level of those that are under way."""
         now_s = self._clock()
         told: dict[str, tuple[float, float] | None] = self._client.get_metadata([BOARD], default={})
-        levels = [one[0] * math.exp((one[1] - now_s) / FADING_S) for one in told.values() if one is not None and one[1] > now_s - FADING_S]
+        levels = [
+            one[0] * math.exp((one[1] - now_s) / FADING_S)
+            for one in told.values()
+            if one is not None and one[1] > now_s - FADING_S
+        ]
         self._share.begin_at(min(levels, default=0.0))
         self.tell()
 

@@ -38,14 +38,18 @@ GRADIENT_G = 0.0
 SURE_Z = 3.0
 
 
-def stain_task(host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
+def stain_task(
+    host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
     """A block's derivatives of sum(w ref C) and of sum(w C1 C) to the texels (H, W), paths shared, and its sum of squares."""
     start, block = time.time(), read_block(task.block)
     view, weight = block.fitted_view, block.fit_weight
     image: StackEstimate = host.call("images", task.recipe, task.tissue, view, samples=task.samples, seed=seeds[0])
 
     def gradient(cotangent: NDArray[np.float64]) -> NDArray[np.float64]:
-        found: StainGradient = host.call("stain_gradient", task.recipe, similar, view, cotangent, samples=task.samples, seed=seeds[1])
+        found: StainGradient = host.call(
+            "stain_gradient", task.recipe, similar, view, cotangent, samples=task.samples, seed=seeds[1]
+        )
         (texels,) = found.gradient
         assert texels is not None
         return texels
@@ -93,10 +97,19 @@ class StainStage:
     def sums(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> StainSums:
         """Sums over all blocks at a stained tissue."""
         assert tissue.stain is not None
-        parts = self.passes.run(f"{self.passes.seeds.channel}-{label}", tissue, self.samples, stain_task, similar_tissue(tissue, GRADIENT_G), seeds)
+        parts = self.passes.run(
+            f"{self.passes.seeds.channel}-{label}",
+            tissue,
+            self.samples,
+            stain_task,
+            similar_tissue(tissue, GRADIENT_G),
+            seeds,
+        )
         self.passes.record([row for *_, row in parts])
         touched, a_t = self.layout.index >= 0, tissue.stain.transmittance
-        explained, carried = (sum(((a_t * part[k])[touched] for part in parts), np.zeros(touched.sum())) for k in (0, 1))
+        explained, carried = (
+            sum(((a_t * part[k])[touched] for part in parts), np.zeros(touched.sum())) for k in (0, 1)
+        )
         return StainSums(explained, carried, sum(part[2] for part in parts))
 
     def _step(
@@ -120,7 +133,9 @@ class StainStage:
         # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike 1974).
         def compute() -> dict[str, float]:
             seeds = self.passes.seeds("stain.compare", 1), self.passes.seeds("stain.compare", 2)
-            parts = self.passes.run(f"{self.passes.seeds.channel}-stain-compare", plain, self.samples, compare_task, stained, seeds, False)
+            parts = self.passes.run(
+                f"{self.passes.seeds.channel}-stain-compare", plain, self.samples, compare_task, stained, seeds, False
+            )
             self.passes.record([row for _, row in parts])
             total: LossChange = parts[0][0]
             for change, _ in parts[1:]:

@@ -82,7 +82,10 @@ def write_asset(
     textures = {}
     if stains is not None:
         (tooth,) = teeth
-        textures = {channel: path.relative_to(folder) for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()}
+        textures = {
+            channel: path.relative_to(folder)
+            for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()
+        }
 
     first = lights[0]
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
@@ -91,11 +94,15 @@ def write_asset(
         samples = SceneParameter("spp", 256)
         if report.teeth:
             numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
-            scene = mouth_scene(surfaces, numbers, mouth, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples)
+            scene = mouth_scene(
+                surfaces, numbers, mouth, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples
+            )
         else:
             tissue = tissue_of(report.parameters[channel])
             stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
-            scene = nested_scene(files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained)
+            scene = nested_scene(
+                files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
+            )
         write_scene(folder / f"scene_{channel}.xml", scene)
 
     rig = {
@@ -129,7 +136,9 @@ def mouth_of(report: FitReport, channel: str) -> Mouth:
 
 
 def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
-    values: dict[str, Any] = {field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table}
+    values: dict[str, Any] = {
+        field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table
+    }
     return Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
 
 
@@ -144,7 +153,9 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
     if report.enamel_thickness is not None:
         for table in tables.values():
             table["enamel.thickness"] = report.enamel_thickness
-    return {channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in tables.items()}
+    return {
+        channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in tables.items()
+    }
 
 
 def errors_json(report: FitReport) -> dict[str, Any]:
@@ -164,7 +175,10 @@ def errors_json(report: FitReport) -> dict[str, Any]:
         "next_capture": report.next_capture,
         "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},
     }
-    teeth = {fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"}) for fdi, tooth in report.teeth.items()}
+    teeth = {
+        fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"})
+        for fdi, tooth in report.teeth.items()
+    }
     return errors | ({"teeth": teeth} if teeth else {})
 
 

@@ -31,7 +31,11 @@ def medium_dict(medium: Medium) -> SceneDict:
     medium.require_lobes("An exported scene")
     first: SceneDict = {"type": "hg", "g": float(medium.g1)}
     second: SceneDict = {"type": "hg", "g": float(medium.g2)}
-    phase = first if medium.beta >= 1 else {"type": "blendphase", "weight": float(1 - medium.beta), "first": first, "second": second}
+    phase = (
+        first
+        if medium.beta >= 1
+        else {"type": "blendphase", "weight": float(1 - medium.beta), "first": first, "second": second}
+    )
     return {"type": "homogeneous", "sigma_t": float(medium.sigma), "albedo": float(medium.alpha), "phase": phase}
 
 
@@ -43,7 +47,9 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
     """
     K, pose = np.asarray(camera.K), np.asarray(camera.camera_from_world)
     if abs(K[0, 0] / K[1, 1] - 1) > 1e-4 or abs(K[0, 1]) > 1e-6 * K[0, 0]:
-        raise CaptureInputError(f"Camera {camera.name} has unequal focal lengths or skew, which Mitsuba cannot render; resample its images to square pixels.")
+        raise CaptureInputError(
+            f"Camera {camera.name} has unequal focal lengths or skew, which Mitsuba cannot render; resample its images to square pixels."
+        )
     width, height = camera.size
     # Mitsuba looks along +z with x to the left and y up; OpenCV has x right and y down.
     world_from_camera = np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -74,12 +80,26 @@ def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> 
     Args:
         stain: picture of what the surface takes of light that passes, 1 - a_t; over nothing it is a mask before black.
     """
-    texture = None if stain is None else {"type": "bitmap", "filename": stain.as_posix(), "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    texture = (
+        None
+        if stain is None
+        else {
+            "type": "bitmap",
+            "filename": stain.as_posix(),
+            "raw": True,
+            "filter_type": "bilinear",
+            "wrap_mode": "clamp",
+        }
+    )
     if boundary == "thin":
         return {"type": "thin_boundary", "ior": ior} | ({} if texture is None else {"stain": texture})
     if texture is None:
         return {"type": "null"}
-    return {"type": "mask", "opacity": texture, "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
+    return {
+        "type": "mask",
+        "opacity": texture,
+        "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+    }
 
 
 TeethFiles = Mapping[str, tuple[Path, Path | None]]
@@ -119,7 +139,9 @@ def nested_scene(
         scene["medium_dentin"] = medium_dict(tissue.dentin)
     enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name))) | {"interior": enamel}
+        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name))) | {
+            "interior": enamel
+        }
         if dentin is not None:
             scene[f"dentin_{name}"] = surface_dict(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
@@ -146,7 +168,9 @@ def _with_transforms(node: Any) -> Any:
     return mi.ScalarTransform4f(node) if isinstance(node, np.ndarray) else node
 
 
-def render_batches(scene: Any, sensor: int, samples: int, seed: int, batches: int = 16) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def render_batches(
+    scene: Any, sensor: int, samples: int, seed: int, batches: int = 16
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Image (H, W) and the variance of its mean from independent batches of ``samples / batches`` paths per pixel."""
     import drjit as dr
     import mitsuba as mi

@@ -10,14 +10,23 @@ from services.anatomy.scans.separation import separate
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import Boundary
-from services.fit.export.mitsuba_scene import SceneDict, boundary_dict, lit_scene, medium_dict, sensor_dict, surface_dict
+from services.fit.export.mitsuba_scene import (
+    SceneDict,
+    boundary_dict,
+    lit_scene,
+    medium_dict,
+    sensor_dict,
+    surface_dict,
+)
 from services.fit.optics.parameters import Mouth
 
 SurfaceFiles = Mapping[str, Path]
 """PLY files by the name of the surface: ``crown_11``, ``root_11``, ``dentin_11`` and ``contact_11_12`` by FDI number, ``gums``, ``cavity``."""
 
 
-def write_mouth_surfaces(folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | None, cavity: Mesh | None) -> dict[str, Path]:
+def write_mouth_surfaces(
+    folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | None, cavity: Mesh | None
+) -> dict[str, Path]:
     """Write the surfaces between media, none of which overlap; what is empty has no file.
 
     Raises:
@@ -56,12 +65,17 @@ def mouth_scene(
     """
     scene = lit_scene(light_mm, intensity)
     for number, tissue in zip(fdi, mouth.teeth, strict=True):
-        scene |= {f"medium_enamel_{number}": medium_dict(tissue.enamel), f"medium_dentin_{number}": medium_dict(tissue.dentin)}
+        scene |= {
+            f"medium_enamel_{number}": medium_dict(tissue.enamel),
+            f"medium_dentin_{number}": medium_dict(tissue.dentin),
+        }
     if mouth.gums is not None:
         scene["medium_gums"] = medium_dict(mouth.gums)
 
     def between(path: Path, contrast: float, inside: str, outside: str | None = None) -> SceneDict:
-        sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | ({"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {})
+        sides = {"interior": {"type": "ref", "id": f"medium_{inside}"}} | (
+            {"exterior": {"type": "ref", "id": f"medium_{outside}"}} if outside else {}
+        )
         return surface_dict(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
 
     for name, path in files.items():

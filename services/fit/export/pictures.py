@@ -11,9 +11,21 @@ from numpy.typing import NDArray
 
 Image8 = NDArray[np.uint8]
 
-DIVERGING = ((0.0, (8, 69, 148)), (0.25, (66, 146, 198)), (0.5, (247, 247, 247)), (0.75, (230, 130, 40)), (1.0, (140, 45, 4)))
+DIVERGING = (
+    (0.0, (8, 69, 148)),
+    (0.25, (66, 146, 198)),
+    (0.5, (247, 247, 247)),
+    (0.75, (230, 130, 40)),
+    (1.0, (140, 45, 4)),
+)
 """Blue to orange through near-white: distinct for all common colour-vision deficiencies and in grey by its ends' darkness."""
-SEQUENTIAL = ((0.0, (68, 1, 84)), (0.25, (59, 82, 139)), (0.5, (33, 145, 140)), (0.75, (94, 201, 98)), (1.0, (253, 231, 37)))
+SEQUENTIAL = (
+    (0.0, (68, 1, 84)),
+    (0.25, (59, 82, 139)),
+    (0.5, (33, 145, 140)),
+    (0.75, (94, 201, 98)),
+    (1.0, (253, 231, 37)),
+)
 """Viridis at five stops (van der Walt and Smith 2015): perceptually uniform, safe for colour-vision deficiencies."""
 RESIDUAL_OF_WHITE = 0.25
 """Residuals are drawn from minus to plus this fraction of the picture's white."""

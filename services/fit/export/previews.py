@@ -14,7 +14,15 @@ from services.core.store import write_atomic
 from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.thickness import ThicknessMap
 from services.fit.execution.channel_fit import StepReport
-from services.fit.export.pictures import RESIDUAL_OF_WHITE, Picture, enlarge, png_bytes, signed_map, tone_map, white_level
+from services.fit.export.pictures import (
+    RESIDUAL_OF_WHITE,
+    Picture,
+    enlarge,
+    png_bytes,
+    signed_map,
+    tone_map,
+    white_level,
+)
 from services.fit.export.report import ReportPictures
 from services.fit.export.stains import stain_image
 from services.fit.inputs.observations import ViewStack
@@ -38,10 +46,14 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
     return tuple(shown)
 
 
-def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> tuple[Picture, ...]:
+def pictures_of(
+    evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]
+) -> tuple[Picture, ...]:
     """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
     # A fit of every n-th pixel is shown as the smaller picture it is, not as dots.
-    every = min((spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1)
+    every = min(
+        (spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1
+    )
     channels = list(evaluations)
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
@@ -53,7 +65,9 @@ def pictures_of(evaluations: Mapping[str, Evaluation], manifest: PreparedManifes
             if key not in images:
                 width, height = (-(-size // every) for size in view.camera.size)
                 blank = np.zeros((height, width, len(channels)))
-                images[key] = Picture(*key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool))
+                images[key] = Picture(
+                    *key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool)
+                )
             shown = (view.pixels % every == 0).all(axis=1)
             x, y = view.pixels[shown].T // every
             images[key].photo[y, x, index] = view.reference[number, shown]
@@ -68,7 +82,9 @@ def spacing(pixels: NDArray[np.int32]) -> int:
     return max(int(np.gcd.reduce(np.concatenate(steps))), 1)
 
 
-def write_preview(root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]) -> list[dict[str, object]]:
+def write_preview(
+    root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]
+) -> list[dict[str, object]]:
     """Write render, photograph and residual of one image as PNG; returns the preview event's data, paths relative to ``root``."""
     pictures = pictures_of({step.channel: evaluation}, manifest, {step.channel: views})
     chosen = [p for p in pictures if not p.held_out][:1] + [p for p in pictures if p.held_out][:1]
@@ -93,7 +109,12 @@ def write_preview(root: Path, step: StepReport, evaluation: Evaluation, manifest
     return events
 
 
-def write_pictures(folder: Path, evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]) -> None:
+def write_pictures(
+    folder: Path,
+    evaluations: Mapping[str, Evaluation],
+    manifest: PreparedManifest,
+    views: Mapping[str, tuple[ViewStack, ...]],
+) -> None:
     """Keep the final pictures, linear, in the fit's folder."""
     arrays: dict[str, NDArray[np.generic]] = {}
     for k, picture in enumerate(pictures_of(evaluations, manifest, views)):
@@ -121,8 +142,19 @@ def read_pictures(
         pictures = []
         for k in range(count):
             camera, light = (str(part) for part in stored[f"{k}.name"])
-            pictures.append(Picture(camera, light, bool(stored[f"{k}.held_out"]), stored[f"{k}.photo"], stored[f"{k}.render"], stored[f"{k}.valid"]))
+            pictures.append(
+                Picture(
+                    camera,
+                    light,
+                    bool(stored[f"{k}.held_out"]),
+                    stored[f"{k}.photo"],
+                    stored[f"{k}.render"],
+                    stored[f"{k}.valid"],
+                )
+            )
     if tooth is None:
         return ReportPictures(channels, tuple(pictures))
     seen = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
-    return ReportPictures(channels, tuple(pictures), thickness, cameras[0].name, seen, () if stains is None else tuple(stains.textures))
+    return ReportPictures(
+        channels, tuple(pictures), thickness, cameras[0].name, seen, () if stains is None else tuple(stains.textures)
+    )

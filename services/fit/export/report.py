@@ -33,7 +33,13 @@ from services.fit.export.pictures import (
 if TYPE_CHECKING:
     from jinja2 import Template
 
-PART_LABELS = {"enamel": "Enamel", "dentin": "Dentin", "shape": "Dentin shape", "gums": "Gums", "cavity": "Wall of the mouth"}
+PART_LABELS = {
+    "enamel": "Enamel",
+    "dentin": "Dentin",
+    "shape": "Dentin shape",
+    "gums": "Gums",
+    "cavity": "Wall of the mouth",
+}
 LEAF_LABELS = {
     "sigma": "extinction σ",
     "alpha": "albedo α",
@@ -75,7 +81,9 @@ class ReportPictures:
     """The C channels that have stains."""
 
 
-def write_report(path: Path, report: FitReport, pictures: ReportPictures, history: list[dict[str, Any]], context: dict[str, Any]) -> None:
+def write_report(
+    path: Path, report: FitReport, pictures: ReportPictures, history: list[dict[str, Any]], context: dict[str, Any]
+) -> None:
     """Write the report as one HTML file without any outside reference.
 
     Args:
@@ -108,7 +116,9 @@ def write_report(path: Path, report: FitReport, pictures: ReportPictures, histor
         channels=list(report.parameters),
         parameters=_parameter_rows(report.parameters),
         teeth=_tooth_rows(report.teeth),
-        tooth_sentences=[(fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()],
+        tooth_sentences=[
+            (fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()
+        ],
         thickness=_thickness(pictures),
         thickness_bar=gradient(SEQUENTIAL),
         stains=_stains(pictures),
@@ -182,12 +192,21 @@ def _charts(history: list[dict[str, Any]]) -> list[tuple[str, str]]:
     channels = list(dict.fromkeys(str(entry.get("channel", "")) for entry in history))
 
     def lines(key: str) -> list[Series]:
-        rows = [[e for e in history if str(e.get("channel", "")) == channel and e.get(key) is not None] for channel in channels]
-        return [Series(channel, tuple((float(e["step"]), float(e[key])) for e in part)) for channel, part in zip(channels, rows, strict=True)]
+        rows = [
+            [e for e in history if str(e.get("channel", "")) == channel and e.get(key) is not None]
+            for channel in channels
+        ]
+        return [
+            Series(channel, tuple((float(e["step"]), float(e[key])) for e in part))
+            for channel, part in zip(channels, rows, strict=True)
+        ]
 
     charts = [
         ("Loss", log_chart("Loss by step", "step", "loss", lines("loss"))),
-        ("Held-out error", log_chart("Held-out error by step", "step", "held-out error", lines("held_out_error"), percent=True)),
+        (
+            "Held-out error",
+            log_chart("Held-out error by step", "step", "held-out error", lines("held_out_error"), percent=True),
+        ),
     ]
     return [(name, chart) for name, chart in charts if chart]
 
@@ -202,7 +221,15 @@ def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
     for (channel, stage), entry in last.items():
         error, se = entry.get("held_out_error"), entry.get("held_out_se")
         told = "" if error is None else _percent(error) if se is None else f"{100 * error:.1f} ± {100 * se:.1f} %"
-        rows.append({"channel": channel, "stage": stage, "step": str(entry["step"]), "loss": f"{entry['loss']:.3g}", "error": told})
+        rows.append(
+            {
+                "channel": channel,
+                "stage": stage,
+                "step": str(entry["step"]),
+                "loss": f"{entry['loss']:.3g}",
+                "error": told,
+            }
+        )
     return rows
 
 
@@ -212,7 +239,15 @@ def _parameter_rows(parameters: dict[str, dict[str, Estimate]]) -> list[dict[str
     for name in sorted(names, key=_order):
         present = [table[name] for table in parameters.values() if name in table]
         unit = "" if present[0].unit == "1" else present[0].unit
-        rows.append({"group": _group(name), "label": _label(name), "name": name, "unit": unit, "cells": [cell(t.get(name)) for t in parameters.values()]})
+        rows.append(
+            {
+                "group": _group(name),
+                "label": _label(name),
+                "name": name,
+                "unit": unit,
+                "cells": [cell(t.get(name)) for t in parameters.values()],
+            }
+        )
     return rows
 
 
@@ -224,7 +259,10 @@ def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
             "fdi": fdi,
             "state": tooth.state,
             "channel": channel,
-            "errors": [_percent(errors[channel]) if channel in errors else "" for errors in (tooth.held_out_error, tooth.fit_error)],
+            "errors": [
+                _percent(errors[channel]) if channel in errors else ""
+                for errors in (tooth.held_out_error, tooth.fit_error)
+            ],
             "cells": [cell(table.get(name)) for name in names],
         }
         for fdi, tooth in teeth.items()
@@ -242,7 +280,10 @@ def _correlations(correlations: dict[str, Correlation]) -> list[dict[str, Any]]:
     for channel, found in correlations.items():
         if len(found.names) > 1:
             labels = [_symbol(name) for name in found.names]
-            rows = [(label, [cell(v, a == b) for b, v in enumerate(row)]) for a, (label, row) in enumerate(zip(labels, found.matrix, strict=True))]
+            rows = [
+                (label, [cell(v, a == b) for b, v in enumerate(row)])
+                for a, (label, row) in enumerate(zip(labels, found.matrix, strict=True))
+            ]
             tables.append({"channel": channel, "labels": labels, "rows": rows})
     return tables
 
@@ -297,7 +338,10 @@ def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
     if found.errors_mm is not None:
         most = max(0.05, math.ceil(20 * float(np.nanpercentile(found.errors_mm, 99))) / 20)
         maps.append(("Its standard error", found.errors_mm, most, f"{np.nanmean(found.errors_mm):.2f} mm"))
-    drawn = [(what, data_uri(enlarge(scalar_map(values, (0.0, most)), 240)), f"{most:g} mm", mean) for what, values, most, mean in maps]
+    drawn = [
+        (what, data_uri(enlarge(scalar_map(values, (0.0, most)), 240)), f"{most:g} mm", mean)
+        for what, values, most, mean in maps
+    ]
     height, width = found.image_mm.shape
     return {"maps": drawn, "camera": pictures.camera, "width": str(width), "height": str(height)}
 
@@ -309,7 +353,10 @@ def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
     low = float(np.floor(10 * np.nanmin(pictures.stains)) / 10)
     drawn = [(name, scalar_map(pictures.stains[..., k], (low, 1.0))) for k, name in enumerate(pictures.stained)]
     return {
-        "images": [(name, data_uri(enlarge(image, 240)), f"{np.nanmean(pictures.stains[..., k]):.2f}") for k, (name, image) in enumerate(drawn)],
+        "images": [
+            (name, data_uri(enlarge(image, 240)), f"{np.nanmean(pictures.stains[..., k]):.2f}")
+            for k, (name, image) in enumerate(drawn)
+        ],
         "camera": pictures.camera,
         "low": f"{low:g}",
         "width": str(pictures.stains.shape[1]),
@@ -323,6 +370,9 @@ def gradient(stops: ColourStops) -> str:
 
 
 def _provenance(boundary: str, context: dict[str, Any]) -> Sequence[tuple[str, str]]:
-    surface = {"matched": "index matched: light crosses the surface unaltered", "thin": f"thin dielectric layer, index {context.get('ior', '')}"}
+    surface = {
+        "matched": "index matched: light crosses the surface unaltered",
+        "thin": f"thin dielectric layer, index {context.get('ior', '')}",
+    }
     rows = [("Surface model", surface[boundary])] if boundary in surface else []
     return rows + [(str(label), str(text)) for label, text in context.get("provenance", {}).items()]

@@ -77,7 +77,9 @@ def _append(parent: ET.Element, name: str, value: Any, *, top: bool = False) -> 
         transform = ET.SubElement(parent, "transform", name=name)
         ET.SubElement(transform, "matrix", value=" ".join(repr(float(entry)) for entry in value.reshape(-1)))
     elif isinstance(value, list):
-        ET.SubElement(parent, "point", {"name": name} | {axis: _text(entry) for axis, entry in zip("xyz", value, strict=True)})
+        ET.SubElement(
+            parent, "point", {"name": name} | {axis: _text(entry) for axis, entry in zip("xyz", value, strict=True)}
+        )
     elif isinstance(value, SceneParameter):
         ET.SubElement(parent, VALUE_TAGS[type(value.default)], name=name, value=_text(value))
     else:

@@ -27,7 +27,11 @@ def kept_stains(folder: Path) -> ToothStains | None:
     if not (folder / STAINS).is_file():
         return None
     with np.load(folder / STAINS, allow_pickle=False) as stored:
-        textures = {name.removeprefix("texture."): Stain(stored[name].astype(float)) for name in stored.files if name.startswith("texture.")}
+        textures = {
+            name.removeprefix("texture."): Stain(stored[name].astype(float))
+            for name in stored.files
+            if name.startswith("texture.")
+        }
         return ToothStains(stored["corners_uv"].astype(float), textures)
 
 
@@ -55,7 +59,9 @@ def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.
         return np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     points = hits.points_mm[hits.hit]
-    weights = np.stack([doubled_area(points, corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)], axis=1)
+    weights = np.stack(
+        [doubled_area(points, corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)], axis=1
+    )
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     uv = np.einsum("nc,ncd->nd", weights, stains.corners_uv[hits.face[hits.hit]])
     for k, stain in enumerate(stains.textures.values()):

@@ -131,18 +131,26 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
             f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); keep one folder below teeth/, or set kind to 'jaw'."
         )
     if spec.kind == "jaw" and len(manifest.fdi) < 2:
-        raise CaptureInputError("A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set kind to 'tooth'.")
+        raise CaptureInputError(
+            "A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set kind to 'tooth'."
+        )
     teeth = read_teeth(folder, manifest.fdi)
     if spec.dentin == "known" and not any(tooth.dentin is not None for tooth in teeth):
         whose = f"tooth {teeth[0].fdi}" if len(teeth) == 1 else "no tooth"
-        raise SettingsError(f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to 'fit' or 'none'.")
+        raise SettingsError(
+            f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to 'fit' or 'none'."
+        )
     for channel in spec.channels or ():
         if channel not in manifest.channels:
-            raise SettingsError(f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}.")
+            raise SettingsError(
+                f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}."
+            )
     held_out = held_out_images(manifest, spec)
     if spec.kind == "tooth":
         return Observations(folder, manifest, teeth, held_out)
-    gums, cavity = (read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply"))
+    gums, cavity = (
+        read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply")
+    )
     return Observations(folder, manifest, teeth, held_out, gums, cavity)
 
 
@@ -154,12 +162,16 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
     """
     cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
     if len(lights) < 2:
-        raise CaptureInputError(f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more lights.")
+        raise CaptureInputError(
+            f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more lights."
+        )
     chosen = np.zeros((len(cameras), len(lights)), dtype=bool)
     if spec.held_out_lights is not None:
         for name in spec.held_out_lights:
             if name not in lights:
-                raise SettingsError(f"Option held_out_lights names '{name}', which the capture does not have; it has {', '.join(lights)}.")
+                raise SettingsError(
+                    f"Option held_out_lights names '{name}', which the capture does not have; it has {', '.join(lights)}."
+                )
             chosen[:, lights.index(name)] = True
     elif manifest.held_out:
         for camera, light in manifest.held_out:
@@ -191,16 +203,23 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         if len(x) == 0:
             continue
         reference, spread = (
-            np.stack([stack[c, light][y, x, index] for light in range(len(manifest.lights))]).astype(np.float64) for stack in (radiance, variance)
+            np.stack([stack[c, light][y, x, index] for light in range(len(manifest.lights))]).astype(np.float64)
+            for stack in (radiance, variance)
         )
         chosen = valid[:, y, x] & np.isfinite(reference)
         reference = np.where(chosen, reference, 0.0)
-        assumed = (spec.sensor_noise_relative * reference) ** 2 + (spec.sensor_noise_floor * reference.max(initial=0.0)) ** 2
+        assumed = (spec.sensor_noise_relative * reference) ** 2 + (
+            spec.sensor_noise_floor * reference.max(initial=0.0)
+        ) ** 2
         known = np.isfinite(spread) & (spread > 0)
         pixels = np.stack([x, y], axis=-1).astype(np.int32)
-        views.append(ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c]))
+        views.append(
+            ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c])
+        )
     if not views:
-        raise CaptureInputError("No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres.")
+        raise CaptureInputError(
+            "No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres."
+        )
     require_signal(views, f"Channel {channel}")
     if spec.held_out_lights != () and not any((v.valid & v.held_out[:, None]).any() for v in views):
         raise CaptureInputError("No pixel is valid in any held-out image; name other lights in held_out_lights.")
@@ -215,16 +234,29 @@ def require_signal(views: Sequence[ViewStack], name: str) -> None:
     """
     fitted = [v.fitted for v in views]
     if not any(f.any() for f in fitted):
-        raise CaptureInputError("No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks.")
+        raise CaptureInputError(
+            "No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks."
+        )
     signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
     if signal <= 0:
-        raise CaptureInputError(f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out.")
+        raise CaptureInputError(
+            f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out."
+        )
 
 
-def channel_scene(observations: Observations, channel: str, dentins: Sequence[DentinShape | None], spec: JobSpec, stain_uv: Array | None = None) -> SceneRecipe:
+def channel_scene(
+    observations: Observations,
+    channel: str,
+    dentins: Sequence[DentinShape | None],
+    spec: JobSpec,
+    stain_uv: Array | None = None,
+) -> SceneRecipe:
     """All that was captured, with the dentin of each tooth, under all lights of a channel."""
     return SceneRecipe(
-        tuple(ToothSurfaces(tooth.outer, dentin, stain_uv) for tooth, dentin in zip(observations.teeth, dentins, strict=True)),
+        tuple(
+            ToothSurfaces(tooth.outer, dentin, stain_uv)
+            for tooth, dentin in zip(observations.teeth, dentins, strict=True)
+        ),
         observations.light_positions_mm,
         observations.light_intensities(channel),
         spec.boundary,
@@ -235,7 +267,9 @@ def channel_scene(observations: Observations, channel: str, dentins: Sequence[De
     )
 
 
-def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...], loss: Loss = "l2") -> ChannelFiles:
+def write_channel(
+    folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...], loss: Loss = "l2"
+) -> ChannelFiles:
     """Write one channel's blocks and scenes; the same input gives the same files.
 
     Args:
@@ -256,7 +290,11 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
     cells = {v.camera.name: comparison_cells(v, coarse_pixels) for v in views}
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
-        chosen = replace(scene, light_positions_mm=scene.light_positions_mm[lights], light_intensities=scene.light_intensities[lights])
+        chosen = replace(
+            scene,
+            light_positions_mm=scene.light_positions_mm[lights],
+            light_intensities=scene.light_intensities[lights],
+        )
         return write_recipe(folder, chosen)
 
     def block(view: ViewStack, weight: Array, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
@@ -273,9 +311,15 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
             kept = np.ones(len(view.pixels), dtype=bool) if most is None else on_coarse_grid(view.pixels, counted, most)
             relevant = np.flatnonzero(counted & kept)
             pixels, signal = pixels + len(relevant), signal + float((weight * view.reference**2)[:, kept].sum())
-            fits += [block(view, weight, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)]
+            fits += [
+                block(view, weight, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)
+            ]
             seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
-            compares += [block(view, weight, seen, part) for part in _split(seen_pixels, int(seen.sum()), len(views)) if len(part)]
+            compares += [
+                block(view, weight, seen, part)
+                for part in _split(seen_pixels, int(seen.sum()), len(views))
+                if len(part)
+            ]
         return Level(tuple(fits), tuple(compares), pixels, signal)
 
     few = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
@@ -284,7 +328,11 @@ def write_channel(folder: Path, scene: SceneRecipe, channel: str, views: tuple[V
         recipe=recipe(used),
         coarse=level(coarse_pixels),
         full=level(None),
-        search_blocks=tuple(block(view, weight, used, pixels) for view, weight, pixels in zip(views, weights, few, strict=True) if len(pixels)),
+        search_blocks=tuple(
+            block(view, weight, used, pixels)
+            for view, weight, pixels in zip(views, weights, few, strict=True)
+            if len(pixels)
+        ),
         evaluation_recipe=recipe(seen),
         weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),

@@ -30,7 +30,9 @@ class Residual:
 def residual_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
     """Render a block and subtract the reference."""
     start, block = time.time(), read_block(task.block)
-    stack: StackEstimate = host.call("images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed)
+    stack: StackEstimate = host.call(
+        "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed
+    )
     return Residual(stack.mean - block.reference, stack.variance, trace_row("weights", task, start))
 
 
@@ -40,13 +42,21 @@ def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, 
 
     def compute() -> list[tuple[str, str]]:
         seed = passes.seeds(stage, "weights")
-        residuals: list[Residual] = passes.run(f"{passes.seeds.channel}-{stage}-weights", tissue, samples, residual_task, seed)
+        residuals: list[Residual] = passes.run(
+            f"{passes.seeds.channel}-{stage}-weights", tissue, samples, residual_task, seed
+        )
         passes.record([r.trace for r in residuals])
         blocks = passes.read_blocks()
 
         # One set of weights over all blocks, because scale and floor are those of the whole channel.
         fitted = [block.fit_weight > 0 for block in blocks]
-        columns = zip(*((b.reference[f], b.variance[f], r.residual[f], r.variance[f]) for b, r, f in zip(blocks, residuals, fitted, strict=True)), strict=True)
+        columns = zip(
+            *(
+                (b.reference[f], b.variance[f], r.residual[f], r.variance[f])
+                for b, r, f in zip(blocks, residuals, fitted, strict=True)
+            ),
+            strict=True,
+        )
         found = weights(loss, *(np.concatenate(column) for column in columns))
         parts = np.split(found, np.cumsum([f.sum() for f in fitted])[:-1])
         files = []

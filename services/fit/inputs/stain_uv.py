@@ -90,14 +90,23 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
     place: Array = np.einsum("sc,scd->sd", weights, outer.vertices_mm[outer.faces[faces]])
 
     def mean(values: Array) -> Array:
-        sums = [np.bincount(texels.reshape(-1), carried * np.repeat(values[:, k], 4), height * width)[touched] for k in range(3)]
+        sums = [
+            np.bincount(texels.reshape(-1), carried * np.repeat(values[:, k], 4), height * width)[touched]
+            for k in range(3)
+        ]
         return np.asarray(np.stack(sums, axis=-1) / area[touched, None])
 
     normals = mean(_normals(outer)[faces])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     points = mean(place)
     index = np.where(touched, np.cumsum(touched) - 1, -1).reshape(height, width)
-    return StainLayout(corners_uv, index, points, np.asarray(area[touched], dtype=np.float64), _neighbours(points, normals, REACH * texel_mm))
+    return StainLayout(
+        corners_uv,
+        index,
+        points,
+        np.asarray(area[touched], dtype=np.float64),
+        _neighbours(points, normals, REACH * texel_mm),
+    )
 
 
 def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:
@@ -107,7 +116,9 @@ def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64]
     column, row = x.astype(np.int64), y.astype(np.int64)
     u, v = x - column, y - row
     right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
-    texels = np.stack([row * width + column, row * width + right, below * width + column, below * width + right], axis=-1)
+    texels = np.stack(
+        [row * width + column, row * width + right, below * width + column, below * width + right], axis=-1
+    )
     return texels, np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=-1)
 
 
@@ -123,7 +134,9 @@ def _surface_samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.int64], 
         i, j = (index.reshape(-1) for index in np.mgrid[: n + 1, : n + 1])
         lattice = np.stack([i, j, n - i - j], axis=-1)[i + j <= n] / n
         count = len(lattice)
-        parts.append((np.repeat(chosen, count), np.tile(lattice, (len(chosen), 1)), np.repeat(areas[chosen] / count, count)))
+        parts.append(
+            (np.repeat(chosen, count), np.tile(lattice, (len(chosen), 1)), np.repeat(areas[chosen] / count, count))
+        )
     faces, weights, shares = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return faces, weights, shares
 

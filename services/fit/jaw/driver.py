@@ -68,11 +68,19 @@ class JawDriver:
         dentins = jaw_dentins(observations.teeth, observations.manifest.cameras, spec)
         for tooth, dentin in zip(observations.teeth, dentins, strict=True) if spec.dentin != "none" else ():
             if dentin is None:
-                attempt.log(f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh.")
+                attempt.log(
+                    f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh."
+                )
         channels = []
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
-            channels.append(Channel(name, views, write_channel(attempt.inputs, channel_scene(observations, name, dentins, spec), name, views)))
+            channels.append(
+                Channel(
+                    name,
+                    views,
+                    write_channel(attempt.inputs, channel_scene(observations, name, dentins, spec), name, views),
+                )
+            )
         journal = attempt.journal(channel.files for channel in channels)
         begun, _ = journal.once("begun", lambda: started_s)
 
@@ -82,10 +90,17 @@ class JawDriver:
         with attempt.workers() as run_on:
             for number, channel in enumerate(order):
                 shapes = [tooth.shape for tooth in found[order[0].name].fit.tissue.teeth] if found else None
-                run = _ChannelRun(attempt, observations, dentins, channel, journal, run_on, (number, len(order)), shapes)
+                run = _ChannelRun(
+                    attempt, observations, dentins, channel, journal, run_on, (number, len(order)), shapes
+                )
                 found[channel.name] = run.fit()
         fits = {channel.name: found[channel.name] for channel in channels}
-        attempt.write_records(journal, observations, {c: jaw.fit.evaluation for c, jaw in fits.items()}, {c: jaw.views for c, jaw in fits.items()})
+        attempt.write_records(
+            journal,
+            observations,
+            {c: jaw.fit.evaluation for c, jaw in fits.items()},
+            {c: jaw.views for c, jaw in fits.items()},
+        )
         return report(fits, order[0].name, dentins, observations, time.time() - begun)
 
 
@@ -97,7 +112,9 @@ def require_jaw_options(spec: JobSpec) -> None:
     """
     for option, usual in job_kinds()["jaw"].fixed_options.items():
         if (asked := getattr(spec, option)) != usual:
-            raise SettingsError(f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one with kind 'tooth'.")
+            raise SettingsError(
+                f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one with kind 'tooth'."
+            )
 
 
 def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSpec) -> list[DentinShape | None]:
@@ -117,7 +134,9 @@ def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSp
         except TOOTH_FAULTS:
             return None
 
-    return [blended(tooth, frame) for tooth, frame in zip(teeth, jaw_frames(teeth, viewpoints_mm(cameras)), strict=True)]
+    return [
+        blended(tooth, frame) for tooth, frame in zip(teeth, jaw_frames(teeth, viewpoints_mm(cameras)), strict=True)
+    ]
 
 
 def known_dentins(teeth: Sequence[Tooth]) -> list[DentinShape | None]:
@@ -151,13 +170,21 @@ class _ChannelRun:
                 self.attempt.log(f"{self.channel.name}: {starts[-1].sentence}")
         mouth = start_mouth(starts, self._gums(), has_cavity=observations.cavity is not None)
         shapes = [() if start.drops_dentin else self._shape(k) for k, start in enumerate(starts)]
-        mouth = replace(mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True)))
+        mouth = replace(
+            mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True))
+        )
 
         # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so the jaw's does not hold it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
-        files, dentins = self.channel.files, [None if s.drops_dentin else d for s, d in zip(starts, self.dentins, strict=True)]
+        files, dentins = (
+            self.channel.files,
+            [None if s.drops_dentin else d for s, d in zip(starts, self.dentins, strict=True)],
+        )
         if failed:
-            scene, views = channel_scene(observations, self.channel.name, dentins, self.attempt.spec), without(views, failed)
+            scene, views = (
+                channel_scene(observations, self.channel.name, dentins, self.attempt.spec),
+                without(views, failed),
+            )
             files = write_channel(self.attempt.inputs, scene, self.channel.name, views)
         self.attempt.log(f"{self.channel.name}: all {len(starts)} teeth together.")
         schedule = JawSchedule(
@@ -193,7 +220,9 @@ class _ChannelRun:
         if gums is None:
             return None
         if fitted_pixels(views) < MIN_TOOTH_PIXELS:
-            self.attempt.log(f"{self.channel.name}: gums show in {fitted_pixels(views)} usable pixels and start from the literature.")
+            self.attempt.log(
+                f"{self.channel.name}: gums show in {fitted_pixels(views)} usable pixels and start from the literature."
+            )
             return GUMS_START
         try:
             alone = replace(self.observations, teeth=(Tooth(0, gums),), gums=None, cavity=None)
@@ -203,7 +232,13 @@ class _ChannelRun:
             return GUMS_START
 
     def _start(
-        self, name: str, alone: Observations, dentin: DentinShape | None, shape: tuple[float, ...], views: tuple[ViewStack, ...], fdi: int | None
+        self,
+        name: str,
+        alone: Observations,
+        dentin: DentinShape | None,
+        shape: tuple[float, ...],
+        views: tuple[ViewStack, ...],
+        fdi: int | None,
     ) -> Tissue:
         # The first stages of a single tooth's fit, on a scene of its own.
         channel, spec = self.channel.name, self.attempt.spec
@@ -230,5 +265,8 @@ class _ChannelRun:
             self.steps = schedule.steps
 
     def _done(self, step: int) -> float:
-        expected = START_STEPS * len(self.observations.teeth) + (3 if self.attempt.spec.dentin == "fit" else 2) * self.attempt.spec.max_steps
+        expected = (
+            START_STEPS * len(self.observations.teeth)
+            + (3 if self.attempt.spec.dentin == "fit" else 2) * self.attempt.spec.max_steps
+        )
         return (self.place[0] + min(step / expected, 0.99)) / self.place[1]

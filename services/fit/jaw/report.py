@@ -37,7 +37,13 @@ class JawFit:
     """What was fitted and judged."""
 
 
-def report(fits: Mapping[str, JawFit], shaped_by: str, dentins: Sequence[DentinShape | None], observations: Observations, seconds: float) -> FitReport:
+def report(
+    fits: Mapping[str, JawFit],
+    shaped_by: str,
+    dentins: Sequence[DentinShape | None],
+    observations: Observations,
+    seconds: float,
+) -> FitReport:
     """The report of all channels.
 
     Args:
@@ -46,15 +52,26 @@ def report(fits: Mapping[str, JawFit], shaped_by: str, dentins: Sequence[DentinS
     """
     first = fits[shaped_by]
     converged, advice = judge({c: jaw.fit for c, jaw in fits.items()})
-    misplaced = offsets_told(_evaluations(fits), {c: worst_error(jaw.fit) for c, jaw in fits.items()}, observations, _views(fits), "the jaw's meshes")
+    misplaced = offsets_told(
+        _evaluations(fits),
+        {c: worst_error(jaw.fit) for c, jaw in fits.items()},
+        observations,
+        _views(fits),
+        "the jaw's meshes",
+    )
     advice = misplaced + advice
-    teeth = {str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced) for k, start in enumerate(first.starts)}
+    teeth = {
+        str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
+        for k, start in enumerate(first.starts)
+    }
     unexplained = [fdi for fdi, tooth in teeth.items() if tooth.state == "fitted" and tooth.sentence]
     advice += [tooth.sentence for tooth in teeth.values() if tooth.state != "tied" and tooth.sentence]
     return FitReport(
         converged=converged and not unexplained and not misplaced,
         advice=" ".join(advice),
-        parameters={c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()},
+        parameters={
+            c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()
+        },
         fit_error={c: jaw.fit.fit_error for c, jaw in fits.items()},
         held_out_error={c: jaw.fit.held_out_error for c, jaw in fits.items() if jaw.fit.held_out_error is not None},
         fit_error_se=standard_errors({c: one.fitted for c, one in _evaluations(fits).items()}),
@@ -77,7 +94,15 @@ def _views(fits: Mapping[str, JawFit]) -> dict[str, tuple[ViewStack, ...]]:
     return {channel: jaw.views for channel, jaw in fits.items()}
 
 
-def _tooth(k: int, fits: Mapping[str, JawFit], first: JawFit, dentin: DentinShape | None, observations: Observations, *, is_placed: bool) -> ToothReport:
+def _tooth(
+    k: int,
+    fits: Mapping[str, JawFit],
+    first: JawFit,
+    dentin: DentinShape | None,
+    observations: Observations,
+    *,
+    is_placed: bool,
+) -> ToothReport:
     # The worst state of all channels, and what it says; whether it lies elsewhere is asked only where the jaw as a whole lies where it should.
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
@@ -87,10 +112,19 @@ def _tooth(k: int, fits: Mapping[str, JawFit], first: JawFit, dentin: DentinShap
         sentence = f"Tooth {start.fdi} is still {100 * worst:.0f} % off in its images; check its mesh and its masks."
         if is_placed:
             errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}
-            sentence = " ".join([*offsets_told(_evaluations(fits), errors, observations, _views(fits), f"the mesh of tooth {start.fdi}", k), sentence])
+            sentence = " ".join(
+                [
+                    *offsets_told(
+                        _evaluations(fits), errors, observations, _views(fits), f"the mesh of tooth {start.fdi}", k
+                    ),
+                    sentence,
+                ]
+            )
     shape, covariance = first.fit.tissue.teeth[k].shape, shape_covariance(first.fit.known, k)
     seen = shape, np.array(covariance) if covariance else None, observations.manifest.cameras[0]
-    thickness = None if dentin is None or not first.dentin[k] else thickness_map(observations.teeth[k].outer, dentin, *seen)
+    thickness = (
+        None if dentin is None or not first.dentin[k] else thickness_map(observations.teeth[k].outer, dentin, *seen)
+    )
     tables = {c: _table(k, jaw, first) for c, jaw in fits.items()}
     return ToothReport(
         state=start.state,
@@ -108,10 +142,15 @@ def _tooth(k: int, fits: Mapping[str, JawFit], first: JawFit, dentin: DentinShap
 def _table(k: int, jaw: JawFit, first: JawFit) -> dict[str, Estimate]:
     parts = (f"{k}.enamel", f"{k}.dentin", f"{k}.shape") if jaw.dentin[k] else (f"{k}.enamel",)
     shaped = first.fit.known if shape_covariance(first.fit.known, k) else None
-    return {name.removeprefix(f"{k}."): estimate for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.known, shaped).items()}
+    return {
+        name.removeprefix(f"{k}."): estimate
+        for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.known, shaped).items()
+    }
 
 
 def _errors(evaluations: Mapping[str, Evaluation], k: int, kind: int) -> dict[str, float]:
     nothing = ErrorSums(), ErrorSums()
-    errors = {channel: evaluation.parts.get(k, nothing)[kind].resolved_error for channel, evaluation in evaluations.items()}
+    errors = {
+        channel: evaluation.parts.get(k, nothing)[kind].resolved_error for channel, evaluation in evaluations.items()
+    }
     return {channel: error for channel, error in errors.items() if error is not None}

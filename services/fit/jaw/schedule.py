@@ -62,7 +62,9 @@ class JawSchedule(Stages[Mouth]):
         mouth = self._best_starts() if any(self.dentin) else self.start
         mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
         if self._shaped:
-            mouth, solution = self._iterate(self._problem(self._retied(mouth), "shape", None), self.options(self.files.coarse), solution.samples)
+            mouth, solution = self._iterate(
+                self._problem(self._retied(mouth), "shape", None), self.options(self.files.coarse), solution.samples
+            )
         options = self.at_full_resolution()
         exact = self._problem(self._retied(mouth), "exact", None)
         mouth, solution = self._iterate(exact, options, self.fewer(min(solution.samples, EXACT_SAMPLES * samples)))
@@ -71,20 +73,34 @@ class JawSchedule(Stages[Mouth]):
     def _problem(self, mouth: Mouth, stage: str, image_g: float | None) -> StackProblem[Mouth]:
         domain = self._domain(mouth) if image_g is not None else self._exact_domain(mouth)
         neighbours = Neighbours.of([start.fdi for start in self.teeth])
-        return StackProblem(self.passes, domain, mouth, stage, jacobian_g=SIMILAR_G, image_g=image_g, neighbours=neighbours)
+        return StackProblem(
+            self.passes, domain, mouth, stage, jacobian_g=SIMILAR_G, image_g=image_g, neighbours=neighbours
+        )
 
     def _best_starts(self) -> Mouth:
         # Every ratio for all teeth at once; their losses are compared tooth by tooth, with the same seeds.
         ends = []
         for k, ratio in enumerate(START_RATIOS):
             start = replace(self.start, teeth=tuple(map(partial(_layered, ratio), self.start.teeth, self.dentin)))
-            ends.append(self._iterate(self._problem(start, f"start.{k}", SIMILAR_G), self.short(START_STEPS), self.spec.samples_per_pixel)[0])
+            ends.append(
+                self._iterate(
+                    self._problem(start, f"start.{k}", SIMILAR_G), self.short(START_STEPS), self.spec.samples_per_pixel
+                )[0]
+            )
         samples = min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
 
         def compute() -> list[list[float]]:
-            found = [self._evaluate("starts", similar_tissue(end, SIMILAR_G), samples, self.files.coarse) for end in ends]
+            found = [
+                self._evaluate("starts", similar_tissue(end, SIMILAR_G), samples, self.files.coarse) for end in ends
+            ]
             whole = [each.fitted.product for each in found]
-            return [[each.parts[k][0].product if k in each.parts else total for each, total in zip(found, whole, strict=True)] for k in range(len(self.teeth))]
+            return [
+                [
+                    each.parts[k][0].product if k in each.parts else total
+                    for each, total in zip(found, whole, strict=True)
+                ]
+                for k in range(len(self.teeth))
+            ]
 
         self.pause()
         losses, _ = self.journal.once(f"{self.scope}/starts", compute)
@@ -94,7 +110,11 @@ class JawSchedule(Stages[Mouth]):
     @property
     def media(self) -> tuple[str, ...]:
         """See Stages."""
-        teeth = [f"{k}.{part}" for k, has_dentin in enumerate(self.dentin) for part in (("enamel", "dentin") if has_dentin else ("enamel",))]
+        teeth = [
+            f"{k}.{part}"
+            for k, has_dentin in enumerate(self.dentin)
+            for part in (("enamel", "dentin") if has_dentin else ("enamel",))
+        ]
         return (*teeth, *(() if self.start.gums is None else ("gums",)))
 
     @property
@@ -106,7 +126,9 @@ class JawSchedule(Stages[Mouth]):
         # Media of one tissue are wrong alike: 29 of them, each on its own, would cost more than the fit.
         kinds = {"enamel": WEAK["enamel.g1"], "dentin": WEAK["dentin.g1"], "gums": WEAK["enamel.g1"]}
         held = [part for part in self.media if part not in domain.cosines]
-        alike = {tuple(part for part in held if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()}
+        alike = {
+            tuple(part for part in held if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()
+        }
         return {parts: prior for parts, prior in alike.items() if parts}
 
     def _others(self, tissue: Mouth) -> dict[str, float]:
@@ -128,33 +150,54 @@ class JawSchedule(Stages[Mouth]):
                 if part == "gums":
                     coordinates.append(Coordinate((name,), to_dual(kind, self.start.value(name)), GUMS_SD[kind]))
                 elif self.teeth[int(tooth)].state != "fitted":
-                    coordinates.append(Coordinate((name,), to_dual(kind, common.value(f"0.{medium}.{kind}")), TIED_SD[kind]))
+                    coordinates.append(
+                        Coordinate((name,), to_dual(kind, common.value(f"0.{medium}.{kind}")), TIED_SD[kind])
+                    )
                 else:
                     prior = priors_of(self.spec.prior).get(f"{medium}.{kind}")
                     coordinates.append(Coordinate((name,), *prior) if prior else Coordinate((name,)))
         if mouth.reflectance is not None:
             assert self.start.reflectance is not None
-            coordinates.append(Coordinate(("cavity.reflectance",), to_dual("reflectance", self.start.reflectance), WALL_SD))
+            coordinates.append(
+                Coordinate(("cavity.reflectance",), to_dual("reflectance", self.start.reflectance), WALL_SD)
+            )
         return Domain(tuple(coordinates))
 
     def _exact_domain(self, mouth: Mouth) -> Domain:
         # Enamel of one mouth has one mean cosine, which images of similar media would not show; tied teeth keep the blend weights of the start.
         enamel = tuple(f"{k}.enamel.cosine" for k in range(len(mouth.teeth)))
         weights = [f"{k}.shape.{mode}" for k in self._shaped for mode in range(len(mouth.teeth[k].shape))]
-        return Domain((*self._domain(mouth).coordinates, Coordinate(enamel, *COSINE), *(Coordinate((name,), *SHAPE) for name in weights)))
+        return Domain(
+            (
+                *self._domain(mouth).coordinates,
+                Coordinate(enamel, *COSINE),
+                *(Coordinate((name,), *SHAPE) for name in weights),
+            )
+        )
 
     @property
     def _shaped(self) -> list[int]:
         # Teeth whose blend weights are fitted.
-        return [k for k, tooth in enumerate(self.start.teeth) if tooth.shape and self.fits_shape and self.teeth[k].state == "fitted"]
+        return [
+            k
+            for k, tooth in enumerate(self.start.teeth)
+            if tooth.shape and self.fits_shape and self.teeth[k].state == "fitted"
+        ]
 
     def _retied(self, mouth: Mouth) -> Mouth:
         # Teeth that are tied start the next stage where the others now are, at the cosine that their enamel shares.
         common = self._typical(mouth)
-        cosine = next(tooth.enamel.mean_cosine for tooth, start in zip(mouth.teeth, self.teeth, strict=True) if start.state == "fitted")
+        cosine = next(
+            tooth.enamel.mean_cosine
+            for tooth, start in zip(mouth.teeth, self.teeth, strict=True)
+            if start.state == "fitted"
+        )
         common = replace(common, enamel=similar_medium(common.enamel, cosine))
         tied = (replace(common, shape=tooth.shape) for tooth in mouth.teeth)
-        chosen = (tooth if start.state == "fitted" else other for tooth, start, other in zip(mouth.teeth, self.teeth, tied, strict=True))
+        chosen = (
+            tooth if start.state == "fitted" else other
+            for tooth, start, other in zip(mouth.teeth, self.teeth, tied, strict=True)
+        )
         return replace(mouth, teeth=tuple(chosen))
 
     def _typical(self, mouth: Mouth) -> Tissue:
@@ -164,7 +207,12 @@ class JawSchedule(Stages[Mouth]):
 def _layered(ratio: tuple[float, float], tooth: Tissue, has_dentin: bool) -> Tissue:
     # The homogeneous tooth with its density shared out to its two media.
     return (
-        tooth.with_values({f"{part}.sigma": share * tooth.medium(part).sigma for part, share in zip(("enamel", "dentin"), ratio, strict=True)})
+        tooth.with_values(
+            {
+                f"{part}.sigma": share * tooth.medium(part).sigma
+                for part, share in zip(("enamel", "dentin"), ratio, strict=True)
+            }
+        )
         if has_dentin
         else tooth
     )

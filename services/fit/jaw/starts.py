@@ -45,7 +45,9 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
     """Fit one tooth alone, unless too little of it is seen; what its own data or meshes cause becomes its state."""
     if pixels < MIN_TOOTH_PIXELS:
         seen = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
-        return ToothStart(fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None)
+        return ToothStart(
+            fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None
+        )
     try:
         return ToothStart(fdi, "fitted", "", pixels, fit())
     except TOOTH_FAULTS as problem:
@@ -62,13 +64,22 @@ def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tis
     Raises:
         InputError: no tooth was fitted.
     """
-    fitted = [(start, tissue) for start, tissue in zip(starts, teeth, strict=True) if start.state == "fitted" and tissue is not None]
-    chosen = [similar_tissue(tissue, HELD_G) for start, tissue in fitted if start.is_front] or [similar_tissue(tissue, HELD_G) for _, tissue in fitted]
+    fitted = [
+        (start, tissue)
+        for start, tissue in zip(starts, teeth, strict=True)
+        if start.state == "fitted" and tissue is not None
+    ]
+    chosen = [similar_tissue(tissue, HELD_G) for start, tissue in fitted if start.is_front] or [
+        similar_tissue(tissue, HELD_G) for _, tissue in fitted
+    ]
     if not chosen:
         raise InputError(f"No tooth of the jaw can be fitted; the first one says: {starts[0].sentence}")
 
     def median(part: str) -> Medium:
-        values = {kind: to_natural(kind, statistics.median(to_dual(kind, getattr(t.medium(part), kind)) for t in chosen)) for kind in ("sigma", "alpha")}
+        values = {
+            kind: to_natural(kind, statistics.median(to_dual(kind, getattr(t.medium(part), kind)) for t in chosen))
+            for kind in ("sigma", "alpha")
+        }
         return Medium(values["sigma"], values["alpha"], g1=HELD_G)
 
     return Tissue(median("enamel"), median("dentin"))

@@ -22,11 +22,16 @@ def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple
     """
     from scipy.spatial import cKDTree
 
-    surroundings = {part: mesh for part, mesh in ((GUMS, observations.gums), (CAVITY, observations.cavity)) if mesh is not None}
+    surroundings = {
+        part: mesh for part, mesh in ((GUMS, observations.gums), (CAVITY, observations.cavity)) if mesh is not None
+    }
     numbers = np.array([*range(len(observations.teeth)), *surroundings], dtype=np.int16)
     scene = RayScene(*(tooth.outer for tooth in observations.teeth), *surroundings.values())
     nearest = cKDTree(np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]))
-    tooth_of = np.repeat(np.arange(len(observations.teeth), dtype=np.int16), [len(tooth.outer.vertices_mm) for tooth in observations.teeth])
+    tooth_of = np.repeat(
+        np.arange(len(observations.teeth), dtype=np.int16),
+        [len(tooth.outer.vertices_mm) for tooth in observations.teeth],
+    )
 
     labelled = []
     for view in views:
@@ -37,7 +42,9 @@ def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple
         if hits.hit.any():
             labelled.append(replace(view.of(hits.hit), parts=PixelParts(shown, tooth)))
     if not labelled:
-        raise CaptureInputError("No valid pixel shows a tooth, gums or cavity; check that meshes and cameras share one frame in millimetres.")
+        raise CaptureInputError(
+            "No valid pixel shows a tooth, gums or cavity; check that meshes and cameras share one frame in millimetres."
+        )
     return tuple(labelled)
 
 

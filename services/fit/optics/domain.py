@@ -41,9 +41,27 @@ BOUNDS = {
 }
 HELD_G = 0.8
 """Mean cosine at which sigma and alpha are coordinates where the cosine is one too, and that a single lobe has where it is not."""
-STEP_SCALE = {"sigma": math.log(2.0), "alpha": 0.4, "g1": 0.35, "cosine": 0.35, "g2": 0.35, "beta": 1.0, "reflectance": 1.0, "shape": 0.25}
+STEP_SCALE = {
+    "sigma": math.log(2.0),
+    "alpha": 0.4,
+    "g1": 0.35,
+    "cosine": 0.35,
+    "g2": 0.35,
+    "beta": 1.0,
+    "reflectance": 1.0,
+    "shape": 0.25,
+}
 """Length over which the image is roughly linear in each coordinate; a trust radius of 1 means one of these."""
-UNITS = {"sigma": "1/mm", "alpha": "1", "g1": "1", "cosine": "1", "g2": "1", "beta": "1", "reflectance": "1", "shape": "1"}
+UNITS = {
+    "sigma": "1/mm",
+    "alpha": "1",
+    "g1": "1",
+    "cosine": "1",
+    "g2": "1",
+    "beta": "1",
+    "reflectance": "1",
+    "shape": "1",
+}
 LOGISTIC = frozenset({"beta", "reflectance"})
 
 
@@ -186,7 +204,11 @@ class Domain:
 
     def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Optics) -> Optics:
         """``base`` with this domain's parameters at x."""
-        values = {target: to_natural(c.kind, float(v)) for c, v in zip(self.coordinates, x, strict=True) for target in c.targets}
+        values = {
+            target: to_natural(c.kind, float(v))
+            for c, v in zip(self.coordinates, x, strict=True)
+            for target in c.targets
+        }
         cosines = {part: values.pop(f"{part}.cosine") for part in self.cosines}
         return _at_cosines(_at_cosines(base, dict.fromkeys(cosines, HELD_G)).with_values(values), cosines)
 

@@ -34,10 +34,14 @@ class PhaseTable:
         angles = np.array(self.angles_rad, dtype=np.float64)
         values = tuple(float(value) for value in self.values)
         if len(values) < FEWEST_NODES or len(values) != len(angles):
-            raise InputError(f"A phase table has {len(values)} values at {len(angles)} angles; give as many of each, at least two.")
+            raise InputError(
+                f"A phase table has {len(values)} values at {len(angles)} angles; give as many of each, at least two."
+            )
         for angle, value in zip(angles, values, strict=True):
             if not math.isfinite(value) or value < 0:
-                raise InputError(f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and not negative.")
+                raise InputError(
+                    f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and not negative."
+                )
         # Pi need not have all its digits.
         angles[-1] = math.pi if math.isclose(angles[-1], math.pi, rel_tol=1e-6) else math.nan
         if angles[0] != 0 or not (np.diff(_cosine_deviations(angles)) > 0).all():

@@ -28,7 +28,9 @@ _LEAVES = {
     "beta": (to_dual("beta", 0.9), 1.0),
     "g2": (to_dual("g2", -0.1), 0.35),
 }
-WEAK: Priors = MappingProxyType({f"{part}.{leaf}": prior for part in ("enamel", "dentin") for leaf, prior in _LEAVES.items()})
+WEAK: Priors = MappingProxyType(
+    {f"{part}.{leaf}": prior for part in ("enamel", "dentin") for leaf, prior in _LEAVES.items()}
+)
 """g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
 COSINE = (to_dual("cosine", 0.7), 0.35)
 """Of the mean cosine of one lobe that stands for two: 0.48 to 0.84 (one sigma). Similarity of second order asks teeth's lobes for 0.5 to 0.7."""
@@ -84,7 +86,10 @@ def literature() -> Priors:
         rows = [row for row in LITERATURE_TABLE if row.tissue == part]
         usual = float(np.exp(np.mean([np.log(row.sigma_a) for row in rows if row.sigma_a is not None])))
         absorbed = [usual if row.sigma_a is None else row.sigma_a for row in rows]
-        media = [Medium(row.sigma_s_reduced + a, row.sigma_s_reduced / (row.sigma_s_reduced + a)) for row, a in zip(rows, absorbed, strict=True)]
+        media = [
+            Medium(row.sigma_s_reduced + a, row.sigma_s_reduced / (row.sigma_s_reduced + a))
+            for row, a in zip(rows, absorbed, strict=True)
+        ]
         priors |= towards(part, media)
     return priors
 

@@ -37,7 +37,9 @@ class ChannelMedia:
         self.channels = len(optics.enamel)
         self._parts = DENTIN if optics.dentin else 1
         # Numbered one channel after the other.
-        pairs = zip(optics.enamel, optics.dentin, strict=True) if optics.dentin else ((medium,) for medium in optics.enamel)
+        pairs = (
+            zip(optics.enamel, optics.dentin, strict=True) if optics.dentin else ((medium,) for medium in optics.enamel)
+        )
         self._media = Media([medium for channel in pairs for medium in channel])
         self.two_lobes = self._media.two_lobes
 
@@ -54,9 +56,13 @@ class ChannelMedia:
 
     def phase(self, part: mi.UInt32, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Spectrum:
         """Phase function of each channel, 1/sr."""
-        return mi.Spectrum([PhaseFunction(self._media, index).density(omega, omega_out) for index in self._indices(part)])
+        return mi.Spectrum(
+            [PhaseFunction(self._media, index).density(omega, omega_out) for index in self._indices(part)]
+        )
 
-    def turn(self, part: mi.UInt32, leader: mi.UInt32, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Point2f) -> mi.Vector3f:
+    def turn(
+        self, part: mi.UInt32, leader: mi.UInt32, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Point2f
+    ) -> mi.Vector3f:
         """A direction from the leader's phase function."""
         index = dr.select(part == 0, 0, part + self._parts * leader)
         return PhaseFunction(self._media, index).sample(omega, u_lobe, u.x, u.y)

@@ -76,29 +76,49 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
     Raises:
         InputError: unknown, missing or impossible; names property and value.
     """
-    known = {*PARTS, *(f"{part}_{field}" for part in PARTS for field in MEDIUM_FIELDS), "boundary", "ior", "roughness", "max_depth", *STOCK_PROPERTIES}
+    known = {
+        *PARTS,
+        *(f"{part}_{field}" for part in PARTS for field in MEDIUM_FIELDS),
+        "boundary",
+        "ior",
+        "roughness",
+        "max_depth",
+        *STOCK_PROPERTIES,
+    }
     for name in given:
         if name not in known:
-            raise InputError(f"Integrator {PLUGIN} has no property '{name}'; it has {', '.join(sorted(known - STOCK_PROPERTIES))}.")
+            raise InputError(
+                f"Integrator {PLUGIN} has no property '{name}'; it has {', '.join(sorted(known - STOCK_PROPERTIES))}."
+            )
     ids = {part: tuple(filter(None, (name.strip() for name in str(given.get(part, "")).split(",")))) for part in PARTS}
     if not ids["enamel"]:
         raise InputError(f"Integrator {PLUGIN} needs 'enamel', the ids of the shapes around teeth; give at least one.")
     for name in given:
         if name.startswith("dentin_") and not ids["dentin"]:
-            raise InputError(f"Property {name} is given but no dentin surface; name its shape as 'dentin', or leave the property out.")
+            raise InputError(
+                f"Property {name} is given but no dentin surface; name its shape as 'dentin', or leave the property out."
+            )
     media = {part: _media(part, given, channels) if ids[part] else () for part in PARTS}
-    boundary, ior, roughness, max_depth = (given.get(*pair) for pair in (("boundary", "thin"), ("ior", 1.631), ("roughness", None), ("max_depth", 5000)))
+    boundary, ior, roughness, max_depth = (
+        given.get(*pair) for pair in (("boundary", "thin"), ("ior", 1.631), ("roughness", None), ("max_depth", 5000))
+    )
     if boundary not in {"thin", "matched"}:
         raise InputError(f"boundary = {boundary} must be 'thin' or 'matched'; choose one of these.")
     if not (isinstance(ior, int | float) and math.isfinite(ior) and ior >= 1):
         raise InputError(f"ior = {ior} must be at least 1; give the index of refraction of enamel, 1.631.")
     if roughness is not None and not (isinstance(roughness, int | float) and ROUGHNESS[0] <= roughness <= ROUGHNESS[1]):
-        raise InputError(f"roughness = {roughness} must lie in {ROUGHNESS[0]:g} to {ROUGHNESS[1]:g}; correct it, or leave it out for no mirror image.")
+        raise InputError(
+            f"roughness = {roughness} must lie in {ROUGHNESS[0]:g} to {ROUGHNESS[1]:g}; correct it, or leave it out for no mirror image."
+        )
     if roughness is not None and boundary == "matched":
-        raise InputError("An index-matched surface has no mirror image; choose boundary 'thin', or leave out roughness.")
+        raise InputError(
+            "An index-matched surface has no mirror image; choose boundary 'thin', or leave out roughness."
+        )
     if not isinstance(max_depth, int) or max_depth < 1:
         raise InputError(f"max_depth = {max_depth} must be a positive whole number; correct it.")
-    optics = ToothOptics(media["enamel"], media["dentin"], float(ior) if boundary == "thin" and ior != 1 else None, roughness)
+    optics = ToothOptics(
+        media["enamel"], media["dentin"], float(ior) if boundary == "thin" and ior != 1 else None, roughness
+    )
     return ToothProperties(ToothShapes(ids["enamel"], ids["dentin"]), optics, max_depth)
 
 
@@ -112,9 +132,13 @@ def _media(part: str, given: Mapping[str, Any], channels: int) -> tuple[Medium, 
         try:
             numbers = np.atleast_1d(np.array(value, dtype=np.float64)).reshape(-1)
         except (TypeError, ValueError) as problem:
-            raise InputError(f"{name} = {value} is no number; give one number, or one for each colour channel.") from problem
+            raise InputError(
+                f"{name} = {value} is no number; give one number, or one for each colour channel."
+            ) from problem
         if len(numbers) not in {1, channels}:
-            raise InputError(f"{name} has {len(numbers)} values in a variant of {channels} channel; give one number, or set an RGB variant.")
+            raise InputError(
+                f"{name} has {len(numbers)} values in a variant of {channels} channel; give one number, or set an RGB variant."
+            )
         columns.append(np.broadcast_to(numbers, channels).tolist())
     media = tuple(Medium(*values) for values in zip(*columns, strict=True))
     for medium in media:
@@ -130,7 +154,9 @@ def register_integrator() -> None:
     """
     variant = mi.variant()
     if variant is None or variant.startswith("scalar") or not variant.endswith(("_mono", "_rgb")):
-        raise PlatformError(f"Integrator {PLUGIN} needs a variant such as llvm_ad_mono or llvm_ad_rgb, not {variant}; set one first.")
+        raise PlatformError(
+            f"Integrator {PLUGIN} needs a variant such as llvm_ad_mono or llvm_ad_rgb, not {variant}; set one first."
+        )
 
     class Dentine(mi.SamplingIntegrator):
         """Adapter between Mitsuba's render loop and ``ScenePaths``."""
@@ -140,7 +166,14 @@ def register_integrator() -> None:
             self.properties = read_properties({name: props[name] for name in props.keys()}, len(mi.Spectrum()))  # noqa: SIM118 - no mapping
             self._teeth: SceneTeeth | None = None
 
-        def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, medium: Any = None, active: Any = True) -> Any:  # noqa: ARG002
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: Any = None,  # noqa: ARG002
+            active: Any = True,
+        ) -> Any:
             if self._teeth is None or not self._teeth.describe(scene):
                 self._teeth = SceneTeeth(scene, self.properties.shapes)
             paths = ScenePaths(scene, self._teeth, self.properties.optics, self.properties.max_depth)

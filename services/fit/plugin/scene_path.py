@@ -130,7 +130,9 @@ class ScenePaths:
         rng = mi.PCG32(SCALE_SAMPLES)
         middle = dr.zeros(mi.Interaction3f, SCALE_SAMPLES)
         middle.p = mi.Point3f(self.teeth.centre.tolist())
-        _, weight = self.scene.sample_emitter_direction(middle, mi.Point2f(rng.next_float32(), rng.next_float32()), False)
+        _, weight = self.scene.sample_emitter_direction(
+            middle, mi.Point2f(rng.next_float32(), rng.next_float32()), False
+        )
         mean = float(dr.mean(dr.max(weight))[0])
         return dr.opaque(mi.Float, 1 / mean if mean > 0 else 0.0)
 
@@ -152,7 +154,9 @@ class ScenePaths:
             valid=mi.Bool(False),
             active=mi.Bool(active),
         )
-        (path,) = dr.while_loop((path,), lambda path: path.active, lambda path: (self._step(path),), label="paths through teeth")
+        (path,) = dr.while_loop(
+            (path,), lambda path: path.active, lambda path: (self._step(path),), label="paths through teeth"
+        )
         return path.radiance, path.valid
 
     def _step(self, path: Path) -> Path:
@@ -190,10 +194,24 @@ class ScenePaths:
 
         # The density that each channel would have flown so far with, relative to the leader's.
         length = dr.select(meets, found.t, distance)
-        path.likely = self.media.rival(path.likely, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside)
+        path.likely = self.media.rival(
+            path.likely, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside
+        )
         met = self.teeth.part(found, meets)
         never = mi.Bool(False)
-        return Flight(si, met, dr.dot(path.ray.d, si.n), distance, meets, scatters, meets & (met == 0), never, never, never, mi.Float(0))
+        return Flight(
+            si,
+            met,
+            dr.dot(path.ray.d, si.n),
+            distance,
+            meets,
+            scatters,
+            meets & (met == 0),
+            never,
+            never,
+            never,
+            mi.Float(0),
+        )
 
     def _collect(self, path: Path, flight: Flight) -> None:
         """Light that the path has found by itself, on a surface or in the environment."""
@@ -255,19 +273,31 @@ class ScenePaths:
         # The outside of a glossy face.
         if self.gloss is not None:
             shine, chance = self.gloss.evaluate(si, light.d)
-            value, density = dr.select(flight.shines, shine, value), dr.select(flight.shines, flight.reflected * chance, density)
+            value, density = (
+                dr.select(flight.shines, shine, value),
+                dr.select(flight.shines, flight.reflected * chance, density),
+            )
             image = self.gloss.sample(si, sampler.next_2d(flight.glossy))
             shine, chance = self.gloss.evaluate(si, image)
             turn.direction = dr.select(flight.glossy, image, turn.direction)
             turn.density = dr.select(flight.glossy, flight.reflected * chance, turn.density)
-            turn.weight = dr.select(flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), turn.weight)
+            turn.weight = dr.select(
+                flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), turn.weight
+            )
 
         self._join(path, flight, vertex, light, value * brought, density, joins)
         path.likely = self.media.rival(path.likely, to_onward, scatters)
         return turn
 
     def _join(
-        self, path: Path, flight: Flight, vertex: mi.Interaction3f, light: mi.DirectionSample3f, value: mi.Spectrum, density: mi.Float, joins: mi.Bool
+        self,
+        path: Path,
+        flight: Flight,
+        vertex: mi.Interaction3f,
+        light: mi.DirectionSample3f,
+        value: mi.Spectrum,
+        density: mi.Float,
+        joins: mi.Bool,
     ) -> None:
         # In a tooth only with a probability in proportion to what the emitter could bring.
         value = path.throughput * self.media.share(path.likely) * value
@@ -308,7 +338,9 @@ class ScenePaths:
             shadow.depth += self.media.extinction(self.teeth.medium(shadow.place)) * length
             cosine = dr.dot(shadow.ray.d, si.n)
             if self.ior is not None:
-                shadow.surface *= dr.select(meets & (part == ENAMEL), 1 - fresnel.reflectance(dr.abs(cosine), self.ior), 1)
+                shadow.surface *= dr.select(
+                    meets & (part == ENAMEL), 1 - fresnel.reflectance(dr.abs(cosine), self.ior), 1
+                )
             shadow.surface *= dr.select(meets & (part == 0), 0, 1)
             shadow.alive = meets & (part != 0) & (dr.min(shadow.depth) < DARK_DEPTH)
             onward = si.spawn_ray(shadow.ray.d)
@@ -318,5 +350,7 @@ class ScenePaths:
             return shadow
 
         shadow = Shadow(ray, mi.UInt32(place), mi.Spectrum(0), mi.Float(1), mi.Bool(active))
-        (shadow,) = dr.while_loop((shadow,), lambda shadow: shadow.alive, lambda shadow: (step(shadow),), label="light through teeth")
+        (shadow,) = dr.while_loop(
+            (shadow,), lambda shadow: shadow.alive, lambda shadow: (step(shadow),), label="light through teeth"
+        )
         return shadow.surface * dr.exp(-shadow.depth)

@@ -86,7 +86,9 @@ def _state(scene: Any, shapes: ToothShapes) -> list[NDArray[Any]]:
     for name in (*shapes.enamel, *shapes.dentin):
         if name not in by_id:
             known = ", ".join(sorted(filter(None, by_id))) or "no shape with an id"
-            raise InputError(f"The scene has no shape '{name}' but {known}; correct the id, and load the scene with optimize=False so that ids survive.")
+            raise InputError(
+                f"The scene has no shape '{name}' but {known}; correct the id, and load the scene with optimize=False so that ids survive."
+            )
         if not by_id[name].is_mesh():
             raise InputError(f"Shape '{name}' is no triangle mesh; give the tooth's surface as a mesh file.")
         if by_id[name].is_emitter():

@@ -27,10 +27,14 @@ def main(
         raise typer.Exit(error.exit_status) from error
     write_results(fits, out)
     for fit in fits:
-        print(f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {100 * fit.errors.fit_error:.2f} %")
+        print(
+            f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {100 * fit.errors.fit_error:.2f} %"
+        )
         for name in type(fit.parameters).model_fields:
             told = getattr(fit.parameters, name)
-            print(f"  {name:16} {told.value:9.5f} ± {told.se:.5f} {told.unit}{'' if told.determined else '  not determined'}")
+            print(
+                f"  {name:16} {told.value:9.5f} ± {told.se:.5f} {told.unit}{'' if told.determined else '  not determined'}"
+            )
         for note in fit.notes:
             print(f"  {note}")
 

@@ -54,13 +54,17 @@ def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: 
     centre_mm = float(lit.sum(axis=1) @ y_mm / lit.sum())
     if abs(centre_mm) <= MAX_OFF * max(pitch_mm, beam.size_mm):
         return ()
-    return (f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct pixels.y_mm.",)
+    return (
+        f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct pixels.y_mm.",
+    )
 
 
 def grid_faults(pixels: PixelGrid) -> tuple[str, ...]:
     """Whether the beam's axis, which meets its face at x = y = 0, lies where pixels are."""
     beside = [axis for axis, (low, high) in (("x", pixels.x_mm), ("y", pixels.y_mm)) if not low < 0 < high]
-    return tuple(f"The beam meets the cell at {axis} = 0, beside the pixels; correct pixels.{axis}_mm." for axis in beside)
+    return tuple(
+        f"The beam meets the cell at {axis} = 0, beside the pixels; correct pixels.{axis}_mm." for axis in beside
+    )
 
 
 def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:

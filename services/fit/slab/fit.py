@@ -85,7 +85,9 @@ def fit_images(
         parameters=parameters_of(material, uncertainty, index),
         phase=phase,
         errors=_errors(measured, first, second),
-        notes=measured.faults + sample_faults(material, rig.width_mm) + _notes(measured, phase, converged=solution.converged),
+        notes=measured.faults
+        + sample_faults(material, rig.width_mm)
+        + _notes(measured, phase, converged=solution.converged),
         converged=solution.converged,
         steps=solution.steps,
         paths=solution.paths,
@@ -99,7 +101,11 @@ def fit_images(
 def _budget(effort: float) -> Budget:
     plain = Budget()
     last = tuple((max(1, round(effort * paths)), batches) for paths, batches in plain.last)
-    return Budget(first_paths=max(1, round(effort * plain.first_paths)), search_paths=max(1, round(effort * plain.search_paths)), last=last)
+    return Budget(
+        first_paths=max(1, round(effort * plain.first_paths)),
+        search_paths=max(1, round(effort * plain.search_paths)),
+        last=last,
+    )
 
 
 def last_look(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
@@ -121,12 +127,16 @@ def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[
 def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> tuple[str, ...]:
     notes = []
     if measured.assumed_noise:
-        notes.append("Images without a variance file are taken to have shot noise of 1 % at a pixel of the image's mean.")
+        notes.append(
+            "Images without a variance file are taken to have shot noise of 1 % at a pixel of the image's mean."
+        )
     if lost := int(np.count_nonzero(~np.isfinite(measured.variances))):
         notes.append(f"{lost} values are not finite or have no variance and were left out.")
     if bands := [f"from {low:.1f} to {high:.1f}" for low, high in phase.undetermined_bands_deg()]:
         told = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
-        notes.append(f"The images do not determine the phase function {told} degrees; what is given there is the prior's.")
+        notes.append(
+            f"The images do not determine the phase function {told} degrees; what is given there is the prior's."
+        )
     if not converged:
         notes.append("The search spent its steps before they stopped to help; the last steps were made all the same.")
     return tuple(notes)

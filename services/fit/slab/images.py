@@ -45,14 +45,18 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     grid = grid_of(folder.pixels)
     entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
     if not entries:
-        raise CaptureInputError(f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength.")
+        raise CaptureInputError(
+            f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength."
+        )
     values, variances, faults = [], [], list(grid_faults(folder.pixels))
     for entry in entries:
         image = _read(root, folder, entry, entry.file)
         variance = shot_noise(image) if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
         usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
         if not usable.any():
-            raise CaptureInputError(f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again.")
+            raise CaptureInputError(
+                f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."
+            )
         faults += image_faults(f"{entry.camera} under {entry.light}", image, folder.pixels, folder.beam)
         value, of_value = _folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
         values.append(value)
@@ -76,15 +80,21 @@ def shot_noise(image: Array, share: float = DEFAULT_NOISE) -> Array:
 def _read(root: Path, folder: SlabFolder, entry: SlabImage, file: str) -> Array:
     place = f"Image file {root / file} (camera {entry.camera}, light {entry.light})"
     if Path(file).suffix.lower() != ".npy":
-        raise CaptureInputError(f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float.")
+        raise CaptureInputError(
+            f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float."
+        )
     try:
         image = np.load(root / file, allow_pickle=False)
     except (ValueError, EOFError, OSError) as problem:
-        raise CaptureInputError(f"{place} cannot be read ({problem}); it may be truncated, so copy or export it again.") from problem
+        raise CaptureInputError(
+            f"{place} cannot be read ({problem}); it may be truncated, so copy or export it again."
+        ) from problem
     expected = folder.pixels.rows, folder.pixels.columns
     if not isinstance(image, np.ndarray) or image.shape != expected or not np.issubdtype(image.dtype, np.floating):
         found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else "an archive"
-        raise CaptureInputError(f"{place} holds {found} instead of floats {expected} (rows, columns); export it on the folder's grid.")
+        raise CaptureInputError(
+            f"{place} holds {found} instead of floats {expected} (rows, columns); export it on the folder's grid."
+        )
     return image.astype(np.float64)
 
 

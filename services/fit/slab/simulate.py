@@ -68,8 +68,12 @@ class SlabResult(Record):
     dT: dict[str, float] = Field(default_factory=dict)
     dR_se: dict[str, float] = Field(default_factory=dict)
     dT_se: dict[str, float] = Field(default_factory=dict)
-    radiance: FaceValues | None = Field(default=None, description="azimuthal mean at each exit cosine, per sr and incident irradiance")
-    rings: FaceValues | None = Field(default=None, description="share of the incident flux that leaves within each ring, the last one unbounded")
+    radiance: FaceValues | None = Field(
+        default=None, description="azimuthal mean at each exit cosine, per sr and incident irradiance"
+    )
+    rings: FaceValues | None = Field(
+        default=None, description="share of the incident flux that leaves within each ring, the last one unbounded"
+    )
     paths: int = Field(description="number of walks")
     complete: bool = Field(description="whether every standard error asked for was reached before the time ran out")
 
@@ -97,7 +101,9 @@ class Sums:
     def add(self, table: NDArray[np.float64], samples: int) -> None:
         """Add a pass: sums (lanes, rows, 2) over ``samples`` paths per lane."""
         if not np.isfinite(table).all():
-            raise NonFiniteError(f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the parameters.")
+            raise NonFiniteError(
+                f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the parameters."
+            )
         self.first += table.sum(axis=0)
         self.second += (table**2).sum(axis=0) / samples
         self.lanes += len(table)
@@ -175,7 +181,9 @@ def simulate_slab(
     )  # fmt: skip
     if numbered:
         names = tuple({"sigma": "sigma1", "alpha": "alpha1", "g": "g1a"}.get(name, name) for name in names)
-    totals, derivatives, radiances, rings = (np.hstack(pair) for pair in zip(parts(sums.mean()), parts(sums.standard_error()), strict=True))
+    totals, derivatives, radiances, rings = (
+        np.hstack(pair) for pair in zip(parts(sums.mean()), parts(sums.standard_error()), strict=True)
+    )
     dR, dT, dR_se, dT_se = (dict(zip(names, column.tolist(), strict=True)) for column in derivatives.T)
     R, T, R_se, T_se = totals[0].tolist()
     return SlabResult(
@@ -231,13 +239,22 @@ def accumulate(
         scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True, bend=boundary == "smooth", exit_cosines=exit_cosines,
         ring_edges_mm=ring_edges_mm,
     )  # fmt: skip
-    sums = Sums(1 + len(scores) + border + len(exit_cosines) + plan.rings, float(specular_share(ior, source, mu_incident)))
+    sums = Sums(
+        1 + len(scores) + border + len(exit_cosines) + plan.rings, float(specular_share(ior, source, mu_incident))
+    )
     spread = np.array([_spread_of_border(layers, score) for score in scores])
     from_scores: bool | None = False if border_terms_only or not border else None
     begun_s = time.monotonic()
     samples, missing = FIRST_SAMPLES, math.inf
     while missing > 1 and sums.samples < MAX_PATHS and time.monotonic() < begun_s + max_seconds:
-        start = SlabStart(LANES, _pass_seed(seed, sums.passes), diffuse=source == "diffuse", ior=ior, bend=plan.bend, cosine=mu_incident)
+        start = SlabStart(
+            LANES,
+            _pass_seed(seed, sums.passes),
+            diffuse=source == "diffuse",
+            ior=ior,
+            bend=plan.bend,
+            cosine=mu_incident,
+        )
         slots, slopes = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
         table = np.stack([faces[:, :2] for faces in (slots, *slopes)], axis=1)
         if from_scores is not False:
@@ -271,22 +288,32 @@ def _checked(layers: tuple[Layer, ...], ior: float, boundary: str, source: str) 
         require_medium(f"layer {number}", _medium(layer))
         last = number == len(layers)
         if not layer.thickness_mm > 0 or (math.isinf(layer.thickness_mm) and not last):
-            raise InputError(f"layer {number}.thickness_mm = {layer.thickness_mm:g} must be positive, and only the last layer may be infinite.")
+            raise InputError(
+                f"layer {number}.thickness_mm = {layer.thickness_mm:g} must be positive, and only the last layer may be infinite."
+            )
     if math.isinf(layers[-1].thickness_mm) and layers[-1].alpha == 1 and sum(layer.alpha < 1 for layer in layers) == 0:
-        raise InputError("A half space without absorption never lets its light go; give alpha below 1 or a finite width.")
+        raise InputError(
+            "A half space without absorption never lets its light go; give alpha below 1 or a finite width."
+        )
     return 1.0 if boundary == "matched" else ior
 
 
-def _check_directions(source: str, mu_incident: float, exit_cosines: tuple[float, ...], ring_edges_mm: tuple[float, ...]) -> None:
+def _check_directions(
+    source: str, mu_incident: float, exit_cosines: tuple[float, ...], ring_edges_mm: tuple[float, ...]
+) -> None:
     if not 0 < mu_incident <= 1:
-        raise InputError(f"mu-incident = {mu_incident:g} must lie in 0 to 1, 0 excluded; it is the cosine of the beam to the normal.")
+        raise InputError(
+            f"mu-incident = {mu_incident:g} must lie in 0 to 1, 0 excluded; it is the cosine of the beam to the normal."
+        )
     if source == "diffuse" and mu_incident != 1:
         raise InputError(f"mu-incident = {mu_incident:g} is for a beam; leave it out, or choose source normal.")
     for cosine in exit_cosines:
         if not 0 < cosine <= 1:
             raise InputError(f"exit-cosines has {cosine:g}; give cosines to the normal in 0 to 1, 0 excluded.")
     if not all(low < high < math.inf for low, high in pairwise((0.0, *ring_edges_mm))):
-        raise InputError(f"ring-edges = {', '.join(f'{edge:g}' for edge in ring_edges_mm)} must be positive, finite and increasing, in mm.")
+        raise InputError(
+            f"ring-edges = {', '.join(f'{edge:g}' for edge in ring_edges_mm)} must be positive, finite and increasing, in mm."
+        )
 
 
 def _medium(layer: Layer) -> Medium:

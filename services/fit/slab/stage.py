@@ -50,7 +50,9 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
     fits = []
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
-        run_on.gather([run_on.submit(f"{nm:g}", fit_task, root, nm, options, place, flag) for nm, place in places.items()])
+        run_on.gather(
+            [run_on.submit(f"{nm:g}", fit_task, root, nm, options, place, flag) for nm, place in places.items()]
+        )
     for number, place in enumerate(places.values()):
         kept = read_kept(place)
         assert kept is not None
@@ -107,7 +109,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     files = []
     for fit in report.fits:
         name = f"{fit.wavelength_nm:g}"
-        for file, text in ((f"tabphase_{name}.txt", values_text(fit)), (f"slab_{name}.xml", scene_xml(fit, folder.cell))):
+        for file, text in (
+            (f"tabphase_{name}.txt", values_text(fit)),
+            (f"slab_{name}.xml", scene_xml(fit, folder.cell)),
+        ):
             write_atomic(writer.folder / file, text.encode())
             files.append(file)
     images = {fit.wavelength_nm: read_images_of(fit_folder / f"{fit.wavelength_nm:g}.npz") for fit in report.fits}
@@ -135,7 +140,9 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
     assert spec.capture is not None  # a slab has no rig
     if not (spec.capture / "slab.json").is_file():
-        raise CaptureInputError(f"{spec.capture} holds no slab.json, which a job of kind slab is fitted from; check option 'capture'.")
+        raise CaptureInputError(
+            f"{spec.capture} holds no slab.json, which a job of kind slab is fitted from; check option 'capture'."
+        )
     return spec.capture, read_folder(spec.capture)
 
 
@@ -151,5 +158,8 @@ def _cancellable(flag: Path) -> Callable[[Callable[[Block], BlockSums], Sequence
 
 def _told(fit: Any) -> str:
     told = fit.parameters
-    parts = (f"{label} {value.value:.4g} ± {value.se:.1g}" for label, value in (("σs", told.sigma_s), ("σs′", told.sigma_s_reduced)))
+    parts = (
+        f"{label} {value.value:.4g} ± {value.se:.1g}"
+        for label, value in (("σs", told.sigma_s), ("σs′", told.sigma_s_reduced))
+    )
     return f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images {100 * fit.errors.fit_error:.2f} %."

@@ -120,7 +120,9 @@ class Adam:
         found = problem.gradient(x, samples=state.samples, step=state.step)
         prior_mean, precision = self.domain.prior
         if not (np.isfinite(found.gradient).all() and np.isfinite(found.loss)):
-            raise NonFiniteError(f"The gradient is not finite at step {number}; check the capture for invalid radiance.")
+            raise NonFiniteError(
+                f"The gradient is not finite at step {number}; check the capture for invalid radiance."
+            )
 
         # In step scales, so that one rate fits all coordinates.
         scale = self.domain.scale
@@ -135,8 +137,14 @@ class Adam:
         new = np.clip(x - scale * move, low, high)
 
         # Single iterates wander by about the rate for ever; running means tell drift from wandering, once both have left the start behind.
-        lately, before = (old + (new - old) / span for old, span in ((state.lately, options.window), (state.before, 3 * options.window)))
-        is_still = number > 3 * options.window and float(np.abs((lately - before) / scale).max()) < options.still * options.rate
+        lately, before = (
+            old + (new - old) / span
+            for old, span in ((state.lately, options.window), (state.before, 3 * options.window))
+        )
+        is_still = (
+            number > 3 * options.window
+            and float(np.abs((lately - before) / scale).max()) < options.still * options.rate
+        )
         result = Result.CONVERGED if is_still else Result.MAX_STEPS if number >= options.max_steps else Result.RUNNING
         verdict = f"moved by {float(np.linalg.norm((new - x) / scale)):.3f}"
         state = replace(state, x=new, mean=mean, square=square, lately=lately, before=before)

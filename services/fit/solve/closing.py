@@ -51,7 +51,9 @@ class ClosingSums:
         """From ``record``."""
         sums = ClosingSums(**{name: np.array(value, dtype=np.float64) for name, value in record.items()})
         count = len(sums.gradient)
-        return replace(sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count))
+        return replace(
+            sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count)
+        )
 
     @property
     def shift_covariance(self) -> Array:

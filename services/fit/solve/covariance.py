@@ -97,7 +97,11 @@ class Uncertainty:
         # a'C Lambda C a / a'C a is the prior's share of the information: lambda / (d + lambda) for one coordinate.
         seen = self.posterior @ slope
         prior_share = float((precision * seen) @ seen) / max(float(slope @ seen), 1e-300)
-        return along_open < 0.1 * size and float((scaled[on_bound] ** 2).sum()) < 0.1 * size and prior_share < 1 - MIN_DATA_SHARE
+        return (
+            along_open < 0.1 * size
+            and float((scaled[on_bound] ** 2).sum()) < 0.1 * size
+            and prior_share < 1 - MIN_DATA_SHARE
+        )
 
 
 @dataclass(frozen=True)
@@ -135,10 +139,17 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
     # difference of the two ways of carrying is as uncertain as it is large: images are linear over short distances only.
     carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
     correction = solved.excess @ carried
-    known, known_noise = t.T @ equations.gradient + correction, t.T @ equations.gradient_noise @ t + np.outer(correction, correction)
+    known, known_noise = (
+        t.T @ equations.gradient + correction,
+        t.T @ equations.gradient_noise @ t + np.outer(correction, correction),
+    )
     first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
     share = first / (first + second)
-    return Pooled((1 - share) * known + share * sums.gradient, (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise, (1 - share) * carried)
+    return Pooled(
+        (1 - share) * known + share * sums.gradient,
+        (1 - share) ** 2 * known_noise + share**2 * sums.gradient_noise,
+        (1 - share) * carried,
+    )
 
 
 @dataclass(frozen=True)
@@ -158,7 +169,12 @@ class ClosingModel:
         scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
         scaled = scaled - open_directions @ (open_directions.T @ scaled)
         low, high = domain.bounds
-        return np.asarray(np.clip(self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high) - self.x)
+        return np.asarray(
+            np.clip(
+                self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high
+            )
+            - self.x
+        )
 
     def slope(self, step: Array) -> float:
         """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what noise alone would give."""
@@ -184,10 +200,14 @@ def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: Cl
     t = known.transform
     solved = response(sums, t.T @ np.diag(precision) @ t, domain.relation)
     pooled = _pooled(t, equations, sums, solved)
-    return ClosingModel(domain, x, known, solved.inverse, pooled.gradient + t.T @ (precision * (x - mean)), _positive(pooled.noise))
+    return ClosingModel(
+        domain, x, known, solved.inverse, pooled.gradient + t.T @ (precision * (x - mean)), _positive(pooled.noise)
+    )
 
 
-def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None) -> Uncertainty:
+def uncertainty(
+    domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None
+) -> Uncertainty:
     """Uncertainty at a solution from the normal equations there.
 
     Args:
@@ -205,9 +225,17 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: Clos
         meat = meat + _positive(t.T @ equations.gradient_noise @ t)
         left = t.T @ (equations.gradient + precision * (x - mean))
     else:
-        solved, moved = response(sums, prior, domain.relation), np.linalg.solve(t, np.zeros(count) if step is None else step)
+        solved, moved = (
+            response(sums, prior, domain.relation),
+            np.linalg.solve(t, np.zeros(count) if step is None else step),
+        )
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
-        meat = meat + _positive(pooled.noise) + sums.shift_covariance + np.diag(solved.variance @ (moved + pooled.carried) ** 2)
+        meat = (
+            meat
+            + _positive(pooled.noise)
+            + sums.shift_covariance
+            + np.diag(solved.variance @ (moved + pooled.carried) ** 2)
+        )
         left = pooled.gradient + t.T @ (precision * (x - mean)) + np.linalg.solve(inverse, moved) - prior @ moved
 
     # What is left of the step counts as error along what is not open.
@@ -218,7 +246,9 @@ def uncertainty(domain: Domain, x: Array, equations: NormalEquations, sums: Clos
     return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich)
 
 
-def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None) -> dict[str, Estimate]:
+def estimates(
+    tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None
+) -> dict[str, Estimate]:
     """Every parameter of the named parts with unit, standard error and whether the data fix it, and the derived quantities.
 
     Args:
@@ -231,7 +261,9 @@ def estimates(tissue: Optics, parts: Iterable[str], known: Uncertainty | None, s
     out: dict[str, Estimate] = {}
     for part in parts:
         if part == "cavity":
-            out["cavity.reflectance"] = _raw(tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None)
+            out["cavity.reflectance"] = _raw(
+                tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None
+            )
             continue
         if part.rpartition(".")[2] == "shape":
             names = [f"{part}.{k}" for k in range(len(_weights(tissue, part)))]
@@ -261,10 +293,14 @@ def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:
     for k, coordinate in enumerate(known.domain.coordinates):
         if name in coordinate.targets:
             slope[k] = natural_derivative(coordinate.kind, float(known.x[k]))
-    return Estimate(value=tissue.value(name), se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope))
+    return Estimate(
+        value=tissue.value(name), se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope)
+    )
 
 
-def _derived(tissue: Optics, known: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str) -> Estimate:
+def _derived(
+    tissue: Optics, known: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str
+) -> Estimate:
     value = quantity(tissue.medium(part))
     if known is None:
         return Estimate(value=value, se=None, unit=unit, determined=False)
@@ -274,7 +310,9 @@ def _derived(tissue: Optics, known: Uncertainty | None, part: str, quantity: Cal
         if any(target.startswith(f"{part}.") for target in coordinate.targets):
             shift = np.zeros(len(known.x))
             shift[k] = step
-            high, low = (quantity(known.domain.tissue_at(known.x + sign * shift, tissue).medium(part)) for sign in (1, -1))
+            high, low = (
+                quantity(known.domain.tissue_at(known.x + sign * shift, tissue).medium(part)) for sign in (1, -1)
+            )
             slope[k] = (high - low) / (2 * step)
     if not slope.any():
         return Estimate(value=value, se=None, unit=unit, determined=False)

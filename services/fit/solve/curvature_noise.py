@@ -46,7 +46,9 @@ class CurvatureNoise:
         sums = {part.coordinates: part for part in self.parts}
         for part in other.parts:
             known = sums.get(part.coordinates)
-            sums[part.coordinates] = part if known is None else NoisePart(part.coordinates, known.moments + part.moments)
+            sums[part.coordinates] = (
+                part if known is None else NoisePart(part.coordinates, known.moments + part.moments)
+            )
         return CurvatureNoise(tuple(sums.values()))
 
     def scaled(self, factor: float) -> CurvatureNoise:
@@ -74,7 +76,13 @@ class CurvatureNoise:
 
     def record(self) -> list[dict[str, Any]]:
         """As JSON values, numbers exact."""
-        return [{"coordinates": part.coordinates, "moments": base64.b64encode(np.ascontiguousarray(part.moments).tobytes()).decode()} for part in self.parts]
+        return [
+            {
+                "coordinates": part.coordinates,
+                "moments": base64.b64encode(np.ascontiguousarray(part.moments).tobytes()).decode(),
+            }
+            for part in self.parts
+        ]
 
     @staticmethod
     def of(record: list[dict[str, Any]]) -> CurvatureNoise:
@@ -92,7 +100,9 @@ def per_pixel(terms: Array, lights: int) -> Array:
     return np.asarray(terms.reshape(len(terms), lights, -1).sum(axis=1))
 
 
-def curvature_noise(mean: Array, difference: Array, weight: Array, coordinates: Sequence[int], lights: int = 1) -> NoisePart:
+def curvature_noise(
+    mean: Array, difference: Array, weight: Array, coordinates: Sequence[int], lights: int = 1
+) -> NoisePart:
     """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded estimates of j."""
     m, d = mean[list(coordinates)], difference[list(coordinates)]
     first, second = np.triu_indices(len(m))

@@ -155,7 +155,16 @@ class GaussNewton:
         """
         low, high = self.domain.bounds
         state = State(np.clip(x, low, high), samples)
-        return state if before is None else replace(state, samples=max(samples, before.samples), memory=before.equations, memory_samples=before.known_samples)
+        return (
+            state
+            if before is None
+            else replace(
+                state,
+                samples=max(samples, before.samples),
+                memory=before.equations,
+                memory_samples=before.known_samples,
+            )
+        )
 
     def terminate(self, state: State) -> bool:
         """Whether nothing is left to do."""
@@ -163,7 +172,9 @@ class GaussNewton:
 
     def finish(self, state: State) -> Solution:
         """The outcome as a value."""
-        return Solution(state.x, state.result, ADVICE[state.result], state.step, state.samples, state.memory, state.memory_samples)
+        return Solution(
+            state.x, state.result, ADVICE[state.result], state.step, state.samples, state.memory, state.memory_samples
+        )
 
     def step(self, problem: Problem, state: State) -> State:
         """One linearisation and up to ``max_trials`` comparisons.
@@ -179,7 +190,9 @@ class GaussNewton:
 
         # The weak prior is exact: it joins curvature and gradient, never their noise.
         mean, precision = self.domain.prior
-        equations = replace(fresh, hessian=fresh.hessian + np.diag(precision), gradient=fresh.gradient + precision * (x - mean))
+        equations = replace(
+            fresh, hessian=fresh.hessian + np.diag(precision), gradient=fresh.gradient + precision * (x - mean)
+        )
         noise_gain = gain_by_noise(equations)
 
         # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never looks like convergence.
@@ -196,16 +209,24 @@ class GaussNewton:
             compared = problem.compare(x, new, samples=state.samples, step=state.step - 1, trial=trial)
             change = compared.change + 0.5 * float(precision @ ((new - mean) ** 2 - (x - mean) ** 2))
             if not np.isfinite([change, compared.variance]).all():
-                raise NonFiniteError(f"The loss is not finite at step {state.step}; check the capture for invalid radiance.")
+                raise NonFiniteError(
+                    f"The loss is not finite at step {state.step}; check the capture for invalid radiance."
+                )
 
             # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
-            model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * length) * promised)
+            model_se = math.hypot(
+                equations.step_noise(step), (options.slope_error + options.model_error * length) * promised
+            )
             judged = Judged(change, compared.se, noise_gain - promised, model_se, options.sure_z)
             if judged.is_better(options.sure_z):
                 poor = change > 0.25 * judged.model
                 grown = 2 * radius if length > 0.8 * radius and change < 0.5 * judged.model else radius
                 state = replace(
-                    state, x=new, accepted=state.accepted + 1, radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0), verdict="accepted"
+                    state,
+                    x=new,
+                    accepted=state.accepted + 1,
+                    radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0),
+                    verdict="accepted",
                 )
                 return self._limited(self._carry(state, step, length))
             at_fault = judged.is_worse or judged.contradicted
@@ -215,18 +236,33 @@ class GaussNewton:
             if radius < options.least_radius:
                 return replace(state, result=Result.STALLED, verdict="worse at every radius")
         if at_fault:
-            return self._limited(replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced"))
+            return self._limited(
+                replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced")
+            )
         if state.samples < options.max_samples:
-            return self._limited(replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled"))
-        return self._settled(problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations)
+            return self._limited(
+                replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled")
+            )
+        return self._settled(
+            problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations
+        )
 
     def _settled(self, problem: Problem, state: State, equations: NormalEquations) -> State:
         # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step below one scale.
         scale, x = self.domain.scale, state.x
         eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
         noise = equations.eigenvalue_noise(scale[:, None] * vectors)
-        spread = np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors), 0.0))
-        sure = vectors[:, (eigenvalues > DETERMINED * noise) & (eigenvalues > spread) & (eigenvalues > 1e-13 * abs(eigenvalues).max())]
+        spread = np.sqrt(
+            np.maximum(
+                np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors), 0.0
+            )
+        )
+        sure = vectors[
+            :,
+            (eigenvalues > DETERMINED * noise)
+            & (eigenvalues > spread)
+            & (eigenvalues > 1e-13 * abs(eigenvalues).max()),
+        ]
         curvature = np.einsum("ak,ab,bk->k", sure, equations.hessian * np.outer(scale, scale), sure)
         step = scale * (sure @ (-(sure.T @ (scale * equations.gradient)) / curvature))
         length = self._length(step)
@@ -235,18 +271,24 @@ class GaussNewton:
         low, high = self.domain.bounds
         step = np.clip(x + step / max(length, 1.0), low, high) - x
 
-        compared = problem.compare(x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials)
+        compared = problem.compare(
+            x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials
+        )
         mean, precision = self.domain.prior
         change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
         options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
-        model_se = math.hypot(equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model)
+        model_se = math.hypot(
+            equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model
+        )
         judged = Judged(change, compared.se, model + gain_by_noise(equations), model_se, options.sure_z)
         refused = not judged.is_better(LAST_STEP_Z) if options.slope_error else judged.is_worse
         if refused:
             return state
         if length > 1:
             # Too far for one linear model: look again from there.
-            return self._limited(self._carry(replace(state, x=x + step, result=Result.RUNNING, verdict="settling"), step, 1.0))
+            return self._limited(
+                self._carry(replace(state, x=x + step, result=Result.RUNNING, verdict="settling"), step, 1.0)
+            )
         return replace(state, x=x + step, memory=state.memory.moved(step), verdict=f"{state.verdict}, settled")
 
     def _length(self, step: Array) -> float:
@@ -255,13 +297,23 @@ class GaussNewton:
     def _propose(self, equations: NormalEquations, x: Array, radius: float) -> tuple[Array, float]:
         # Step within the radius and the gain that the model promises for it.
         reach = radius * math.sqrt(self.options.parts)
-        step = solve_box(equations.hessian, equations.gradient, x, self.domain.bounds, self.domain.scale, reach, equations.hessian_noise)
+        step = solve_box(
+            equations.hessian,
+            equations.gradient,
+            x,
+            self.domain.bounds,
+            self.domain.scale,
+            reach,
+            equations.hessian_noise,
+        )
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
     def _carry(self, state: State, step: Array, length: float) -> State:
         # What was known before a long step is worth less after it: the model's error grows with the step, its noise does not.
         assert state.memory is not None
-        return replace(state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2))
+        return replace(
+            state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2)
+        )
 
     def _limited(self, state: State) -> State:
         return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state

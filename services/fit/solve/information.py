@@ -29,7 +29,9 @@ class Addition:
         return Addition(factor * self.information, factor * self.meat)
 
 
-def addition(known: Sandwich, slopes: tuple[Array, Array], renders: tuple[Array, Array], variance: Array, weight: float) -> Addition:
+def addition(
+    known: Sandwich, slopes: tuple[Array, Array], renders: tuple[Array, Array], variance: Array, weight: float
+) -> Addition:
     """Sum measurements that have not been made, with as many paths as the fit's last measurement.
 
     Args:

@@ -66,7 +66,10 @@ def weights(loss: Loss, reference: Array, variance: Array, residual: Array, resi
         scale = max(float(np.median(np.abs(deviation))) / MEDIAN_OF_NORMAL, 1e-12)
         return _scaled(1 / (1 + (deviation / (CAUCHY * scale)) ** 2), variance)
     size = np.maximum(np.abs(residual), MIN_RESIDUAL * spread)
-    return _scaled(chosen("Loss with changing weights", loss, {"l1": 1 / size, "relative_l1": 1 / (size * _floored(reference))}), variance)
+    return _scaled(
+        chosen("Loss with changing weights", loss, {"l1": 1 / size, "relative_l1": 1 / (size * _floored(reference))}),
+        variance,
+    )
 
 
 def _floored(reference: Array) -> Array:

@@ -50,7 +50,11 @@ class NormalEquations:
     @staticmethod
     def of(record: dict[str, Any]) -> NormalEquations:
         """From ``record``."""
-        values: dict[str, Any] = {name: np.array(value) if isinstance(value, list) else value for name, value in record.items() if name != "hessian_noise"}
+        values: dict[str, Any] = {
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in record.items()
+            if name != "hessian_noise"
+        }
         return NormalEquations(**values, hessian_noise=CurvatureNoise.of(record["hessian_noise"]))
 
     def scaled(self, factor: float) -> NormalEquations:
@@ -70,7 +74,9 @@ class NormalEquations:
     def moved(self, step: Array) -> NormalEquations:
         """The quadratic model seen from ``step`` further on; the curvature's noise enters the gradient."""
         noise = self.gradient_noise + self.hessian_noise.of_product(step)
-        return replace(self, gradient=self.gradient + self.hessian @ step, gradient_noise=noise, carried=self.carried + step)
+        return replace(
+            self, gradient=self.gradient + self.hessian @ step, gradient_noise=noise, carried=self.carried + step
+        )
 
     def step_noise(self, step: Array) -> float:
         """Standard deviation of the change g'p + p'Hp/2 that the model predicts for a step p."""
@@ -87,7 +93,14 @@ Region = tuple[Sequence[int], NDArray[np.bool_]]
 
 
 def normal_equations(
-    j1: Array, j2: Array, r1: Array, r2: Array, reference_variance: Array, weight: Array, lights: int = 1, regions: Sequence[Region] | None = None
+    j1: Array,
+    j2: Array,
+    r1: Array,
+    r2: Array,
+    reference_variance: Array,
+    weight: Array,
+    lights: int = 1,
+    regions: Sequence[Region] | None = None,
 ) -> NormalEquations:
     """Sum one block of measurements.
 
@@ -110,11 +123,15 @@ def normal_equations(
     weighted = weight * mean
     hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
     regions = regions if regions is not None else ((range(len(mean)), np.ones(len(weight), dtype=bool)),)
-    noise = [CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights),)) for near, chosen in regions]
+    noise = [
+        CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights),))
+        for near, chosen in regions
+    ]
 
     # Gradient, and its noise by pixels.
     by_image, by_jacobian, by_both = (
-        per_pixel(terms, lights) for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
+        per_pixel(terms, lights)
+        for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
     )
     sensor = weight**2 * reference_variance
     return NormalEquations(
@@ -151,7 +168,15 @@ class LossChange:
         return LossChange(self.change + other.change, self.variance + other.variance)
 
 
-def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Array, lights: int, cell: NDArray[np.int32] | None = None) -> LossChange:
+def loss_change(
+    old1: Array,
+    old2: Array,
+    new1: Array,
+    new2: Array,
+    weight: Array,
+    lights: int,
+    cell: NDArray[np.int32] | None = None,
+) -> LossChange:
     """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
 
     The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows from the same identity as above,
@@ -165,10 +190,14 @@ def loss_change(old1: Array, old2: Array, new1: Array, new2: Array, weight: Arra
     """
     if cell is not None:
         total = _by_cell(weight, cell, lights)
-        old1, old2, new1, new2 = (_by_cell(weight * r, cell, lights) / np.where(total > 0, total, 1.0) for r in (old1, old2, new1, new2))
+        old1, old2, new1, new2 = (
+            _by_cell(weight * r, cell, lights) / np.where(total > 0, total, 1.0) for r in (old1, old2, new1, new2)
+        )
         weight = total
     terms = weight * (new1 * new2 - old1 * old2)
-    deviations = per_pixel(weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))[None], lights)[0]
+    deviations = per_pixel(
+        weight * 0.5 * ((new1 + new2) * (new1 - new2) - (old1 + old2) * (old1 - old2))[None], lights
+    )[0]
     return LossChange(0.5 * float(terms.sum()), 0.25 * float(deviations @ deviations))
 
 

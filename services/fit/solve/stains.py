@@ -63,12 +63,22 @@ class StainState:
 
     def record(self) -> dict[str, Any]:
         """As JSON values; floats survive exactly."""
-        return {"depth": self.depth.tolist(), "moved": self.moved.tolist(), "seen": self.seen.astype(int).tolist(), "squares": self.squares}
+        return {
+            "depth": self.depth.tolist(),
+            "moved": self.moved.tolist(),
+            "seen": self.seen.astype(int).tolist(),
+            "squares": self.squares,
+        }
 
     @staticmethod
     def of(record: dict[str, Any]) -> StainState:
         """From ``record``."""
-        return StainState(np.array(record["depth"]), np.array(record["moved"]), np.array(record["seen"], dtype=bool), record["squares"])
+        return StainState(
+            np.array(record["depth"]),
+            np.array(record["moved"]),
+            np.array(record["seen"], dtype=bool),
+            record["squares"],
+        )
 
 
 def clean(texels: int) -> StainState:
@@ -96,7 +106,9 @@ class StainSolver:
         total = float(np.maximum(sums.carried, 0.0).sum())
         factor = float(np.clip(sums.explained.sum() / total, 0.1, 10.0)) if total > 0 else 1.0
         scaled = StainSums(sums.explained * factor, sums.carried * factor**2, sums.squares)
-        return self._relative(state, self._moved(state, scaled, scaled.explained - scaled.carried, 1.0, MOMENTUM, -DEEPEST))
+        return self._relative(
+            state, self._moved(state, scaled, scaled.explained - scaled.carried, 1.0, MOMENTUM, -DEEPEST)
+        )
 
     def exact_step(self, state: StainState, sums: StainSums, number: int) -> StainState:
         """A step with momentum along the exact gradient; later ones are shorter, so that noise averages out (Robbins and Monro 1951).
@@ -121,11 +133,14 @@ class StainSolver:
         ones = np.ones(len(self.neighbours))
         rows = np.arange(len(self.neighbours))
         difference = sparse.csr_matrix(
-            (np.concatenate([ones, -ones]), (np.tile(rows, 2), self.neighbours.T.reshape(-1))), shape=(len(self.neighbours), self.texels)
+            (np.concatenate([ones, -ones]), (np.tile(rows, 2), self.neighbours.T.reshape(-1))),
+            shape=(len(self.neighbours), self.texels),
         )
         return sparse.identity(self.texels, format="csr") / CLEAN_SD**2 + difference.T @ difference / NEIGHBOUR_SD**2
 
-    def _moved(self, state: StainState, sums: StainSums, slope: Array, bound: float, momentum: float, low: float) -> StainState:
+    def _moved(
+        self, state: StainState, sums: StainSums, slope: Array, bound: float, momentum: float, low: float
+    ) -> StainState:
         from scipy import sparse
         from scipy.sparse.linalg import spsolve
 

@@ -90,7 +90,11 @@ class Observed:
 
 
 def search_node(
-    node: Node, orders: Sequence[tuple[Array, Array]], edges: NDArray[np.int64], observed: Sequence[Observed], albedos: int
+    node: Node,
+    orders: Sequence[tuple[Array, Array]],
+    edges: NDArray[np.int64],
+    observed: Sequence[Observed],
+    albedos: int,
 ) -> tuple[Candidate, ...]:
     """Errors of one node's table points, best first.
 
@@ -118,7 +122,9 @@ def search_node(
     safe = np.where(lit, cc, 1.0)
     scale = np.where(lit, cr / safe, 0.0)
     error = np.sqrt(np.clip(np.where(lit, 1 - cr**2 / (safe * max(total, 1e-300)), 1.0), 0.0, 1.0))
-    found = [Candidate(node.sigma, float(a), node.g, float(e), float(s)) for a, e, s in zip(alpha, error, scale, strict=True)]
+    found = [
+        Candidate(node.sigma, float(a), node.g, float(e), float(s)) for a, e, s in zip(alpha, error, scale, strict=True)
+    ]
     return tuple(sorted(found, key=lambda c: c.score))
 
 

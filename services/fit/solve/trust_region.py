@@ -57,7 +57,13 @@ def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: 
 
 
 def solve_box(
-    hessian: Array, gradient: Array, x: Array, bounds: tuple[Array, Array], scale: Array, radius: float, hessian_noise: CurvatureNoise | None = None
+    hessian: Array,
+    gradient: Array,
+    x: Array,
+    bounds: tuple[Array, Array],
+    scale: Array,
+    radius: float,
+    hessian_noise: CurvatureNoise | None = None,
 ) -> Array:
     """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on their bound and the rest solved again.
 

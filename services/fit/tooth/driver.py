@@ -23,7 +23,15 @@ from services.fit.execution.executors import Executor
 from services.fit.execution.journal import Journal
 from services.fit.export.previews import shown_images
 from services.fit.export.stains import keep_stains
-from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack, channel_scene, read_channel, read_observations, write_channel
+from services.fit.inputs.observations import (
+    ChannelFiles,
+    Observations,
+    ViewStack,
+    channel_scene,
+    read_channel,
+    read_observations,
+    write_channel,
+)
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, estimates
@@ -46,9 +54,21 @@ class FitDriver:
             attempt.log(misnumbered)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
-        layout = stain_layout(tooth.outer, texel_edge_mm(pixel_edge_mm(tooth, observations.manifest.cameras, spec))) if spec.stains else None
-        scenes = {channel: channel_scene(observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv) for channel in channels}
-        files = {channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss) for channel in channels}
+        layout = (
+            stain_layout(tooth.outer, texel_edge_mm(pixel_edge_mm(tooth, observations.manifest.cameras, spec)))
+            if spec.stains
+            else None
+        )
+        scenes = {
+            channel: channel_scene(
+                observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv
+            )
+            for channel in channels
+        }
+        files = {
+            channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss)
+            for channel in channels
+        }
         journal = attempt.journal(files.values())
         begun, _ = journal.once("begun", lambda: started_s)
 
@@ -60,7 +80,9 @@ class FitDriver:
         with attempt.workers() as run_on:
             for number, channel in enumerate(order):
                 attempt.log(f"{channel}: renderers start, then the table is searched.")
-                schedule = self._schedule(observations, files[channel], views[channel], journal, run_on, (number, len(order)))
+                schedule = self._schedule(
+                    observations, files[channel], views[channel], journal, run_on, (number, len(order))
+                )
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
@@ -70,14 +92,24 @@ class FitDriver:
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if layout is not None and textures:
             keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
-        report = self._publish(observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun)
+        report = self._publish(
+            observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
+        )
         if misnumbered:
-            report = report.model_copy(update={"converged": False, "advice": f"{misnumbered} {report.advice}".strip(), "told": NOTHING})
+            report = report.model_copy(
+                update={"converged": False, "advice": f"{misnumbered} {report.advice}".strip(), "told": NOTHING}
+            )
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
         return report.model_copy(update={"next_capture": where + next_capture})
 
     def _schedule(
-        self, observations: Observations, files: ChannelFiles, views: tuple[ViewStack, ...], journal: Journal, run_on: Executor, place: tuple[int, int]
+        self,
+        observations: Observations,
+        files: ChannelFiles,
+        views: tuple[ViewStack, ...],
+        journal: Journal,
+        run_on: Executor,
+        place: tuple[int, int],
     ) -> ChannelSchedule:
         attempt, spec = self.attempt, self.attempt.spec
         media = 2 * spec.adam_steps if spec.solver == "adam" else spec.max_steps + 10
@@ -89,7 +121,9 @@ class FitDriver:
             journal=journal,
             has_dentin=True,
             modes=0,
-            report=attempt.teller(observations, views, journal, lambda step: (place[0] + min(step / expected, 0.99)) / place[1]),
+            report=attempt.teller(
+                observations, views, journal, lambda step: (place[0] + min(step / expected, 0.99)) / place[1]
+            ),
             pause=attempt.context.raise_if_cancelled,
             shown=shown_images(views),
         )
@@ -109,12 +143,18 @@ class FitDriver:
         tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
         converged, advice = judge(fits)
         misplaced = offsets_told(
-            evaluations, {c: worst_error(fit) for c, fit in fits.items()}, observations, views, f"the mesh of tooth {observations.teeth[0].fdi}"
+            evaluations,
+            {c: worst_error(fit) for c, fit in fits.items()},
+            observations,
+            views,
+            f"the mesh of tooth {observations.teeth[0].fdi}",
         )
         converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
-        thickness = fitted_thickness(observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance)
+        thickness = fitted_thickness(
+            observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance
+        )
         return FitReport(
             converged=converged,
             advice=" ".join(advice),
@@ -178,12 +218,20 @@ def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
 
 def shape_covariance(known: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:
     """Covariance of the blend weights, of a jaw those of one tooth; empty where they were not fitted."""
-    own = [k for k, coordinate in enumerate(known.domain.coordinates) if coordinate.kind == "shape" and coordinate.tooth == tooth]
+    own = [
+        k
+        for k, coordinate in enumerate(known.domain.coordinates)
+        if coordinate.kind == "shape" and coordinate.tooth == tooth
+    ]
     return tuple(tuple(row) for row in known.covariance[np.ix_(own, own)].tolist())
 
 
 def fitted_thickness(
-    tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec, shape: tuple[float, ...], covariance: tuple[tuple[float, ...], ...]
+    tooth: Tooth,
+    cameras: tuple[Camera, ...],
+    spec: JobSpec,
+    shape: tuple[float, ...],
+    covariance: tuple[tuple[float, ...], ...],
 ) -> ThicknessMap | None:
     """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not see the tooth.
 
@@ -192,7 +240,11 @@ def fitted_thickness(
         covariance: of the blend weights; empty where they were not fitted.
     """
     dentin = dentin_shape(tooth, cameras, spec)
-    return None if dentin is None else thickness_map(tooth.outer, dentin, shape, np.array(covariance) if covariance else None, cameras[0])
+    return (
+        None
+        if dentin is None
+        else thickness_map(tooth.outer, dentin, shape, np.array(covariance) if covariance else None, cameras[0])
+    )
 
 
 def pixel_edge_mm(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> float:

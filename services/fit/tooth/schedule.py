@@ -100,7 +100,11 @@ class ChannelSchedule(Stages[Tissue]):
         return ("enamel", "dentin") if self.has_dentin else ("enamel",)
 
     def _held(self, domain: Domain) -> Held:
-        told = {name.rpartition(".")[0] for name in (*domain.parameters, *self.spec.held) if name.endswith((".g1", ".cosine"))}
+        told = {
+            name.rpartition(".")[0]
+            for name in (*domain.parameters, *self.spec.held)
+            if name.endswith((".g1", ".cosine"))
+        }
         return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in told}
 
     def _others(self, tissue: Tissue) -> dict[str, float]:
@@ -126,7 +130,10 @@ class ChannelSchedule(Stages[Tissue]):
             tissue, before = self._iterate(problem, options, reached)
 
         options = self.at_full_resolution()
-        exact_samples = max(self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))), MIN_EXACT_SAMPLES)
+        exact_samples = max(
+            self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))),
+            MIN_EXACT_SAMPLES,
+        )
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         is_same = self.files.full.blocks == self.files.coarse.blocks and not is_reweighted(spec.loss)
@@ -136,7 +143,9 @@ class ChannelSchedule(Stages[Tissue]):
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
             tissue, solution = self._iterate(problem, options, solution.samples)
         if spec.lobes == 2:
-            problem = StackProblem(self.passes, self._with_shape(self._domain(ALL_LEAVES)), self._with_lobes(tissue), "phase")
+            problem = StackProblem(
+                self.passes, self._with_shape(self._domain(ALL_LEAVES)), self._with_lobes(tissue), "phase"
+            )
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return problem, tissue, solution
 
@@ -146,7 +155,9 @@ class ChannelSchedule(Stages[Tissue]):
         if self.has_dentin:
             tissue = self._best_start(tissue, self.short(START_STEPS))
         stage = "layered" if self.has_dentin else "homogeneous"
-        tissue, solution = self._solve(stage, domain, tissue.with_values(self.spec.held), options, 2 * self.spec.samples_per_pixel, SIMILAR_G)
+        tissue, solution = self._solve(
+            stage, domain, tissue.with_values(self.spec.held), options, 2 * self.spec.samples_per_pixel, SIMILAR_G
+        )
         return tissue, solution.samples
 
     def _given(self) -> Tissue:
@@ -160,11 +171,15 @@ class ChannelSchedule(Stages[Tissue]):
         # As in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
         tissue = self._homogeneous_start()
         if self.has_dentin:
-            _, tissue, _ = self._descend("homogeneous", shared_domain(self._priors), tissue, self.spec.samples_per_pixel)
+            _, tissue, _ = self._descend(
+                "homogeneous", shared_domain(self._priors), tissue, self.spec.samples_per_pixel
+            )
         tissue = (self._with_lobes(tissue) if self.spec.lobes == 2 else tissue).with_values(self.spec.held)
         domain = self._with_shape(self._domain(ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha")))
         self.at_full_resolution()
-        return self._descend("layered" if self.has_dentin else "homogeneous", domain, tissue, self.fewer(self.spec.samples_per_pixel))
+        return self._descend(
+            "layered" if self.has_dentin else "homogeneous", domain, tissue, self.fewer(self.spec.samples_per_pixel)
+        )
 
     def _descend(self, stage: str, domain: Domain, tissue: Tissue, samples: int) -> Fitted:
         # The exact media and their own derivatives, at constant samples.
@@ -180,16 +195,22 @@ class ChannelSchedule(Stages[Tissue]):
             samples = self.fewer(self.spec.max_samples_per_pixel)
             self.passes = reweighted(self.passes, self.journal, self.spec.loss, tissue, samples=samples, stage=stage)
 
-    def _stained(self, layout: StainLayout, problem: StackProblem[Tissue], tissue: Tissue, solution: Solution) -> Fitted:
+    def _stained(
+        self, layout: StainLayout, problem: StackProblem[Tissue], tissue: Tissue, solution: Solution
+    ) -> Fitted:
         # The texture in turn with the media; what is returned is the plain fit where a texture gains nothing.
         options = self.options(self.files.full)
-        samples = min(max(self.fewer(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples), options.max_samples)
+        samples = min(
+            max(self.fewer(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples), options.max_samples
+        )
         last = problem, tissue, solution
 
         def refit(stained: Tissue, turn: int, is_last: bool) -> Tissue:
             nonlocal last
             if self.spec.solver == "adam":
-                last = self._descend(f"stained.{turn}", problem.domain, stained, self.fewer(self.spec.samples_per_pixel))
+                last = self._descend(
+                    f"stained.{turn}", problem.domain, stained, self.fewer(self.spec.samples_per_pixel)
+                )
                 return last[1]
             limits = options if is_last else replace(options, max_steps=min(HOMOGENEOUS_STEPS, options.max_steps))
             problem_now = replace(problem, base=stained, stage=f"stained.{turn}")
@@ -241,7 +262,9 @@ class ChannelSchedule(Stages[Tissue]):
                 for task in passes.tasks(label, tissue, max(self.spec.samples_per_pixel, SEARCH_SAMPLES)):
                     for k in (1, 2):
                         seed = passes.seeds("search", n, k)
-                        pending.append(passes.executor.submit(f"{label}-{task.index}-{k}", orders_task, task, edges, seed))
+                        pending.append(
+                            passes.executor.submit(f"{label}-{task.index}-{k}", orders_task, task, edges, seed)
+                        )
             parts = passes.executor.gather(pending)
             passes.record([row for _, row in parts])
             orders = iter([orders for orders, _ in parts])
@@ -260,7 +283,10 @@ class ChannelSchedule(Stages[Tissue]):
         # and dentin exchanged.
         domain, ends = self._domain(("sigma", "alpha")), []
         for k, (thin, dense) in enumerate(START_RATIOS):
-            start = tissue.with_values({"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma} | self.spec.held)
+            start = tissue.with_values(
+                {"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma}
+                | self.spec.held
+            )
             ends.append(self._solve(f"start.{k}", domain, start, options, self.spec.samples_per_pixel, SIMILAR_G)[0])
         samples = min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
         problem = StackProblem(self.passes, domain, tissue, "starts", image_g=SIMILAR_G)
@@ -268,7 +294,9 @@ class ChannelSchedule(Stages[Tissue]):
         def compute() -> int:
             best = 0
             for k in range(1, len(ends)):
-                change = problem.compare(domain.x_of(ends[best]), domain.x_of(ends[k]), samples=samples, step=k, trial=0)
+                change = problem.compare(
+                    domain.x_of(ends[best]), domain.x_of(ends[k]), samples=samples, step=k, trial=0
+                )
                 best = k if change.change < 0 else best
             return best
 
@@ -281,7 +309,9 @@ class ChannelSchedule(Stages[Tissue]):
         beta, g2 = 0.9, -0.1
         g1 = (HELD_G - (1 - beta) * g2) / beta
         lobes = (("beta", beta), ("g1", g1), ("g2", g2))
-        return tissue.with_values({f"{part}.{leaf}": value for part in ("enamel", "dentin") for leaf, value in lobes} | self.spec.held)
+        return tissue.with_values(
+            {f"{part}.{leaf}": value for part in ("enamel", "dentin") for leaf, value in lobes} | self.spec.held
+        )
 
 
 def shared_domain(priors: Priors = WEAK) -> Domain:
@@ -297,4 +327,6 @@ def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors
 def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
     # What both media share has a prior only where theirs are one.
     (prior, *others) = (priors.get(target) for target in targets)
-    return Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)
+    return (
+        Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)
+    )

@@ -13,9 +13,23 @@ from services.core.errors import InputError
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.paths.until import MAX_SAMPLES, Effort, Sums, trace_until
 from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.checks import require_cotangent, require_finite, require_finite_gradient, require_lights, require_surfaces, require_view
+from services.fit.transport.scene.checks import (
+    require_cotangent,
+    require_finite,
+    require_finite_gradient,
+    require_lights,
+    require_surfaces,
+    require_view,
+)
 from services.fit.transport.scene.names import media_of, parameter_names, whitened
-from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, ShapeGradient, StackEstimate, StainGradient, View
+from services.fit.transport.scene.recipe import (
+    JacobianEstimate,
+    SceneRecipe,
+    ShapeGradient,
+    StackEstimate,
+    StainGradient,
+    View,
+)
 
 if TYPE_CHECKING:
     from services.fit.transport.gradients.shape_gradient import ShapeGradients
@@ -46,7 +60,9 @@ class Engine:
             if not math.isfinite(ior) or ior < 1:
                 raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
         if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
-            raise InputError(f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it.")
+            raise InputError(
+                f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it."
+            )
         prepare_device(threads, recipe.device)
         from services.fit.transport.lighting.light_maps import LightMaps
         from services.fit.transport.lighting.lights import PointLights
@@ -98,7 +114,9 @@ class Engine:
             return StackEstimate(mean, variance)
 
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
-        return trace_until(lambda numbers, batches: self._trace(tissue, view, Plan(), numbers, seed, batches), summarise, effort)
+        return trace_until(
+            lambda numbers, batches: self._trace(tissue, view, Plan(), numbers, seed, batches), summarise, effort
+        )
 
     def jacobian(
         self,
@@ -141,11 +159,15 @@ class Engine:
         def summarise(tables: Sums) -> JacobianEstimate:
             mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
             pairs = [self._among_all(view, *_mean_and_variance(tables[place[name]])) for name in names]
-            slopes, slope_variances = (np.stack([pair[k] for pair in pairs]) if pairs else np.zeros((0, *mean.shape)) for k in range(2))
+            slopes, slope_variances = (
+                np.stack([pair[k] for pair in pairs]) if pairs else np.zeros((0, *mean.shape)) for k in range(2)
+            )
             return JacobianEstimate(names, mean, variance, slopes, slope_variances)
 
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
-        return trace_until(lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort)
+        return trace_until(
+            lambda numbers, batches: self._trace(tissue, view, plan, numbers, seed, batches), summarise, effort
+        )
 
     def shape_gradient(
         self,
@@ -179,26 +201,43 @@ class Engine:
 
         cotangent = np.asarray(cotangent, dtype=np.float64)
         if not 0 <= tooth < len(self.recipe.teeth) or self._geometry.modes_of[tooth] == 0:
-            raise InputError(f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a blend shape.")
+            raise InputError(
+                f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a blend shape."
+            )
         if self.recipe.border_width_mm > 0:
-            raise InputError(f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take the Jacobian's.")
+            raise InputError(
+                f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take the Jacobian's."
+            )
         if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
-            raise InputError(f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them.")
+            raise InputError(
+                f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them."
+            )
         media, _ = self._prepare(tissue, view)
         require_cotangent(cotangent, view, self.recipe)
         moved = tissue if isinstance(tissue, Tissue) else tissue.teeth[tooth]
         if moved.enamel.table is not None or moved.dentin.table is not None:
-            raise InputError(f"Tooth {tooth} has a phase table, and this gradient needs lobes; give it lobes, or take the Jacobian's.")
+            raise InputError(
+                f"Tooth {tooth} has a phase table, and this gradient needs lobes; give it lobes, or take the Jacobian's."
+            )
         if tooth not in self._shape_gradients:
             self._shape_gradients[tooth] = ShapeGradients(self._geometry, tooth, self._ior, self._radius_mm)
         lights = len(view.lights or self.recipe.light_positions_mm)
         photons = photons or -(-samples * len(view) // lights)
-        found = self._shape_gradients[tooth](moved, media, view, cotangent, seed=seed, samples=samples, photons=photons, order=order)
+        found = self._shape_gradients[tooth](
+            moved, media, view, cotangent, seed=seed, samples=samples, photons=photons, order=order
+        )
         require_finite_gradient("the dentin's shape", view, found.gradient, found.variance)
         return found
 
     def order_images(
-        self, tissue: Tissue | Mouth, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1
+        self,
+        tissue: Tissue | Mouth,
+        view: View,
+        *,
+        bin_edges: NDArray[np.int64],
+        samples: int,
+        seed: int,
+        batches: int = 1,
     ) -> NDArray[np.float64]:
         """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
 
@@ -214,7 +253,14 @@ class Engine:
         return orders
 
     def stain_gradient(
-        self, tissue: Tissue | Mouth, view: View, cotangent: NDArray[np.float64], *, seed: int, samples: int, batches: int = 16
+        self,
+        tissue: Tissue | Mouth,
+        view: View,
+        cotangent: NDArray[np.float64],
+        *,
+        seed: int,
+        samples: int,
+        batches: int = 16,
     ) -> StainGradient:
         """Derivatives of sum(cotangent x images) to every texel of the stains, in one pass, both of a path's crossings included (teeth 2018 Eq. 10).
 
@@ -241,7 +287,10 @@ class Engine:
         (sums, _) = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
         require_finite_gradient("the stains", view, sums)
         means = sums * (largest / count)
-        gradient, variance = means.mean(axis=0), means.var(axis=0, ddof=1) / batches if batches > 1 else np.full(textures.count, np.nan)
+        gradient, variance = (
+            means.mean(axis=0),
+            means.var(axis=0, ddof=1) / batches if batches > 1 else np.full(textures.count, np.nan),
+        )
         return StainGradient(textures.cut(gradient), textures.cut(variance), batches * count)
 
     def _prepare(self, tissue: Tissue | Mouth, view: View) -> tuple[Media, PointLights]:
@@ -280,7 +329,9 @@ class Engine:
         """Arrays (..., lights of the view, N) with zeros in place of the lights that were not sampled."""
         if view.lights is None:
             return arrays
-        whole = tuple(np.zeros((*array.shape[:-2], len(self.recipe.light_positions_mm), array.shape[-1])) for array in arrays)
+        whole = tuple(
+            np.zeros((*array.shape[:-2], len(self.recipe.light_positions_mm), array.shape[-1])) for array in arrays
+        )
         for target, array in zip(whole, arrays, strict=True):
             target[..., list(view.lights), :] = array
         return whole
@@ -299,7 +350,9 @@ class Engine:
         if view.lights not in self._some_lights:
             chosen = list(view.lights)
             self._some_lights[view.lights] = PointLights(
-                self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen], self._lights.maps.of(chosen)
+                self.recipe.light_positions_mm[chosen],
+                self.recipe.light_intensities[chosen],
+                self._lights.maps.of(chosen),
             )
         return self._some_lights[view.lights]
 

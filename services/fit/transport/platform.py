@@ -38,7 +38,9 @@ def import_renderer() -> tuple[ModuleType, ModuleType]:
         for cause in _causes(problem):
             if missing := _MISSING_LIBRARY.search(str(cause)):
                 package = PACKAGES.get(missing[1], f"the package of {missing[1]}")
-                raise PlatformError(f"The renderer needs {missing[1]}, which this machine lacks; install {package}.") from problem
+                raise PlatformError(
+                    f"The renderer needs {missing[1]}, which this machine lacks; install {package}."
+                ) from problem
         raise PlatformError(f"The renderer cannot be loaded ({problem}); install drjit and mitsuba again.") from problem
 
 
@@ -51,7 +53,9 @@ def require_llvm(version: tuple[int, int, int]) -> None:
     if version[0] < 0:
         raise PlatformError(f"No libLLVM was found, which the CPU renderer needs; {LLVM_REMEDY}.")
     if version[0] < OLDEST_LLVM:
-        raise PlatformError(f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {LLVM_REMEDY}.")
+        raise PlatformError(
+            f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {LLVM_REMEDY}."
+        )
 
 
 def require_renderer() -> None:
@@ -70,12 +74,16 @@ def require_renderer() -> None:
         drjit.eval(image)
         value = float(image.array[0])
     except Exception as problem:
-        raise PlatformError(f"The renderer cannot render a pixel here ({problem}); check libLLVM and the packages drjit and mitsuba.") from problem
+        raise PlatformError(
+            f"The renderer cannot render a pixel here ({problem}); check libLLVM and the packages drjit and mitsuba."
+        ) from problem
     if value != 1.0:
         raise PlatformError(f"The renderer sees {value:g} where a light of 1 is; check the packages drjit and mitsuba.")
 
 
-def prepare_device(threads: int | None = None, backend: Device | None = None, colours: Literal["mono", "rgb"] = "mono") -> None:
+def prepare_device(
+    threads: int | None = None, backend: Device | None = None, colours: Literal["mono", "rgb"] = "mono"
+) -> None:
     """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same back end do nothing.
 
     Args:
@@ -93,7 +101,9 @@ def prepare_device(threads: int | None = None, backend: Device | None = None, co
     if mitsuba.variant() == variant:
         return
     if mitsuba.variant() is not None:
-        raise PlatformError(f"This process already renders with {mitsuba.variant()}; start a new process for {variant}.")
+        raise PlatformError(
+            f"This process already renders with {mitsuba.variant()}; start a new process for {variant}."
+        )
     if backend == "llvm":
         require_llvm(tuple(drjit.detail.llvm_version()))
     elif not drjit.has_backend(drjit.JitBackend.CUDA):

@@ -60,7 +60,9 @@ class RayScene:
         radius = float(np.linalg.norm(self._vertices - centre, axis=1).max()) + 1.0
         skip = np.maximum(0.0, ((centre - origins) * directions).sum(axis=1) - radius)
         start = origins + skip[:, None] * directions
-        ray = mi.Ray3f(mi.Point3f(start.T.astype(np.float32)), mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)))
+        ray = mi.Ray3f(
+            mi.Point3f(start.T.astype(np.float32)), mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32))
+        )
         found = self._scene.ray_intersect_preliminary(ray, coherent=False)
         dr.eval(found.t, found.prim_index)
         distance, face = np.array(found.t, dtype=np.float64), np.array(found.prim_index, dtype=np.int64)
@@ -74,7 +76,9 @@ class RayScene:
         return Hits(hit, points, normals, mesh, face - self._first_face[np.maximum(mesh, 0)])
 
 
-def pixel_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pixel_rays(
+    camera: Camera, offset: tuple[float, float] = (0.5, 0.5)
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Origin (3,) and directions (H * W, 3) through every pixel, row by row, at an offset inside the pixel."""
     width, height = camera.size
     x, y = np.meshgrid(np.arange(width) + offset[0], np.arange(height) + offset[1])

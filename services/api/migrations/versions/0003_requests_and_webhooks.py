@@ -17,7 +17,9 @@ def upgrade() -> None:
     for number, spec in connection.execute(sql.select(job.c.number, job.c.spec)).all():
         options = json.loads(spec)
         source = (options.get("rig") or {}).get("mouth") or options.get("capture")
-        connection.execute(job.update().where(job.c.number == number).values(kind=options.get("kind", "tooth"), source=source))
+        connection.execute(
+            job.update().where(job.c.number == number).values(kind=options.get("kind", "tooth"), source=source)
+        )
 
     op.create_table(
         "webhook",
@@ -56,4 +58,8 @@ def upgrade() -> None:
         sql.Column("error", sql.Text),
         sqlite_autoincrement=True,
     )
-    op.create_table("webhook_cursor", sql.Column("reader", sql.Text, primary_key=True), sql.Column("event", sql.Integer, nullable=False))
+    op.create_table(
+        "webhook_cursor",
+        sql.Column("reader", sql.Text, primary_key=True),
+        sql.Column("event", sql.Integer, nullable=False),
+    )

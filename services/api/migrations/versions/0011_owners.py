@@ -26,4 +26,8 @@ def upgrade() -> None:
     op.add_column("capture_file", sql.Column("is_known", sql.Boolean, nullable=False, server_default=sql.false()))
     files = sql.table("capture_file", sql.column("is_known"), sql.column("received_bytes"), sql.column("bytes"))
     op.execute(files.update().where(files.c.received_bytes == files.c.bytes).values(is_known=sql.true()))
-    op.create_table("ended_session", sql.Column("sha256", sql.Text, primary_key=True), sql.Column("expires_s", sql.Float, nullable=False))
+    op.create_table(
+        "ended_session",
+        sql.Column("sha256", sql.Text, primary_key=True),
+        sql.Column("expires_s", sql.Float, nullable=False),
+    )

@@ -22,7 +22,9 @@ def render(folder: Path, camera: str, light: str, spp: int, seed: int = 0, varia
     x, y, z = rig["lights"][light]["position_mm"]
     planes = []
     for channel, intensity in zip(rig["channels"], rig["lights"][light]["intensity"], strict=True):
-        scene = mi.load_file(str(folder / f"scene_{channel}.xml"), optimize=False, light_x=x, light_y=y, light_z=z, intensity=intensity)
+        scene = mi.load_file(
+            str(folder / f"scene_{channel}.xml"), optimize=False, light_x=x, light_y=y, light_z=z, intensity=intensity
+        )
         planes.append(np.array(mi.render(scene, sensor=rig["cameras"].index(camera), spp=spp, seed=seed))[..., 0])
     return np.stack(planes, axis=-1)
 

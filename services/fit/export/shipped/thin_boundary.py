@@ -35,7 +35,9 @@ def register() -> None:
             found.pdf = dr.select(mirror, share, 1 - share)
             found.eta = 1.0
             found.sampled_component = dr.select(mirror, mi.UInt32(0), mi.UInt32(1))
-            found.sampled_type = dr.select(mirror, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.Null))
+            found.sampled_type = dr.select(
+                mirror, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.Null)
+            )
             return found, dr.select(mirror, mi.Spectrum(1.0), self.passed(si, active)) & active
 
         def eval(self, ctx, si, wo, active=True):  # type: ignore[no-untyped-def]  # noqa: ARG002

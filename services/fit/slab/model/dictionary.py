@@ -67,7 +67,9 @@ class Material:
             ValueError: the extinction exceeds that of the atoms.
         """
         if self.extinction_per_mm > LARGEST_EXTINCTION_PER_MM:
-            raise ValueError(f"extinction {self.extinction_per_mm:g}/mm exceeds the dictionary's {LARGEST_EXTINCTION_PER_MM:g}/mm")
+            raise ValueError(
+                f"extinction {self.extinction_per_mm:g}/mm exceeds the dictionary's {LARGEST_EXTINCTION_PER_MM:g}/mm"
+            )
         occupied = np.append(self.scattering * tent_solid_angles(), self.absorption_per_mm) / LARGEST_EXTINCTION_PER_MM
         return np.append(occupied, 1 - occupied.sum())
 

@@ -85,14 +85,20 @@ def run_block(block: Block) -> BlockSums:
         _late_share(block), *_arrays(rig.interface, views), _grid(rig), block.scores, images, rows, totals,
     )  # fmt: skip
     if not (np.isfinite(images).all() and np.isfinite(rows).all()):
-        raise NonFiniteError(f"A slab's images are not finite at {np.count_nonzero(~np.isfinite(images))} pixels; report the parameters.")
+        raise NonFiniteError(
+            f"A slab's images are not finite at {np.count_nonzero(~np.isfinite(images))} pixels; report the parameters."
+        )
     return BlockSums(images / block.paths, rows / block.paths, totals / block.paths)
 
 
-def render(rig: Rig, material: Material, *, seed: int, step: int, batches: int, paths: int, scores: bool, blocks: Blocks = map) -> Batches:
+def render(
+    rig: Rig, material: Material, *, seed: int, step: int, batches: int, paths: int, scores: bool, blocks: Blocks = map
+) -> Batches:
     """Independent batches of ``paths`` paths a light."""
     lights = range(len(rig.lights))
-    tasks = [Block(rig, light, material, seed, (step, batch), paths, scores) for batch in range(batches) for light in lights]
+    tasks = [
+        Block(rig, light, material, seed, (step, batch), paths, scores) for batch in range(batches) for light in lights
+    ]
     first_images, first_rows = single_scattering(rig, material, scores=scores)
     images = np.repeat(first_images[None], batches, axis=0)
     rows = np.repeat(first_rows[None], batches, axis=0)

@@ -121,7 +121,9 @@ def grid_of(pixels: PixelGrid) -> Grid:
     return Grid(x_from, 0.0 if folded else y_from, pitch_x, pitch_y, pixels.columns, rows, folded)
 
 
-def _views(folder: SlabFolder, interface: Interface, grid: Grid, light: Light, seen: list[tuple[int, SlabCamera]]) -> Views:
+def _views(
+    folder: SlabFolder, interface: Interface, grid: Grid, light: Light, seen: list[tuple[int, SlabCamera]]
+) -> Views:
     sine = interface.inside_sine(light.angle_deg)
     sines = np.array([interface.inside_sine(camera.angle_deg) for _, camera in seen])
     # A solid angle shrinks on its way in by (n0/n)^2 cos b / cos b_in; radiance is power per sr outside and projected area.

@@ -79,7 +79,9 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
                 yield cosine, middle - _langevin(half) * step_out / 2, (strength * share * density)[:, None] * spread
 
 
-def _returns(interface: Interface, sine: float, before: int, lateral: float, after: int) -> Iterator[tuple[float, float]]:
+def _returns(
+    interface: Interface, sine: float, before: int, lateral: float, after: int
+) -> Iterator[tuple[float, float]]:
     """Share and displacement of every way to be reflected so many times before and after the scatter."""
     ways = [interface.reflections(sine)] * before + [interface.reflections(lateral)] * after
     for chosen in itertools.product(*ways):

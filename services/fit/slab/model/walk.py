@@ -240,8 +240,12 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                         towards_far = far[camera] != (reflections % 2 == 1)
                         deep = (width - z if towards_far else z) + reflections * width
                         flight = deep / out
-                        value, knot, lower, upper = at_angle(dx * lateral + (dz if towards_far else -dz) * out, scattering)
-                        amount = share * weight * value / (sigma_t * albedo) * math.exp(-sigma_t * flight) * scales[camera]
+                        value, knot, lower, upper = at_angle(
+                            dx * lateral + (dz if towards_far else -dz) * out, scattering
+                        )
+                        amount = (
+                            share * weight * value / (sigma_t * albedo) * math.exp(-sigma_t * flight) * scales[camera]
+                        )
                         if reflections > 0:
                             amount *= (mirrors[camera] / REFLECTED_SHARE) ** reflections
                         shift = shifts[camera]

@@ -36,13 +36,17 @@ def phase_chart(title: str, phase: PhaseFunction) -> str:
     parts = [f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">']
     for first, last in phase.undetermined_bands_deg():
         width = max(x(last) - x(first), 2.0)
-        parts.append(f'<rect class="prior" x="{x(first):.1f}" y="{TOP}" width="{width:.1f}" height="{HEIGHT - TOP - BOTTOM}"/>')
+        parts.append(
+            f'<rect class="prior" x="{x(first):.1f}" y="{TOP}" width="{width:.1f}" height="{HEIGHT - TOP - BOTTOM}"/>'
+        )
     for decade in range(math.ceil(low), math.floor(high) + 1):
         at = y(10.0**decade)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{10.0**decade:g}</text>')
     under = HEIGHT - BOTTOM + 16
-    parts += [f'<text x="{x(angle):.1f}" y="{under}" text-anchor="middle">{angle}</text>' for angle in range(0, 181, 30)]
+    parts += [
+        f'<text x="{x(angle):.1f}" y="{under}" text-anchor="middle">{angle}</text>' for angle in range(0, 181, 30)
+    ]
     middle = (LEFT + WIDTH - RIGHT) / 2
     parts.append(f'<text x="{middle:.0f}" y="{HEIGHT - 6}" text-anchor="middle">scattering angle, degrees</text>')
     parts.append(f'<text transform="translate(12 {HEIGHT / 2:.0f}) rotate(-90)" text-anchor="middle">per sr</text>')

@@ -67,7 +67,9 @@ def write_report(
 def _notes(report: SlabReport) -> list[str]:
     # What holds of all wavelengths is said once.
     every = [note for note in report.fits[0].notes if all(note in fit.notes for fit in report.fits)]
-    return every + [f"{fit.wavelength_nm:g} nm: {note}" for fit in report.fits for note in fit.notes if note not in every]
+    return every + [
+        f"{fit.wavelength_nm:g} nm: {note}" for fit in report.fits for note in fit.notes if note not in every
+    ]
 
 
 def _errors(report: SlabReport, name: str) -> dict[str, Any] | None:
@@ -83,7 +85,9 @@ def _errors(report: SlabReport, name: str) -> dict[str, Any] | None:
 def _row(report: SlabReport, name: str) -> dict[str, Any]:
     told: list[Quantity] = [getattr(fit.parameters, name) for fit in report.fits]
     # An index that was given has no error of its own to tell.
-    cells = [cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined)) for one in told]
+    cells = [
+        cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined)) for one in told
+    ]
     return {"label": LABELS[name], "name": name, "cells": cells, "unit": "" if told[0].unit == "1" else "per mm"}
 
 

@@ -110,7 +110,9 @@ def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:
     )
 
 
-def image_error(first: NDArray[np.float64], second: NDArray[np.float64], values: NDArray[np.float64], variances: NDArray[np.float64]) -> float:
+def image_error(
+    first: NDArray[np.float64], second: NDArray[np.float64], values: NDArray[np.float64], variances: NDArray[np.float64]
+) -> float:
     """Relative error from two independent renders, the measurements' noise taken out of both sums."""
     usable = np.isfinite(variances)
     y, noise = values[usable], float(variances[usable].sum())
@@ -129,7 +131,9 @@ class SlabReport(Record):
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
         judged = FitReport(
             converged=not stopped,
-            advice=f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort." if stopped else "",
+            advice=f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort."
+            if stopped
+            else "",
             parameters={},
             fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
             held_out_error={name: error for name, error in held_out.items() if error is not None},

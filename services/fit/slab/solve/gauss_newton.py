@@ -113,7 +113,10 @@ class GaussNewton:
         scale = self.best_scale(state.material, quadratic)
         prior = precision(scale)
         change = self.change(quadratic, prior, x, state.damping)
-        promise, noise = promised(quadratic, prior, x, change), noise_of_promise(quadratic, prior, state.equations.gradient_noise)
+        promise, noise = (
+            promised(quadratic, prior, x, change),
+            noise_of_promise(quadratic, prior, state.equations.gradient_noise),
+        )
         if promise < WORTHWHILE * noise and state.paths >= self.budget.search_paths:
             return state, True
         paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
@@ -125,7 +128,9 @@ class GaussNewton:
             if after <= before + TOLERATED_RISE * float(np.hypot(state.equations.misfit_se, equations.misfit_se)):
                 return State(material_at(y), equations, paths, max(state.damping / 4, DAMPING)), False
         more = min(2 * state.paths, self.budget.search_paths)
-        return State(state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping), False
+        return State(
+            state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping
+        ), False
 
     def finish(self, state: State, steps: int, converged: bool) -> Solution:
         """Steps from many paths, then from the most: each stage until its paths tell of nothing more."""
@@ -138,9 +143,13 @@ class GaussNewton:
                 prior = precision(scale)
                 change = self.change(quadratic, prior, x, DAMPING)
                 material = material_at(x + change)
-                if promised(quadratic, prior, x, change) < UNFINISHED * noise_of_promise(quadratic, prior, equations.gradient_noise):
+                if promised(quadratic, prior, x, change) < UNFINISHED * noise_of_promise(
+                    quadratic, prior, equations.gradient_noise
+                ):
                     break
-        return Solution(material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths)
+        return Solution(
+            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths
+        )
 
     @staticmethod
     def change(quadratic: Quadratic, prior: Array, x: Array, damping: float) -> Array:
@@ -151,12 +160,23 @@ class GaussNewton:
         """Normal equations of fresh batches."""
         self.renders += 1
         self.paths += paths * batches * len(self.rig.lights)
-        estimates = render(self.rig, material, seed=self.seed, step=self.renders, batches=batches, paths=paths, scores=True, blocks=self.blocks)
+        estimates = render(
+            self.rig,
+            material,
+            seed=self.seed,
+            step=self.renders,
+            batches=batches,
+            paths=paths,
+            scores=True,
+            blocks=self.blocks,
+        )
         own = smoothed_variance(estimates.images, (self.rig.grid.rows, self.rig.grid.columns)) * batches * paths
         # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and weights that
         # share them with the residuals bent sigma_s' up by several per cent.
         known = own if self.path_variance is None else self.path_variance
-        weights = np.where(self.measured.held_out[:, None], 0, 1 / (self.measured.variances + known / (batches * paths)))
+        weights = np.where(
+            self.measured.held_out[:, None], 0, 1 / (self.measured.variances + known / (batches * paths))
+        )
         self.path_variance = (own + known) / 2
         return normal_equations(estimates, material, self.measured.values, weights)
 
@@ -173,7 +193,12 @@ def unknowns(material: Material) -> Array:
 def quadratic_at(material: Material, equations: NormalEquations) -> Quadratic:
     """The model of half the misfit in the unknowns themselves."""
     x = unknowns(material)
-    return Quadratic(equations.matrix, equations.gradient - equations.matrix @ x, equations.noise, equations.noise_gradient - equations.noise @ x)
+    return Quadratic(
+        equations.matrix,
+        equations.gradient - equations.matrix @ x,
+        equations.noise,
+        equations.noise_gradient - equations.noise @ x,
+    )
 
 
 def material_at(x: Array) -> Material:

@@ -78,7 +78,11 @@ class Quadratic:
         linear, total = self.linear + self.noise_linear, self.matrix + self.noise + prior
         x = _bounded(total + RIDGE * float(np.diag(total).max()) * np.eye(UNKNOWNS), -linear)
         sign, log_determinant = np.linalg.slogdet(total)
-        return float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale)) if sign > 0 else -np.inf
+        return (
+            float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale))
+            if sign > 0
+            else -np.inf
+        )
 
 
 def _bounded(matrix: Array, right: Array) -> Array:

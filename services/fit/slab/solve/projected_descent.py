@@ -67,7 +67,14 @@ def image_weights(values: Array) -> Array:
     return 1 / np.maximum(WEIGHT_FLOOR, relative**WEIGHT_POWER)
 
 
-def descend(rig: Rig, measured: Measurements, start: Material, seed: int, options: DescentOptions | None = None, blocks: Blocks = map) -> Material:
+def descend(
+    rig: Rig,
+    measured: Measurements,
+    start: Material,
+    seed: int,
+    options: DescentOptions | None = None,
+    blocks: Blocks = map,
+) -> Material:
     """The average of the iterates from a start."""
     options = options or DescentOptions()
     used = np.isfinite(measured.variances) & ~measured.held_out[:, None]
@@ -76,7 +83,9 @@ def descend(rig: Rig, measured: Measurements, start: Material, seed: int, option
     point, summed = start.weights(), np.zeros(KNOTS + 2)
     for step in range(options.iterations):
         material = floored(point)
-        batches = render(rig, material, seed=seed, step=FIRST_STEP + step, batches=2, paths=options.paths, scores=True, blocks=blocks)
+        batches = render(
+            rig, material, seed=seed, step=FIRST_STEP + step, batches=2, paths=options.paths, scores=True, blocks=blocks
+        )
         gradient = np.zeros(KNOTS + 2)
         for image, rows in zip(batches.images, batches.rows[::-1], strict=True):
             gradient += weight_gradient(rows, material, weights * (image - measured.values)) / brightest**2

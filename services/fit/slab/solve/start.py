@@ -33,7 +33,9 @@ def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Materi
     for number, (thickness, g) in enumerate((t, g) for t in THICKNESSES for g in COSINES):
         sigma_s = thickness / rig.width_mm
         guess = henyey_greenstein(sigma_s, g, sigma_s * (1 / FIRST_ALBEDO - 1))
-        images = render(rig, guess, seed=seed, step=-number - 1 + 2**32, batches=2, paths=TABLE_PATHS, scores=False, blocks=blocks).images
+        images = render(
+            rig, guess, seed=seed, step=-number - 1 + 2**32, batches=2, paths=TABLE_PATHS, scores=False, blocks=blocks
+        ).images
         first, second = images - measured.values
         misfit = float((first * second / tolerated)[fitted].sum())
         if misfit < lowest:
@@ -49,9 +51,13 @@ def _material(point: Array) -> Material:
     return henyey_greenstein(math.exp(point[0]), float(point[1]), float(point[2]))
 
 
-def _improved(rig: Rig, measured: Measurements, point: Array, tolerated: Array, seed: int, step: int, blocks: Blocks) -> Array:
+def _improved(
+    rig: Rig, measured: Measurements, point: Array, tolerated: Array, seed: int, step: int, blocks: Blocks
+) -> Array:
     material = _material(point)
-    batches = render(rig, material, seed=seed, step=step + 2**31, batches=BATCHES, paths=STEP_PATHS, scores=True, blocks=blocks)
+    batches = render(
+        rig, material, seed=seed, step=step + 2**31, batches=BATCHES, paths=STEP_PATHS, scores=True, blocks=blocks
+    )
     weights = 1 / (tolerated + smoothed_variance(batches.images, (rig.grid.rows, rig.grid.columns)))
     equations = normal_equations(batches, material, measured.values, weights)
 

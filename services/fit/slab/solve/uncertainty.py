@@ -89,6 +89,7 @@ def phase_errors(material: Material, uncertainty: Uncertainty) -> tuple[Array, N
     # ln p = ln f - ln sigma_s
     chain = np.eye(KNOTS + 1)[:KNOTS] - np.append(share, 0.0)
     errors, alone = (
-        np.sqrt(np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True)) for covariance in (uncertainty.covariance, uncertainty.images_alone)
+        np.sqrt(np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True))
+        for covariance in (uncertainty.covariance, uncertainty.images_alone)
     )
     return errors * material.phase_per_sr, alone <= LARGEST_SHARE

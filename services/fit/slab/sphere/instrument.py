@@ -62,7 +62,9 @@ def _gain(sphere: Sphere, sample: float, third: float = 0.0) -> float:
         sample: reflectance of the sample for diffuse light.
         third: reflectance of what lies in the third port.
     """
-    sample_area, third_area, detector_area = (_area(sphere, port) for port in (sphere.sample_port_mm, sphere.third_port_mm, sphere.detector_port_mm))
+    sample_area, third_area, detector_area = (
+        _area(sphere, port) for port in (sphere.sample_port_mm, sphere.third_port_mm, sphere.detector_port_mm)
+    )
     wall_area = 1 - sample_area - third_area - detector_area
     ports = detector_area * sphere.detector_reflectance + sample_area * sample
     if not sphere.baffle:

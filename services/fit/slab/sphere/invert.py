@@ -167,7 +167,9 @@ class _Problem:
         )  # fmt: skip
         return Fitted(fit, optics, covariance[:2, :2])
 
-    def _covariance(self, absorption: float, reduced: float, extinction: float | None, errors: Array) -> tuple[Array, float]:
+    def _covariance(
+        self, absorption: float, reduced: float, extinction: float | None, errors: Array
+    ) -> tuple[Array, float]:
         """Of sigma_a, sigma_s_reduced, sigma_s and g (4, 4), and the standard error of the extinction."""
         point = np.array([absorption, reduced, extinction or 0.0])
         columns = []
@@ -202,19 +204,27 @@ class _Problem:
         if float(np.abs(fitted - np.array([reading.R, reading.T])).max()) > MAX_MISS:
             told = f"R = {reading.R:g}, T = {reading.T:g}"
             nearest = f"the nearest one reads {fitted[0]:.4f}, {fitted[1]:.4f}"
-            notes.append(f"No slab of this width and index reads {told}; {nearest}: check index, glass, standard and what R includes.")
+            notes.append(
+                f"No slab of this width and index reads {told}; {nearest}: check index, glass, standard and what R includes."
+            )
         if absorption < least:
             notes.append("The readings tell no absorption: what is lost is below what they resolve.")
         if reduced < least:
             notes.append("The readings tell no scattering.")
         if extinction is None:
-            notes.append(f"g = {self.file.g:g} is what was given, not measured; the collimated transmittance would tell it.")
+            notes.append(
+                f"g = {self.file.g:g} is what was given, not measured; the collimated transmittance would tell it."
+            )
         elif not MIN_G < 1 - reduced / max(extinction - absorption, 1e-12) < MAX_G:
-            notes.append("The collimated transmittance contradicts R and T, as no g fits all three; check it for scattered light.")
+            notes.append(
+                "The collimated transmittance contradicts R and T, as no g fits all three; check it for scattered light."
+            )
         if reading.R_se is None or reading.T_se is None:
             notes.append(f"R and T without a standard error are taken to have {ASSUMED_SE:g}.")
         if reading.T_unscattered is not None and reading.T_unscattered_se is None:
-            notes.append(f"T_unscattered without a standard error is taken to have {100 * ASSUMED_UNSCATTERED_SHARE:g} % of its value.")
+            notes.append(
+                f"T_unscattered without a standard error is taken to have {100 * ASSUMED_UNSCATTERED_SHARE:g} % of its value."
+            )
         return tuple(notes)
 
 

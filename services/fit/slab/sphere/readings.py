@@ -33,7 +33,9 @@ class Sphere(Record):
     detector_port_mm: Annotated[float, Field(ge=0)] = Field(description="diameter")
     wall_reflectance: Wall
     detector_reflectance: Share = 0.0
-    baffle: bool = Field(default=True, description="between sample and detector, so that light must meet the wall first")
+    baffle: bool = Field(
+        default=True, description="between sample and detector, so that light must meet the wall first"
+    )
 
     @model_validator(mode="after")
     def _ports_fit(self) -> Sphere:
@@ -51,7 +53,9 @@ class TotalsReading(Record):
     R_se: Positive | None = None
     T: Reading
     T_se: Positive | None = None
-    T_unscattered: Annotated[float, Field(gt=0, le=1)] | None = Field(default=None, description="collimated transmittance")
+    T_unscattered: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=None, description="collimated transmittance"
+    )
     T_unscattered_se: Positive | None = None
     source: Literal["normal", "diffuse"] = "normal"
     reflection_wall: Wall | None = Field(default=None, description="of the reflection sphere at this wavelength")
@@ -65,10 +69,14 @@ class SphereFile(Record):
     units: Literal["mm"]
     cell: Cell
     totals: Annotated[tuple[TotalsReading, ...], Field(min_length=1)]
-    g: Annotated[float, Field(gt=-1, lt=1)] = Field(default=0.0, description="mean cosine where T_unscattered is not given")
+    g: Annotated[float, Field(gt=-1, lt=1)] = Field(
+        default=0.0, description="mean cosine where T_unscattered is not given"
+    )
     reflection_sphere: Sphere | None = Field(default=None, description="null where R is corrected already")
     transmission_sphere: Sphere | None = Field(default=None, description="null where T is corrected already")
-    standard_reflectance: Annotated[float, Field(gt=0, le=1)] = Field(default=1.0, description="of the standard R is told by")
+    standard_reflectance: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=1.0, description="of the standard R is told by"
+    )
     specular_included: bool = Field(default=True, description="whether R holds the mirror reflection of the faces")
     unscattered_included: bool = Field(default=True, description="whether T holds the unscattered light")
 
@@ -77,7 +85,9 @@ class SphereFile(Record):
         if self.cell.boundary == "smooth" and self.cell.index is None:
             raise ValueError("cell.index is null, and totals do not tell it; give the sample's index")
         if self.cell.boundary == "smooth" and (self.cell.index or 0) < self.cell.index_outside:
-            raise ValueError(f"cell.index is below index_outside, {self.cell.index_outside:g}; only a sample that is denser is understood")
+            raise ValueError(
+                f"cell.index is below index_outside, {self.cell.index_outside:g}; only a sample that is denser is understood"
+            )
         names = [reading.wavelength_nm for reading in self.totals]
         if twice := {nm for nm in names if nm is not None and names.count(nm) > 1}:
             raise ValueError(f"wavelength {min(twice):g} nm is listed twice; keep one")
@@ -86,7 +96,8 @@ class SphereFile(Record):
     def named(self) -> list[tuple[str, TotalsReading]]:
         """Readings by wavelength in nm, or by their number where none is given."""
         return [
-            (f"{number}" if reading.wavelength_nm is None else f"{reading.wavelength_nm:g}", reading) for number, reading in enumerate(self.totals, start=1)
+            (f"{number}" if reading.wavelength_nm is None else f"{reading.wavelength_nm:g}", reading)
+            for number, reading in enumerate(self.totals, start=1)
         ]
 
 
@@ -111,13 +122,19 @@ def _read_rxt(path: Path) -> SphereFile:
     while rows and len(header) < RXT_HEADER:
         header += rows.pop(0)[1]
     if len(header) != RXT_HEADER:
-        raise CaptureInputError(f"{path}: {RXT_HEADER} numbers come before the readings, this file has {len(header)}; complete it.")
+        raise CaptureInputError(
+            f"{path}: {RXT_HEADER} numbers come before the readings, this file has {len(header)}; complete it."
+        )
     index, slide_index, width_mm, slide_mm, _beam_mm, standard = header[:6]
     spheres, columns = int(header[6]), int(header[17])
     if spheres not in {0, 1}:
-        raise CaptureInputError(f"{path}: readings with {spheres} spheres at once are not understood; measure R and T one after the other.")
+        raise CaptureInputError(
+            f"{path}: readings with {spheres} spheres at once are not understood; measure R and T one after the other."
+        )
     if not 2 <= columns <= MAX_RXT_COLUMNS:
-        raise CaptureInputError(f"{path}: {columns} readings a line are not understood; give M_R and M_T, then M_U and the wall of either sphere.")
+        raise CaptureInputError(
+            f"{path}: {columns} readings a line are not understood; give M_R and M_T, then M_U and the wall of either sphere."
+        )
     reflection, transmission = (_sphere(header[first : first + 5]) if spheres else None for first in (7, 12))
     slide = {"index": slide_index, "thickness_mm": slide_mm} if slide_mm > 0 and slide_index > 1 else None
     try:
@@ -144,9 +161,13 @@ def _numbers(path: Path) -> list[tuple[int, list[float]]]:
         try:
             values = [float(word) for word in words]
         except ValueError as problem:
-            raise CaptureInputError(f"{path}, line {number}: {' '.join(words)} is not a list of numbers; correct it.") from problem
+            raise CaptureInputError(
+                f"{path}, line {number}: {' '.join(words)} is not a list of numbers; correct it."
+            ) from problem
         if not all(map(math.isfinite, values)):
-            raise CaptureInputError(f"{path}, line {number}: {' '.join(words)} holds a number that is not finite; correct it.")
+            raise CaptureInputError(
+                f"{path}, line {number}: {' '.join(words)} holds a number that is not finite; correct it."
+            )
         if values:
             rows.append((number, values))
     return rows
@@ -154,7 +175,9 @@ def _numbers(path: Path) -> list[tuple[int, list[float]]]:
 
 def _reading(path: Path, line: int, row: list[float], columns: int) -> TotalsReading:
     if len(row) not in {columns, columns + 1}:
-        raise CaptureInputError(f"{path}, line {line}: {len(row)} numbers where {columns} readings were announced; correct one of them.")
+        raise CaptureInputError(
+            f"{path}, line {line}: {len(row)} numbers where {columns} readings were announced; correct one of them."
+        )
     values = row[-columns:]
     unscattered, reflection_wall, transmission_wall = (*values[2:], None, None, None)[:3]
     return TotalsReading(

@@ -119,7 +119,9 @@ def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
     return _Quadrature(cosines, weights, passes, diffuse)
 
 
-def _exits(optics: Optics, width_mm: float, quadrature: _Quadrature, incident: Array, nodes: int) -> tuple[Array, Array]:
+def _exits(
+    optics: Optics, width_mm: float, quadrature: _Quadrature, incident: Array, nodes: int
+) -> tuple[Array, Array]:
     """Power that leaves the far and the near face (sources,) for incident power at the nodes (nodes, sources)."""
     even, odd = _admittances(optics, width_mm, quadrature, nodes)
     passes = quadrature.transmittances

@@ -93,7 +93,11 @@ def translucency_of(file: SphereFile, fits: list[Fitted], black: float, white: f
 
 
 def _spectrum(file: SphereFile, fits: list[Fitted], backings: tuple[float, float]) -> _Spectrum | None:
-    known = [(reading.wavelength_nm, fitted) for reading, fitted in zip(file.totals, fits, strict=True) if reading.wavelength_nm]
+    known = [
+        (reading.wavelength_nm, fitted)
+        for reading, fitted in zip(file.totals, fits, strict=True)
+        if reading.wavelength_nm
+    ]
     known.sort(key=lambda pair: pair[0])
     nm = np.array([wavelength for wavelength, _ in known])
     if len(nm) < 2 or nm[0] > FIRST_NM or nm[-1] < LAST_NM:
@@ -113,7 +117,9 @@ def _spectrum(file: SphereFile, fits: list[Fitted], backings: tuple[float, float
         slopes = np.zeros((2, 2))
         steps = DIFFERENCE * np.array([optics.absorption_per_mm, optics.scattering_per_mm * (1 - optics.g)])
         for column, (absorbing, scattering) in enumerate(np.diag(steps)):
-            moved = Optics(optics.absorption_per_mm + absorbing, optics.scattering_per_mm + scattering / (1 - optics.g), optics.g)
+            moved = Optics(
+                optics.absorption_per_mm + absorbing, optics.scattering_per_mm + scattering / (1 - optics.g), optics.g
+            )
             slopes[:, column] = (reflectances(moved) - value) / steps[column]
         values.append(value)
         covariances.append(slopes @ fitted.covariance @ slopes.T)

@@ -17,7 +17,9 @@ def write_sphere(out: Path, fits: list[Fitted], translucency: Translucency | Non
     out.mkdir(parents=True, exist_ok=True)
     told = [fitted.fit.model_dump() for fitted in fits]
     parameters = {fit["name"]: {name: fit[name] for name in PARAMETERS if fit[name] is not None} for fit in told}
-    readings = {fit["name"]: {name: value for name, value in fit.items() if name not in {*PARAMETERS, "name"}} for fit in told}
+    readings = {
+        fit["name"]: {name: value for name, value in fit.items() if name not in {*PARAMETERS, "name"}} for fit in told
+    }
     files = {"parameters": parameters, "readings": readings}
     if translucency is not None:
         files["translucency"] = translucency.model_dump()

@@ -103,7 +103,9 @@ class BorderScattering:
         self.crossing, self.geometry, self.media = crossing, geometry, media
         index_a, index_b = geometry.medium(crossing.before), geometry.medium(crossing.after)
         self.phase_a, self.phase_b = PhaseFunction(media, index_a), PhaseFunction(media, index_b)
-        self.sigma_a, self.sigma_b = (dr.select(index == 0, 0, media.pick(media.sigma_s, index)) for index in (index_a, index_b))
+        self.sigma_a, self.sigma_b = (
+            dr.select(index == 0, 0, media.pick(media.sigma_s, index)) for index in (index_a, index_b)
+        )
         if geometry.mixing:
             # On the border itself both sides are the same mixture; only extinction jumps.
             half = geometry.mixed(crossing.point, crossing.before, mi.Bool(True))
@@ -123,7 +125,9 @@ class BorderScattering:
 
     def _sides(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         omega = self.crossing.omega
-        return self.sigma_a * self.phase_a.density(omega, direction), self.sigma_b * self.phase_b.density(omega, direction)
+        return self.sigma_a * self.phase_a.density(omega, direction), self.sigma_b * self.phase_b.density(
+            omega, direction
+        )
 
     def place(self, direction: mi.Vector3f) -> mi.UInt32:
         """The side on which a walk in ``direction`` starts, by the sign of n . direction."""
@@ -132,7 +136,9 @@ class BorderScattering:
 
     def point(self, direction: mi.Vector3f) -> mi.Point3f:
         """Start of that walk, offset off the border to its side."""
-        offset = self.crossing.normal * dr.mulsign(mi.Float(self.geometry.epsilon), dr.dot(direction, self.crossing.normal))
+        offset = self.crossing.normal * dr.mulsign(
+            mi.Float(self.geometry.epsilon), dr.dot(direction, self.crossing.normal)
+        )
         return mi.Point3f(self.crossing.point + offset)
 
     def sample(self, u_side: mi.Float, u_lobe: mi.Float | None, u: mi.Float, v: mi.Float) -> mi.Vector3f:

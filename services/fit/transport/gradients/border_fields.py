@@ -58,7 +58,15 @@ class Texels:
 class BorderWalk(Walk, ABC):
     """The walk without connections, which instead counts its crossings of the border."""
 
-    def __init__(self, geometry: MeshGeometry, media: Media, start: CameraStart | LightStart, texels: Texels, order: int, ior: float | None) -> None:
+    def __init__(
+        self,
+        geometry: MeshGeometry,
+        media: Media,
+        start: CameraStart | LightStart,
+        texels: Texels,
+        order: int,
+        ior: float | None,
+    ) -> None:
         super().__init__(geometry, media, None, start, Plan(), ior)
         self.mesh, self.texels, self.order = geometry, texels, order
         self.columns = (order + 1) ** 2 + 1
@@ -71,25 +79,39 @@ class BorderWalk(Walk, ABC):
         strength = carried * per_cosine(dr.dot(walker.omega, flight.hit.normal))
         fresh = self.book.order(walker.so_far) == 0
 
-        def count(lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> mi.UInt32:
+        def count(
+            lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+        ) -> mi.UInt32:
             self._count(lane, hit, omega, strength, fresh, crosses)
             return lane
 
-        dr.if_stmt((walker.lane, flight.hit, walker.omega, strength, fresh, crosses), crosses, count, lambda lane, *_: lane, label="border")
+        dr.if_stmt(
+            (walker.lane, flight.hit, walker.omega, strength, fresh, crosses),
+            crosses,
+            count,
+            lambda lane, *_: lane,
+            label="border",
+        )
         super()._move(walker, flight, carried)
 
     @abstractmethod
-    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+    def _count(
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+    ) -> None:
         """Count crossings of a lane's path at ``strength``, its weight over the cosine; ``fresh`` ones have not collided."""
 
     def _texel(self, hit: Hit, active: mi.Bool) -> mi.UInt32:
-        return dr.gather(mi.UInt32, self.texels.of_face, hit.primitive - self.mesh.first_dentin_face(self.texels.tooth), active)
+        return dr.gather(
+            mi.UInt32, self.texels.of_face, hit.primitive - self.mesh.first_dentin_face(self.texels.tooth), active
+        )
 
 
 class LightWalk(BorderWalk):
     """Photons from the lights; gathers how much light, from where, there is on each texel."""
 
-    def __init__(self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, ior: float | None) -> None:
+    def __init__(
+        self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, ior: float | None
+    ) -> None:
         super().__init__(geometry, media, start, texels, order, ior)
         self.photons = start
         # Whole numbers, so that sums do not depend on the order of threads.
@@ -110,7 +132,9 @@ class LightWalk(BorderWalk):
         # As the straight connections of images have it, light that has not scattered is transmitted only.
         return self.book.order(walker.so_far) == 0
 
-    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+    def _count(
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+    ) -> None:
         first = (self.photons.group(lane) * self.texels.count + self._texel(hit, crosses)) * self.columns
         units = strength * FIXED_POINT
         for k, harmonic in enumerate(dr.sh_eval(omega, self.order)):
@@ -148,7 +172,9 @@ class CameraWalk(BorderWalk):
         dr.sync_thread()
         return np.array(self.sums).reshape(-1, self.light_batches, self.shape_modes)
 
-    def _count(self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool) -> None:
+    def _count(
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+    ) -> None:
         texel, speeds = self._texel(hit, crosses), self.mesh.velocity(hit, self.texels.tooth, crosses)
         harmonics = dr.sh_eval(omega, self.order)
         weighted = [harmonics[k] * c for j, c in enumerate(self.coefficients) for k in range(j * j, (j + 1) ** 2)]
@@ -159,4 +185,6 @@ class CameraWalk(BorderWalk):
                 change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~fresh), change)
             for mode, speed in enumerate(speeds):
                 slot = (lane * self.light_batches + batch) * self.shape_modes + mode
-                dr.scatter_add(self.sums, mi.Float64(-strength * speed * change), slot, crosses, mode=dr.ReduceMode.NoConflicts)
+                dr.scatter_add(
+                    self.sums, mi.Float64(-strength * speed * change), slot, crosses, mode=dr.ReduceMode.NoConflicts
+                )

@@ -55,7 +55,9 @@ def _scattered(medium: Medium, cosine: Array) -> Array:
     def lobe(g: float) -> Array:
         return np.asarray((1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5))
 
-    return np.asarray(medium.sigma * medium.alpha * (medium.beta * lobe(medium.g1) + (1 - medium.beta) * lobe(medium.g2)))
+    return np.asarray(
+        medium.sigma * medium.alpha * (medium.beta * lobe(medium.g1) + (1 - medium.beta) * lobe(medium.g2))
+    )
 
 
 def patches(surface: Mesh, count: int) -> NDArray[np.int64]:
@@ -77,5 +79,7 @@ def patches(surface: Mesh, count: int) -> NDArray[np.int64]:
     for _ in range(LLOYD_ROUNDS):
         nearest = cKDTree(centres).query(points)[1]
         weights = np.maximum(np.bincount(nearest, doubled_areas, minlength=count), 1e-30)
-        centres = np.stack([np.bincount(nearest, doubled_areas * column, minlength=count) / weights for column in points.T], axis=1)
+        centres = np.stack(
+            [np.bincount(nearest, doubled_areas * column, minlength=count) / weights for column in points.T], axis=1
+        )
     return np.asarray(np.unique(cKDTree(centres).query(points)[1], return_inverse=True)[1])

@@ -29,13 +29,33 @@ class ShapeGradients:
     def __init__(self, geometry: MeshGeometry, tooth: int, ior: float | None, radius_mm: float) -> None:
         dentin = geometry.recipe.teeth[tooth].dentin
         assert dentin is not None
-        self.geometry, self.tooth, self.recipe, self.ior, self.radius_mm = geometry, tooth, geometry.recipe, ior, radius_mm
+        self.geometry, self.tooth, self.recipe, self.ior, self.radius_mm = (
+            geometry,
+            tooth,
+            geometry.recipe,
+            ior,
+            radius_mm,
+        )
         self._patches = patches(dentin.base, TEXELS)
 
-    def __call__(self, tissue: Tissue, media: Media, view: View, cotangent: Array, *, seed: int, samples: int, photons: int, order: int) -> ShapeGradient:
+    def __call__(
+        self,
+        tissue: Tissue,
+        media: Media,
+        view: View,
+        cotangent: Array,
+        *,
+        seed: int,
+        samples: int,
+        photons: int,
+        order: int,
+    ) -> ShapeGradient:
         """See ``Engine.shape_gradient``; all arguments are checked, and the geometry has the tissue's shape."""
         light_seed, camera_seed = (int(number) for number in np.random.SeedSequence(seed).generate_state(2))
-        series, texels = BorderSeries(tissue.enamel, tissue.dentin), Texels(self._patches, self.geometry.dentin_areas_mm2(self.tooth), self.tooth)
+        series, texels = (
+            BorderSeries(tissue.enamel, tissue.dentin),
+            Texels(self._patches, self.geometry.dentin_areas_mm2(self.tooth), self.tooth),
+        )
         chosen = list(range(len(self.recipe.light_positions_mm)) if view.lights is None else view.lights)
         table = self._light(media, texels, chosen, photons, order, light_seed)
         lights = self.recipe.light_positions_mm[chosen]
@@ -46,13 +66,19 @@ class ShapeGradients:
         crossed = np.zeros((CAMERA_BATCHES, LIGHT_BATCHES, self.geometry.modes_of[self.tooth]))
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
-            light = self._light_of_pixels(table, series, order, piece, arriving, cotangent[chosen, first : first + slice_size])
+            light = self._light_of_pixels(
+                table, series, order, piece, arriving, cotangent[chosen, first : first + slice_size]
+            )
             start = CameraStart(piece, CAMERA_BATCHES, camera_seed, self.radius_mm)
-            sums = CameraWalk(self.geometry, media, start, texels, self.ior, series.coefficients(order), light).meet(per_batch)
+            sums = CameraWalk(self.geometry, media, start, texels, self.ior, series.coefficients(order), light).meet(
+                per_batch
+            )
             crossed += sums.reshape(CAMERA_BATCHES, len(piece), LIGHT_BATCHES, -1).sum(axis=1) / per_batch
         return ShapeGradient(*crossed_mean(crossed), samples=per_batch * CAMERA_BATCHES)
 
-    def _light(self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int) -> NDArray[np.float32]:
+    def _light(
+        self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int
+    ) -> NDArray[np.float32]:
         per_group = -(-photons // LIGHT_BATCHES)
         lanes = min(MAX_LANES_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]

@@ -57,17 +57,25 @@ class StainTextures:
         """Take texture coordinates (F, 3, 2) of every tooth's outer faces, in the order of the scene's faces, and every tooth's texture."""
         sizes = [(1, 1) if stain is None else stain.transmittance.shape for stain in stains]
         first = np.cumsum([0] + [height * width for height, width in sizes])
-        self.ranges = tuple(None if stain is None else (int(a), stain.transmittance.shape) for a, stain in zip(first, stains, strict=False))
+        self.ranges = tuple(
+            None if stain is None else (int(a), stain.transmittance.shape)
+            for a, stain in zip(first, stains, strict=False)
+        )
         self.count = int(first[-1])
         values = [np.ones(1) if stain is None else stain.transmittance.reshape(-1) for stain in stains]
         self._values = mi.Float(np.concatenate(values).astype(np.float32))
         self._corners = mi.Float(np.concatenate(corners_uv).reshape(-1).astype(np.float32))
-        self._layout = mi.UInt32(np.array([(a, *size) for a, size in zip(first, sizes, strict=False)], dtype=np.uint32).reshape(-1))
+        self._layout = mi.UInt32(
+            np.array([(a, *size) for a, size in zip(first, sizes, strict=False)], dtype=np.uint32).reshape(-1)
+        )
         dr.eval(self._values, self._corners, self._layout)
 
     def cut(self, texels: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, ...]:
         """Numbers of all texels as every tooth's (H, W)."""
-        return tuple(None if place is None else texels[place[0] : place[0] + place[1][0] * place[1][1]].reshape(place[1]) for place in self.ranges)
+        return tuple(
+            None if place is None else texels[place[0] : place[0] + place[1][0] * place[1][1]].reshape(place[1])
+            for place in self.ranges
+        )
 
     def transmittance(self, hit: Hit, active: mi.Bool) -> mi.Float:
         """a_t at a hit of a tooth's outer surface, 1 elsewhere."""
@@ -84,7 +92,9 @@ class StainTextures:
             a_t = dr.fma(weight, dr.gather(mi.Float, self._values, texel, active), a_t)
         return [(texel, weight * crossing.number / a_t) for texel, weight in texels]
 
-    def _texels(self, primitive: mi.UInt32, uv: mi.Point2f, tooth: mi.UInt32, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Float]]:
+    def _texels(
+        self, primitive: mi.UInt32, uv: mi.Point2f, tooth: mi.UInt32, active: mi.Bool
+    ) -> list[tuple[mi.UInt32, mi.Float]]:
         # Texel centres lie at half-integers; beyond the outermost ones the texture goes on as there.
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
         place = mi.Point2f(0)

@@ -36,7 +36,9 @@ class LightGroups:
         self._members = mi.UInt32(members.astype(np.uint32))
         dr.eval(self._members)
 
-    def choose(self, group: mi.UInt32, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    def choose(
+        self, group: mi.UInt32, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], u: mi.Float
+    ) -> tuple[mi.UInt32, mi.Float]:
         """Choose one light of a group in proportion to importance(direction) x intensity / distance^2.
 
         Returns:

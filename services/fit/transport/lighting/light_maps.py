@@ -55,7 +55,10 @@ class LightView:
         """Path length in mm inside each of some media."""
         found = []
         for medium in media:
-            of_this = [dr.select(number == medium, length, 0) for number, length in zip(self.media, self.lengths_mm, strict=True)]
+            of_this = [
+                dr.select(number == medium, length, 0)
+                for number, length in zip(self.media, self.lengths_mm, strict=True)
+            ]
             found.append(sum(of_this, start=mi.Float(0)))
         return found
 
@@ -107,7 +110,10 @@ class MapCell:
 
     def between(self, word: int, shift: int) -> mi.Float:
         """Bilinear interpolation of the half of a word from a bit on."""
-        values = [mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift) for corner in self.corners]
+        values = [
+            mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift)
+            for corner in self.corners
+        ]
         return dr.lerp(dr.lerp(*values[:2], self.u), dr.lerp(*values[2:], self.u), self.v)
 
 
@@ -119,7 +125,9 @@ class LightMaps:
     MAX_BYTES = 2**29
     """Of all maps; larger scenes under more lights have a coarser grid."""
 
-    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]) -> None:
+    def __init__(
+        self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]
+    ) -> None:
         centre = 0.5 * (outer_mm.min(axis=0) + outer_mm.max(axis=0))
         radius = float(np.linalg.norm(outer_mm - centre, axis=1).max())
         relative = positions_mm - centre
@@ -176,7 +184,9 @@ class LightMaps:
             ray.travelled += dr.select(hit.valid, hit.distance, 0)
             through = mi.Float(1)
             if ior is not None:
-                through = 1 - fresnel.reflectance(dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.place, behind))
+                through = 1 - fresnel.reflectance(
+                    dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.place, behind)
+                )
             if geometry.stained:
                 through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.place, behind))
             self._meet(ray, geometry, hit, through)
@@ -197,7 +207,9 @@ class LightMaps:
     def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
         """Note a surface. Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order."""
         entering, met = dr.dot(ray.direction, hit.normal) < 0, hit.valid
-        event = dr.select(hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4)))
+        event = dr.select(
+            hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4))
+        )
         # Each event once, and inside the dentin only inside the tooth.
         repeated = (ray.meetings & event) != 0
         unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
@@ -211,7 +223,14 @@ class LightMaps:
     def _store(self, ray: MapRay) -> None:
         self._pack([ray.entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, (1 | 8, 1 | 2 | 4 | 8))
 
-    def _pack(self, depths: list[mi.Float], surface: mi.Float, kind: mi.UInt32, certain_kinds: tuple[int, ...], more: tuple[mi.UInt32, ...] = ()) -> None:
+    def _pack(
+        self,
+        depths: list[mi.Float],
+        surface: mi.Float,
+        kind: mi.UInt32,
+        certain_kinds: tuple[int, ...],
+        more: tuple[mi.UInt32, ...] = (),
+    ) -> None:
         """Four numbers of 16 bits, so that all maps stay in the cache: three depths, and the surface with the cell's certainty in the lowest bit.
 
         A cell is certain where all its corners met the same, of a kind that the map can tell.
@@ -220,15 +239,27 @@ class LightMaps:
         kinds = np.array(kind).reshape(shape)
         certain = np.zeros(shape, dtype=np.uint32)
         corners = [kinds[:, :-1, :-1], kinds[:, 1:, :-1], kinds[:, :-1, 1:], kinds[:, 1:, 1:]]
-        certain[:, :-1, :-1] = np.logical_and.reduce([corner == corners[0] for corner in corners]) & np.isin(corners[0], certain_kinds)
+        certain[:, :-1, :-1] = np.logical_and.reduce([corner == corners[0] for corner in corners]) & np.isin(
+            corners[0], certain_kinds
+        )
         codes = [self._depth_code(depth).reshape(shape) for depth in depths]
-        codes.append(np.rint(np.clip(np.array(surface, dtype=np.float64), 0, 1) * 65535).astype(np.uint32).reshape(shape) & ~np.uint32(1) | certain)
-        words = [codes[0] | codes[1] << 16, codes[2] | codes[3] << 16, *(np.array(word).reshape(shape) for word in more)]
+        codes.append(
+            np.rint(np.clip(np.array(surface, dtype=np.float64), 0, 1) * 65535).astype(np.uint32).reshape(shape)
+            & ~np.uint32(1)
+            | certain
+        )
+        words = [
+            codes[0] | codes[1] << 16,
+            codes[2] | codes[3] << 16,
+            *(np.array(word).reshape(shape) for word in more),
+        ]
         self._table = mi.UInt32(np.stack(words, axis=-1).reshape(-1))
         dr.eval(self._table)
 
     def _depth_code(self, depth: mi.Float) -> NDArray[np.uint32]:
-        return np.clip(np.rint((np.array(depth, dtype=np.float64) + self._near) / self._depth_step), 0, 65535).astype(np.uint32)
+        return np.clip(np.rint((np.array(depth, dtype=np.float64) + self._near) / self._depth_step), 0, 65535).astype(
+            np.uint32
+        )
 
     @dataclass
     class _Frame:
@@ -253,7 +284,9 @@ class LightMaps:
         squared = dr.squared_norm(from_light)
         inverse = dr.rsqrt(squared)
         # How much farther than the scene's centre, without the difference of two long distances.
-        depth = dr.fma(2 * frame.distance, ahead, dr.squared_norm(from_centre)) / dr.fma(squared, inverse, frame.distance)
+        depth = dr.fma(2 * frame.distance, ahead, dr.squared_norm(from_centre)) / dr.fma(
+            squared, inverse, frame.distance
+        )
 
         # Bilinear interpolation between the four rays around the vertex.
         per_forward = dr.rcp(frame.distance + ahead)
@@ -263,17 +296,37 @@ class LightMaps:
         cell = (light * self.size + mi.UInt32(dr.maximum(row, 0))) * self.size + mi.UInt32(dr.maximum(column, 0))
         cell = dr.minimum(cell, self.count * self.size**2 - self.size - 2)
         inside = (per_forward > 0) & (dr.minimum(column, row) >= 0) & (dr.maximum(column, row) < self.size - 1)
-        corners = [[dr.gather(mi.UInt32, self._table, self.WORDS * (cell + k) + word) for word in range(self.WORDS)] for k in (0, 1, self.size, self.size + 1)]
-        found = MapCell(-from_light * inverse, frame.intensity * dr.square(inverse), depth, corners, x - column, y - row, active & inside)
+        corners = [
+            [dr.gather(mi.UInt32, self._table, self.WORDS * (cell + k) + word) for word in range(self.WORDS)]
+            for k in (0, 1, self.size, self.size + 1)
+        ]
+        found = MapCell(
+            -from_light * inverse,
+            frame.intensity * dr.square(inverse),
+            depth,
+            corners,
+            x - column,
+            y - row,
+            active & inside,
+        )
         return self._view(found, place)
 
     def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the place
         """Read a cell."""
-        entry, dentin_entry, dentin_exit = (dr.fma(cell.between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0)))
+        entry, dentin_entry, dentin_exit = (
+            dr.fma(cell.between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0))
+        )
         dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
         certain = cell.inside & ((cell.corners[0][1] & 0x10000) != 0)
-        return LightView(cell.direction, cell.falloff, (ENAMEL, DENTIN), (enamel_mm, dentin_mm), cell.between(1, 16) * (1 / 65535), certain)
+        return LightView(
+            cell.direction,
+            cell.falloff,
+            (ENAMEL, DENTIN),
+            (enamel_mm, dentin_mm),
+            cell.between(1, 16) * (1 / 65535),
+            certain,
+        )
 
 
 def aligned(values: Any) -> Any:

@@ -44,7 +44,9 @@ class PointLights:
         edges = np.linspace(0, self.count, min(self.count, CANDIDATES) + 1).astype(int)
         self.strata = tuple(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
-    def choose(self, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], rng: mi.PCG32, active: mi.Bool) -> ChosenLight:
+    def choose(
+        self, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], rng: mi.PCG32, active: mi.Bool
+    ) -> ChosenLight:
         """Pick one light of stratified candidates in proportion to importance(direction) x intensity / distance^2 (resampled importance sampling)."""
         total, chosen = mi.Float(0), ChosenLight(mi.UInt32(0), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
         for first, last in self.strata:
@@ -126,12 +128,17 @@ def shadow(
         hit = geometry.intersect(ray.point, direction, ray.place, ray.alive)
         length = dr.select(hit.valid, hit.distance, 0)
         ray.depth = dr.fma(sigma, length, ray.depth)
-        ray.lengths = [total + dr.select(medium == k, length, 0) for k, total in zip(measured, ray.lengths, strict=True)]
+        ray.lengths = [
+            total + dr.select(medium == k, length, 0) for k, total in zip(measured, ray.lengths, strict=True)
+        ]
         behind = geometry.beyond(ray.place, direction, hit)
         cosine = dr.dot(direction, hit.normal)
         if shape is not None:
             jump = (media.extinction(geometry.medium(behind)) - sigma) * inverse_cosine(cosine)
-            ray.border = [dr.fma(speed, jump, total) for total, speed in zip(ray.border, geometry.velocity(hit, shape, ray.alive), strict=True)]
+            ray.border = [
+                dr.fma(speed, jump, total)
+                for total, speed in zip(ray.border, geometry.velocity(hit, shape, ray.alive), strict=True)
+            ]
         if thin_ior is not None:
             contrast = geometry.contrast(thin_ior, ray.place, behind)
             ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)

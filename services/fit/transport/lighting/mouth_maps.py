@@ -42,7 +42,11 @@ class MouthMaps(LightMaps):
         leaves = dentin & ~entering & ((ray.meetings & (DENTIN_ENTERED | DENTIN_LEFT)) == DENTIN_ENTERED)
         ends = met & dr.select(begins, hit.opaque | ~entering, ~enters & ~leaves)
 
-        ray.meetings |= dr.select(begins, thing, 0) | dr.select(enters, mi.UInt32(DENTIN_ENTERED), 0) | dr.select(leaves, mi.UInt32(DENTIN_LEFT), 0)
+        ray.meetings |= (
+            dr.select(begins, thing, 0)
+            | dr.select(enters, mi.UInt32(DENTIN_ENTERED), 0)
+            | dr.select(leaves, mi.UInt32(DENTIN_LEFT), 0)
+        )
         ray.entry = dr.select(begins, ray.travelled, ray.entry)
         ray.surface = dr.select(begins, through, ray.surface)
         ray.dentin_entry = dr.select(enters, ray.travelled, ray.dentin_entry)
@@ -54,22 +58,30 @@ class MouthMaps(LightMaps):
     def _store(self, ray: MapRay) -> None:
         first = ray.meetings & FIRST
         solids = range(1, self._geometry.teeth + 2)
-        kinds = tuple(number | dentin for number in solids for dentin in (0, DENTIN_ENTERED, DENTIN_ENTERED | DENTIN_LEFT))
+        kinds = tuple(
+            number | dentin for number in solids for dentin in (0, DENTIN_ENTERED, DENTIN_ENTERED | DENTIN_LEFT)
+        )
         entry = dr.select(first == 0, self._near, ray.entry)
         limit = mi.UInt32(self._depth_code(ray.limit)) | (first << 16)
         self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, kinds, (limit,))
 
     def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:
         halves = ((0, 0), (0, 16), (1, 0), (2, 0))
-        entry, dentin_entry, dentin_exit, limit = (dr.fma(cell.between(*half), self._depth_step, -self._near) for half in halves)
+        entry, dentin_entry, dentin_exit, limit = (
+            dr.fma(cell.between(*half), self._depth_step, -self._near) for half in halves
+        )
         thing = self._geometry.inside(place)
         outside = thing > self._geometry.teeth
-        followed = ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == thing + 1) & (cell.depth < limit)
+        followed = (
+            ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == thing + 1) & (cell.depth < limit)
+        )
         nearest = cell.corners[0][0] & 0xFFFF
         for corner in cell.corners[1:]:
             nearest = dr.minimum(nearest, corner[0] & 0xFFFF)
         # On a wall the first thing is the wall itself, as far as the grid can tell.
-        free = outside & (cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm)
+        free = outside & (
+            cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm
+        )
 
         dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
@@ -79,4 +91,11 @@ class MouthMaps(LightMaps):
         media = [medium, dr.select(thing < self._geometry.teeth, medium + 1, mi.UInt32(1))]
         surface = dr.select(outside, 1, cell.between(1, 16) * (1 / 65535))
         known = cell.inside & (followed | free)
-        return LightView(cell.direction, cell.falloff, tuple(media[: 1 + numbers.dentin]), tuple(lengths_mm[: 1 + numbers.dentin]), surface, known)
+        return LightView(
+            cell.direction,
+            cell.falloff,
+            tuple(media[: 1 + numbers.dentin]),
+            tuple(lengths_mm[: 1 + numbers.dentin]),
+            surface,
+            known,
+        )

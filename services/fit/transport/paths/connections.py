@@ -70,8 +70,17 @@ class Doubt:
 class Connections:
     """Connects vertices of one geometry under one plan."""
 
-    def __init__(self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, book: Scores, ior: mi.Float | None) -> None:
-        self.geometry, self.media, self.lights, self.plan, self.book, self.ior = geometry, media, lights, plan, book, ior
+    def __init__(
+        self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, book: Scores, ior: mi.Float | None
+    ) -> None:
+        self.geometry, self.media, self.lights, self.plan, self.book, self.ior = (
+            geometry,
+            media,
+            lights,
+            plan,
+            book,
+            ior,
+        )
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.turns = lights.turns
         """Steps of the walk per connection."""
@@ -109,14 +118,33 @@ class Connections:
             if isinstance(tally, StainTally):
                 tally.credit(lane, vertex.stains[0], kept.expected_sum[0], active)
                 ray_stains = [FaceCrossing.none(rng.next_float32())]
-                dr.if_stmt((vertex, lane, kept, weight, ray_stains, casts), casts, correct_stains, lambda *_: mi.Float(0), label="correction")
+                dr.if_stmt(
+                    (vertex, lane, kept, weight, ray_stains, casts),
+                    casts,
+                    correct_stains,
+                    lambda *_: mi.Float(0),
+                    label="correction",
+                )
             else:
-                dr.if_stmt((vertex, lane, kept, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction")
+                dr.if_stmt(
+                    (vertex, lane, kept, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction"
+                )
             return rng
 
-        def correct_stains(vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, stains: list[FaceCrossing], casts: mi.Bool) -> mi.Float:
+        def correct_stains(
+            vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, stains: list[FaceCrossing], casts: mi.Bool
+        ) -> mi.Float:
             assert isinstance(tally, StainTally)
-            ray = shadow(self.geometry, self.media, vertex.point, kept.direction, vertex.place, casts, thin_ior=self.ior, stains=stains)
+            ray = shadow(
+                self.geometry,
+                self.media,
+                vertex.point,
+                kept.direction,
+                vertex.place,
+                casts,
+                thin_ior=self.ior,
+                stains=stains,
+            )
             value = weight * tally.weight(lane, kept.light, casts)
             tally.credit(lane, vertex.stains[0], value * (ray.transmittance() - kept.expected), casts)
             tally.credit(lane, ray.stains[0], value * ray.transmittance(), casts)
@@ -127,13 +155,29 @@ class Connections:
                 self.geometry, self.media, vertex.point, kept.direction, vertex.place, casts,
                 measured=self.book.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
             )  # fmt: skip
-            self._count(vertex, lane, kept.light, kept.direction, weight * ray.transmittance(), ray.lengths, ray.border, casts, tally)
-            self._count(vertex, lane, kept.light, kept.direction, -weight * kept.expected, kept.lengths, None, casts, tally)
+            self._count(
+                vertex,
+                lane,
+                kept.light,
+                kept.direction,
+                weight * ray.transmittance(),
+                ray.lengths,
+                ray.border,
+                casts,
+                tally,
+            )
+            self._count(
+                vertex, lane, kept.light, kept.direction, -weight * kept.expected, kept.lengths, None, casts, tally
+            )
             return weight
 
-        return dr.if_stmt((vertex, lane, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection")
+        return dr.if_stmt(
+            (vertex, lane, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection"
+        )
 
-    def _look_around(self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> tuple[Doubt, mi.PCG32]:
+    def _look_around(
+        self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
+    ) -> tuple[Doubt, mi.PCG32]:
         """Count what the light maps expect from one light of every group, and keep one of these in proportion to the doubt about it."""
         maps, groups = self.lights.maps, self.lights.groups
         doubt = MAP_DOUBT if self.plan.shape is None and not self.plan.stains else 1.0
@@ -142,7 +186,9 @@ class Connections:
             group: mi.UInt32, rng: mi.PCG32, kept: Doubt, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
         ) -> tuple[mi.UInt32, mi.PCG32, Doubt, Vertex, mi.UInt32, mi.Bool]:
             u = rng.next_float32() if groups.size > 1 else mi.Float(0)
-            light, brightness = groups.choose(group, vertex.point, lambda direction: self._density(vertex, direction), u)
+            light, brightness = groups.choose(
+                group, vertex.point, lambda direction: self._density(vertex, direction), u
+            )
             seen = maps.look(light, vertex.point, vertex.place, active)
             # A vertex stands for all that were offered with it, and a light for its group.
             weight = vertex.total / dr.maximum(vertex.clear, 1e-30) * brightness
@@ -157,7 +203,9 @@ class Connections:
                 self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
             total = kept.total + importance
             take = rng.next_float32() * total < importance
-            kept = dr.select(take, Doubt(light, seen.direction, weight, expected, lengths, importance, total, expected_sum), kept)
+            kept = dr.select(
+                take, Doubt(light, seen.direction, weight, expected, lengths, importance, total, expected_sum), kept
+            )
             kept.total, kept.expected_sum = total, expected_sum
             return group + 1, rng, kept, vertex, lane, active
 
@@ -196,7 +244,9 @@ class Connections:
             tally.add_derivative(which, lane, slot, value * score, primary)
         border_sums = vertex.border_sums
         if isinstance(medium, Mixed) and self.plan.shape is not None:
-            change = self.book.mixed_motion(medium, PhaseFunction(self.media, medium).scores(LOBE_FIELDS, vertex.omega, direction))
+            change = self.book.mixed_motion(
+                medium, PhaseFunction(self.media, medium).scores(LOBE_FIELDS, vertex.omega, direction)
+            )
             motion = self.geometry.mixture_motion(vertex.point, self.plan.shape, active)
             border_sums = [dr.fma(change, rate, total) for rate, total in zip(motion, border_sums, strict=True)]
         for mode in range(self.modes):

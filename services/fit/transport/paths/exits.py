@@ -28,16 +28,22 @@ class Exits:
 
     def __init__(self, geometry: SlabGeometry, media: Media, plan: Plan, ior: mi.Float | None, first_slot: int) -> None:
         self.geometry, self.media, self.plan, self.ior = geometry, media, plan, ior
-        self.cosines, self.edges_mm = (mi.Float(np.array(values, dtype=np.float32)) for values in (plan.exit_cosines, plan.ring_edges_mm))
+        self.cosines, self.edges_mm = (
+            mi.Float(np.array(values, dtype=np.float32)) for values in (plan.exit_cosines, plan.ring_edges_mm)
+        )
         dr.eval(self.cosines, self.edges_mm)
         self._first_cosine, self._first_ring = first_slot, first_slot + 2 * len(plan.exit_cosines)
         self.slots = 2 * (len(plan.exit_cosines) + plan.rings)
 
-    def count_ring(self, walker: Walker, order: mi.UInt32, hit: Hit, face: mi.UInt32, value: mi.Float, tally: Tally) -> None:
+    def count_ring(
+        self, walker: Walker, order: mi.UInt32, hit: Hit, face: mi.UInt32, value: mi.Float, tally: Tally
+    ) -> None:
         """Count light that leaves ahead, having scattered ``order`` times, in the ring of its exit point."""
         if not self.plan.rings:
             return
-        radius = dr.hypot(dr.fma(walker.omega.x, hit.distance, walker.origin.x), dr.fma(walker.omega.y, hit.distance, walker.origin.y))
+        radius = dr.hypot(
+            dr.fma(walker.omega.x, hit.distance, walker.origin.x), dr.fma(walker.omega.y, hit.distance, walker.origin.y)
+        )
         ring = mi.UInt32(0)
         for edge in range(len(self.plan.ring_edges_mm)):
             ring += dr.select(radius >= dr.gather(mi.Float, self.edges_mm, edge), mi.UInt32(1), mi.UInt32(0))
@@ -78,8 +84,23 @@ class Exits:
             tally.add(lane, slot + 1, strength * dr.fma(sent[0], back, sent[1]), active)
             return which + 1, omega, across, begin, end, flown, scattered, lane, active
 
-        state = (mi.UInt32(0), walker.omega, mi.Vector2f(azimuth[1], azimuth[0]), begin, end, flown, scattered, walker.lane, active)
-        dr.while_loop(state, lambda which, *others: others[-1] & (which < len(self.plan.exit_cosines)), step, label="every exit cosine")
+        state = (
+            mi.UInt32(0),
+            walker.omega,
+            mi.Vector2f(azimuth[1], azimuth[0]),
+            begin,
+            end,
+            flown,
+            scattered,
+            walker.lane,
+            active,
+        )
+        dr.while_loop(
+            state,
+            lambda which, *others: others[-1] & (which < len(self.plan.exit_cosines)),
+            step,
+            label="every exit cosine",
+        )
 
     def _face(self, cosine: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Cosine inside, solid angle times cosine outside over that inside, reflectance."""

@@ -64,7 +64,9 @@ class Scores:
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
         for s in plan.scores:
             if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
-                raise InputError(f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives.")
+                raise InputError(
+                    f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives."
+                )
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
         # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
         self.mixing = mixing
@@ -85,8 +87,15 @@ class Scores:
         """One more in each active lane."""
         if isinstance(medium, Mixed):
             log_alpha = -minus_log1m(dr.minimum(self.media.pick(self.media.absorbed, medium), NEARLY_ONE))
-            return Scatterings([], [so_far.others[0] + dr.select(active, log_alpha, 0)], [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)])
-        counts = [dr.select(active & (medium == k), count + 1, count) for k, count in zip(self.counted, so_far.counts, strict=True)]
+            return Scatterings(
+                [],
+                [so_far.others[0] + dr.select(active, log_alpha, 0)],
+                [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)],
+            )
+        counts = [
+            dr.select(active & (medium == k), count + 1, count)
+            for k, count in zip(self.counted, so_far.counts, strict=True)
+        ]
         if self.counts_all:
             return Scatterings(counts, [], [])
         elsewhere = active
@@ -114,7 +123,11 @@ class Scores:
     def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
         """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
         return [
-            dr.select(medium == s.medium, total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length, total)
+            dr.select(
+                medium == s.medium,
+                total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length,
+                total,
+            )
             if s.field == "sigma"
             else total
             for s, total in zip(self.plan.scores, sums, strict=True)
@@ -142,7 +155,9 @@ class Scores:
         less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
         return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
 
-    def turn(self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool) -> list[mi.Float]:
+    def turn(
+        self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool
+    ) -> list[mi.Float]:
         """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
         if isinstance(medium, Mixed):
             return [
@@ -155,7 +170,12 @@ class Scores:
         ]
 
     def complete(
-        self, sums: list[mi.Float], so_far: Scatterings, medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], lengths: dict[int, mi.Float]
+        self,
+        sums: list[mi.Float],
+        so_far: Scatterings,
+        medium: mi.UInt32 | Mixed,
+        terms: dict[str, mi.Float],
+        lengths: dict[int, mi.Float],
     ) -> list[mi.Float]:
         """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
         whole = []
@@ -166,7 +186,11 @@ class Scores:
             elif s.field == "sigma":
                 value = total - lengths.get(s.medium, mi.Float(0))
             elif s.field in terms:
-                own = medium.share_of(s.medium) * terms[s.field] if isinstance(medium, Mixed) else dr.select(medium == s.medium, terms[s.field], 0)
+                own = (
+                    medium.share_of(s.medium) * terms[s.field]
+                    if isinstance(medium, Mixed)
+                    else dr.select(medium == s.medium, terms[s.field], 0)
+                )
                 value = total + own
             whole.append(value)
         return whole

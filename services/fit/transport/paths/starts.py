@@ -82,7 +82,13 @@ class LightStart:
     """
 
     def __init__(
-        self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64], batches: int, lanes_per_group: int, seed: int
+        self,
+        positions_mm: NDArray[np.float64],
+        intensities: NDArray[np.float64],
+        outer_mm: NDArray[np.float64],
+        batches: int,
+        lanes_per_group: int,
+        seed: int,
     ) -> None:
         """Take lights (L, 3) and (L,), and all vertices of the tooth."""
         self.count, self.batches, self.lanes_per_group = len(positions_mm), batches, lanes_per_group
@@ -117,7 +123,10 @@ class LightStart:
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
         """A photon on its way to a random point of its light's rectangle."""
         rng, first = stream(self.seed, lane, sample), self.group(lane) // self._batches * 14
-        forward, right, up, corner = (mi.Vector3f(*(dr.gather(mi.Float, self._frames, first + 3 * k + axis, active) for axis in range(3))) for k in range(4))
+        forward, right, up, corner = (
+            mi.Vector3f(*(dr.gather(mi.Float, self._frames, first + 3 * k + axis, active) for axis in range(3)))
+            for k in range(4)
+        )
         distance, before = (dr.gather(mi.Float, self._frames, first + k, active) for k in (12, 13))
         across = corner + right * rng.next_float32() + up * rng.next_float32()
         squared = dr.squared_norm(across)

@@ -26,7 +26,9 @@ class Tally:
 
     def add_derivative(self, which: int, lane: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
         """Add to a derivative's sum."""
-        dr.scatter_add(self.derivatives[which], mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter_add(
+            self.derivatives[which], mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts
+        )
 
     def evaluate(self) -> None:
         """Run the kernel without holding the interpreter: a worker's heartbeat goes on."""

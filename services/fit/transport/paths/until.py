@@ -46,15 +46,21 @@ class Effort:
 
     def __post_init__(self) -> None:
         if (self.samples is None) == (self.rel_error is None):
-            raise InputError(f"samples = {self.samples} and rel_error = {self.rel_error}: give exactly one, a number of paths per pixel or an error to reach.")
+            raise InputError(
+                f"samples = {self.samples} and rel_error = {self.rel_error}: give exactly one, a number of paths per pixel or an error to reach."
+            )
         if self.samples is not None and (self.samples < 1 or self.batches < 1):
-            raise InputError(f"samples = {self.samples} and batches = {self.batches} must be at least 1; ask for one path per pixel or more.")
+            raise InputError(
+                f"samples = {self.samples} and batches = {self.batches} must be at least 1; ask for one path per pixel or more."
+            )
         if self.rel_error is None:
             return
         if not 0 < self.rel_error < 1:
             raise InputError(f"rel_error = {self.rel_error:g} must lie between 0 and 1; 0.01 is usual.")
         if self.batches < 2:
-            raise InputError(f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between batches.")
+            raise InputError(
+                f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between batches."
+            )
         if not self.max_seconds >= 0 or not self.batches <= self.max_samples <= MAX_SAMPLES:
             raise InputError(
                 f"max_seconds = {self.max_seconds:g} must not be negative, and max_samples = {self.max_samples} must lie in "
@@ -102,5 +108,7 @@ def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums],
         following = max(1, min(math.ceil(min(wanted, affordable)), most - done))
 
 
-def _summary(summarise: Callable[[Sums], Estimate], totals: Sums, count: int, batches: int, *, complete: bool) -> Estimate:
+def _summary(
+    summarise: Callable[[Sums], Estimate], totals: Sums, count: int, batches: int, *, complete: bool
+) -> Estimate:
     return replace(summarise([total / count for total in totals]), samples=count * batches, complete=complete)

@@ -31,7 +31,13 @@ class Walk:
     """The walk through one geometry under one plan. ``run`` is the only door."""
 
     def __init__(
-        self, geometry: Geometry, media: Media, lights: PointLights | None, start: CameraStart | LightStart | SlabStart, plan: Plan, ior: float | None
+        self,
+        geometry: Geometry,
+        media: Media,
+        lights: PointLights | None,
+        start: CameraStart | LightStart | SlabStart,
+        plan: Plan,
+        ior: float | None,
     ) -> None:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
@@ -84,7 +90,9 @@ class Walk:
             sample=mi.UInt32(0),
             active=lane < dr.opaque(mi.UInt32, self.start.lanes),
         )
-        (walker,) = dr.while_loop((walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk")
+        (walker,) = dr.while_loop(
+            (walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk"
+        )
         if self.connections is not None:
             self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
 
@@ -121,7 +129,9 @@ class Walk:
         reflects = mi.Bool(False)
         if self.ior is not None:
             # A thin face lets the camera's own ray in where its mirror image would be of empty space, and reflects others by chance.
-            contrast = self.geometry.contrast(self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit))
+            contrast = self.geometry.contrast(
+                self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit)
+            )
             mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
             reflects = meets & hit.outer & ~hit.opaque
             entry = self._unmirrored(walker, medium)
@@ -142,7 +152,9 @@ class Walk:
         leaving = hit.valid & hit.outer
         through = mi.Float(1)
         if self.ior is not None:
-            through = 1 - fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), dr.rcp(self.ior) if self.plan.bend else self.ior)
+            through = 1 - fresnel.reflectance(
+                dr.abs(dr.dot(walker.omega, hit.normal)), dr.rcp(self.ior) if self.plan.bend else self.ior
+            )
 
         # Count the share that leaves through an outer face.
         collides = one_minus_exp(sigma * hit.distance)
@@ -153,12 +165,16 @@ class Walk:
         tally.add(walker.lane, face, value, primary)
         if self.exits is not None:
             self.exits.count_ring(walker, self.book.order(walker.so_far), hit, face, value, tally)
-            self.exits.connect(walker, hit, sigma, carried * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally)
+            self.exits.connect(
+                walker, hit, sigma, carried * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally
+            )
         for which, score in enumerate(self.book.complete(walker.sums, walker.so_far, mi.UInt32(0), {}, lengths)):
             tally.add_derivative(which, walker.lane, face, value * score, primary)
         for mode in range(self.modes):
             factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode])
-            tally.add_derivative(len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving)
+            tally.add_derivative(
+                len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving
+            )
 
         # The rest collides before the face or is reflected by it.
         remains = dr.select(leaving, collides + (1 - collides) * (1 - through), 1)
@@ -169,8 +185,12 @@ class Walk:
         first = scatters & (self.book.order(walker.so_far) == 0) & ~walker.secondary
         walker.weight *= remains
         # Judged by what one scattering leaves of it, single scattering survives at any albedo.
-        walker.reference = dr.select(first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference)
-        return Flight(medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False))
+        walker.reference = dr.select(
+            first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference
+        )
+        return Flight(
+            medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False)
+        )
 
     def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
         hit, omega = flight.hit, walker.omega
@@ -183,17 +203,32 @@ class Walk:
             # Score the border's transmittance change, and offer the crossing for the scattering change.
             shifts = [speed * inverse_cosine(cosine) for speed in self.geometry.velocity(hit, self.plan.shape, crosses)]
             jump = dr.select(crosses, self.media.extinction(self.geometry.medium(behind)) - flight.sigma, 0)
-            walker.border_sums = [dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)]
+            walker.border_sums = [
+                dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)
+            ]
             at_border = crosses & ~hit.outer & ~walker.secondary
             walker.kept = offer(
-                walker.kept, dr.fma(omega, hit.distance, walker.origin), omega, hit, walker.place, behind, carried, shifts, walker.rng.next_float32(), at_border
+                walker.kept,
+                dr.fma(omega, hit.distance, walker.origin),
+                omega,
+                hit,
+                walker.place,
+                behind,
+                carried,
+                shifts,
+                walker.rng.next_float32(),
+                at_border,
             )
         if self.geometry.stained:
             stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
             walker.weight *= self.geometry.stain(hit, stained)
             walker.stains = [kept.offer(hit, stained) for kept in walker.stains]
         reached = self.geometry.advance(walker.origin, omega, hit, crosses)
-        walker.origin = dr.select(flight.scatters, dr.fma(omega, flight.distance, walker.origin), dr.select(flight.meets, reached, walker.origin))
+        walker.origin = dr.select(
+            flight.scatters,
+            dr.fma(omega, flight.distance, walker.origin),
+            dr.select(flight.meets, reached, walker.origin),
+        )
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
         walker.place = dr.select(crosses, behind, walker.place)
         scattered_in: mi.UInt32 | Mixed = flight.medium
@@ -210,15 +245,24 @@ class Walk:
         mixed = self.geometry.mixed(walker.origin, walker.place, flight.scatters)
         if self.geometry.opaque:
             wall = mi.UInt32(self.media.count)
-            mixed.first, mixed.second = dr.select(flight.bounces, wall, mixed.first), dr.select(flight.bounces, wall, mixed.second)
-            mixed.share, mixed.slope = dr.select(flight.bounces, 1, mixed.share), dr.select(flight.bounces, 0, mixed.slope)
+            mixed.first, mixed.second = (
+                dr.select(flight.bounces, wall, mixed.first),
+                dr.select(flight.bounces, wall, mixed.second),
+            )
+            mixed.share, mixed.slope = (
+                dr.select(flight.bounces, 1, mixed.share),
+                dr.select(flight.bounces, 0, mixed.slope),
+            )
         return mixed
 
     def _score_mixture(self, walker: Walker, change: mi.Float, active: mi.Bool) -> None:
         """Score what the border's motion changes in the mixture where a lane scatters, per mm of its distance."""
         if self.plan.shape is not None:
             motion = self.geometry.mixture_motion(walker.origin, self.plan.shape, active)
-            walker.border_sums = [total + dr.select(active, change * rate, 0) for total, rate in zip(walker.border_sums, motion, strict=True)]
+            walker.border_sums = [
+                total + dr.select(active, change * rate, 0)
+                for total, rate in zip(walker.border_sums, motion, strict=True)
+            ]
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
         assert self.connections is not None
@@ -231,7 +275,9 @@ class Walk:
             walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums, walker.border_sums, walker.secondary,
             walker.shape_factor, wall, walker.stains, mi.Float(0),
         )  # fmt: skip
-        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces)
+        walker.vertex = self.connections.offer(
+            walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces
+        )
         walker.turn += 1
         due = walker.active & (walker.turn == self.connections.turns) & (walker.vertex.total > 0)
         walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
@@ -244,11 +290,17 @@ class Walk:
         u_lobe = rng.next_float32() if self.media.two_lobes else None
         u, v = rng.next_float32(), rng.next_float32()
         onward = phase.sample(walker.omega, u_lobe, u, v)
-        walker.sums = self.book.turn(walker.sums, medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters)
+        walker.sums = self.book.turn(
+            walker.sums, medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters
+        )
         if isinstance(medium, Mixed) and self.plan.shape is not None:
-            self._score_mixture(walker, self.book.mixed_motion(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters)
+            self._score_mixture(
+                walker, self.book.mixed_motion(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters
+            )
         if self.geometry.opaque:
-            diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))
+            diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
+                mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
+            )
             walker.omega = dr.select(flight.bounces, diffuse, walker.omega)
         walker.omega = dr.select(flight.scatters, onward, walker.omega)
 
@@ -309,7 +361,18 @@ class Walk:
             return walker
 
         walker_after = dr.if_stmt((walker, begins), begins, begin, lambda walker, _: walker, label="secondary walk")
-        for field in ("rng", "origin", "omega", "place", "weight", "reference", "so_far", "steps", "secondary", "shape_factor"):
+        for field in (
+            "rng",
+            "origin",
+            "omega",
+            "place",
+            "weight",
+            "reference",
+            "so_far",
+            "steps",
+            "secondary",
+            "shape_factor",
+        ):
             setattr(walker, field, getattr(walker_after, field))
         return (ended & ~begins) | (begins & (walker.weight == 0))
 

@@ -26,10 +26,14 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
         raise InputError("The scene has no light; list at least one with a position and an intensity.")
     for number, (position, intensity) in enumerate(zip(positions_mm, intensities, strict=True)):
         if not np.isfinite(position).all():
-            raise InputError(f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's calibration.")
+            raise InputError(
+                f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's calibration."
+            )
         if not INTENSITIES[0] <= intensity <= INTENSITIES[1]:
             low, high = INTENSITIES
-            raise InputError(f"Light {number} has intensity = {intensity:g}, which must lie in {low:g} to {high:g}; correct the rig's calibration.")
+            raise InputError(
+                f"Light {number} has intensity = {intensity:g}, which must lie in {low:g} to {high:g}; correct the rig's calibration."
+            )
         if np.linalg.norm(position) > FARTHEST_MM:
             raise InputError(
                 f"Light {number} is {np.linalg.norm(position):.3g} mm away, farther than single precision can follow; "
@@ -70,17 +74,28 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     name, lights = view.camera.name, len(recipe.light_positions_mm)
     pose = np.asarray(view.camera.camera_from_world)
     eye_mm = -pose[:3, :3].T @ pose[:3, 3]
-    if any((eye_mm >= tooth.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= tooth.outer.vertices_mm.max(axis=0)).all() for tooth in recipe.teeth):
+    if any(
+        (eye_mm >= tooth.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= tooth.outer.vertices_mm.max(axis=0)).all()
+        for tooth in recipe.teeth
+    ):
         where = ", ".join(f"{c:.4g}" for c in eye_mm)
-        raise InputError(f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as the meshes are.")
+        raise InputError(
+            f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as the meshes are."
+        )
     if len(view) == 0:
         raise InputError(f"Camera {name} lists no pixel; its valid mask is empty.")
     outside = ((view.pixels < 0) | (view.pixels >= view.camera.size)).any(axis=1)
     if outside.any():
         x, y = view.pixels[outside][0]
-        raise InputError(f"Camera {name} lists pixel ({x}, {y}), outside its {view.camera.size[0]} x {view.camera.size[1]}; correct the list.")
-    if view.lights is not None and not (view.lights and set(view.lights) <= set(range(lights)) and len(set(view.lights)) == len(view.lights)):
-        raise InputError(f"Camera {name} lists lights = {view.lights}; they must be different indices below {lights}, at least one.")
+        raise InputError(
+            f"Camera {name} lists pixel ({x}, {y}), outside its {view.camera.size[0]} x {view.camera.size[1]}; correct the list."
+        )
+    if view.lights is not None and not (
+        view.lights and set(view.lights) <= set(range(lights)) and len(set(view.lights)) == len(view.lights)
+    ):
+        raise InputError(
+            f"Camera {name} lists lights = {view.lights}; they must be different indices below {lights}, at least one."
+        )
 
 
 def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneRecipe) -> None:
@@ -91,7 +106,9 @@ def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneR
     """
     expected = len(recipe.light_positions_mm), len(view)
     if np.shape(cotangent) != expected:
-        raise InputError(f"The cotangent has shape {np.shape(cotangent)}; give a weight for each of {expected[0]} lights and {expected[1]} pixels, {expected}.")
+        raise InputError(
+            f"The cotangent has shape {np.shape(cotangent)}; give a weight for each of {expected[0]} lights and {expected[1]} pixels, {expected}."
+        )
     bad = np.argwhere(~np.isfinite(cotangent))
     if len(bad):
         raise InputError(
@@ -107,7 +124,9 @@ def require_finite_gradient(what: str, view: View, *arrays: NDArray[np.float64])
     """
     bad = sum(int((~np.isfinite(array)).sum()) for array in arrays)
     if bad:
-        raise NonFiniteError(f"{bad} numbers of the gradient to {what} by camera {view.camera.name} came out non-finite; report the parameters.")
+        raise NonFiniteError(
+            f"{bad} numbers of the gradient to {what} by camera {view.camera.name} came out non-finite; report the parameters."
+        )
 
 
 def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:

@@ -28,7 +28,9 @@ MARGIN_MM = 1.5
 """Of several inner surfaces each is measured so far around its box, and taken to be just as far from all other places."""
 
 
-def surface_samples(vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float) -> NDArray[np.float64]:
+def surface_samples(
+    vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float
+) -> NDArray[np.float64]:
     """Points on every triangle, none of whose points is farther than the spacing from one of them."""
     corners = vertices_mm[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -54,7 +56,12 @@ class _Measured:
 class Clearance:
     """Lower bound of the distance to any surface, inside solids."""
 
-    def __init__(self, outer_vertices_mm: NDArray[np.float64], outer_faces: NDArray[np.int32], solids_mm: NDArray[np.float64] | None = None) -> None:
+    def __init__(
+        self,
+        outer_vertices_mm: NDArray[np.float64],
+        outer_faces: NDArray[np.int32],
+        solids_mm: NDArray[np.float64] | None = None,
+    ) -> None:
         """Take the surfaces that never move, and the solids' vertices (V, 3) where not all of those bound one."""
         solids_mm = outer_vertices_mm if solids_mm is None else solids_mm
         low, extent = solids_mm.min(axis=0), np.ptp(solids_mm, axis=0)
@@ -71,10 +78,17 @@ class Clearance:
         bound = self._outer.copy() if len(surfaces) == 1 else np.minimum(self._outer, MARGIN_MM - REBUILD_MM)
         for k, surface in enumerate(surfaces):
             known = self._inner.get(k)
-            moved = np.inf if known is None else float(np.linalg.norm(surface.vertices_mm - known.vertices_mm, axis=1).max())
+            moved = (
+                np.inf
+                if known is None
+                else float(np.linalg.norm(surface.vertices_mm - known.vertices_mm, axis=1).max())
+            )
             if known is None or moved > REBUILD_MM:
                 window = self._window(surface.vertices_mm if len(surfaces) > 1 else None)
-                known, moved = _Measured(surface.vertices_mm, window, self._distance(surface.vertices_mm, surface.faces, window)), 0.0
+                known, moved = (
+                    _Measured(surface.vertices_mm, window, self._distance(surface.vertices_mm, surface.faces, window)),
+                    0.0,
+                )
                 self._inner[k] = known
             bound[known.window] = np.minimum(bound[known.window], known.bound - moved)
         self._upload(bound)
@@ -85,13 +99,19 @@ class Clearance:
             return tuple(slice(0, int(count)) for count in self._shape)
         low = np.floor((vertices_mm.min(axis=0) - MARGIN_MM - self._corner) / self._cell_mm).astype(int)
         high = np.ceil((vertices_mm.max(axis=0) + MARGIN_MM - self._corner) / self._cell_mm).astype(int) + 1
-        return tuple(slice(max(int(a), 0), max(int(b), 0)) for a, b in zip(low, np.minimum(high, self._shape), strict=True))
+        return tuple(
+            slice(max(int(a), 0), max(int(b), 0)) for a, b in zip(low, np.minimum(high, self._shape), strict=True)
+        )
 
-    def _distance(self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]) -> NDArray[np.float64]:
+    def _distance(
+        self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]
+    ) -> NDArray[np.float64]:
         first = np.array([one.start for one in window])
         empty = np.ones([max(one.stop - one.start, 0) for one in window], dtype=bool)
         spacing = SPACING_PER_CELL * self._cell_mm
-        cells = np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int) - first
+        cells = (
+            np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int) - first
+        )
         kept = ((cells >= 0) & (cells < empty.shape)).all(axis=1)
         empty[tuple(cells[kept].T)] = False
         if empty.all():

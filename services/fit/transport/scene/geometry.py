@@ -108,7 +108,10 @@ class SlabGeometry:
         for thickness in thicknesses_mm:
             depths.append(depths[-1] + thickness)
         self.layers = len(thicknesses_mm)
-        self._planes = [mi.Float(depth.astype(np.float32)) if isinstance(depth, np.ndarray) else dr.opaque(mi.Float, depth) for depth in depths]
+        self._planes = [
+            mi.Float(depth.astype(np.float32)) if isinstance(depth, np.ndarray) else dr.opaque(mi.Float, depth)
+            for depth in depths
+        ]
         self.modes_of: tuple[int, ...] = (int(moving_border),)
 
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
@@ -120,7 +123,16 @@ class SlabGeometry:
         distance = dr.maximum((target - origin.z) / direction.z, 0)
         distance = dr.select(active & (direction.z != 0), distance, dr.inf)
         outer = dr.select(down, place == self.layers, place == 1)
-        return Hit(distance, active & dr.isfinite(distance), mi.Normal3f(0, 0, 1), outer, mi.Bool(False), mi.UInt32(0), place, mi.Point2f(0))
+        return Hit(
+            distance,
+            active & dr.isfinite(distance),
+            mi.Normal3f(0, 0, 1),
+            outer,
+            mi.Bool(False),
+            mi.UInt32(0),
+            place,
+            mi.Point2f(0),
+        )
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - planes are as cheap to hit
         """Not used: hitting a plane costs as little."""

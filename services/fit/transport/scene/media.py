@@ -84,7 +84,9 @@ class Media:
 
         def opaque(value: Callable[[Medium], float]) -> list[mi.Float]:
             return [
-                dr.opaque(mi.Float, value(entry)) if isinstance(entry, Medium) else mi.Float(np.array([value(m) for m in entry], dtype=np.float32))
+                dr.opaque(mi.Float, value(entry))
+                if isinstance(entry, Medium)
+                else mi.Float(np.array([value(m) for m in entry], dtype=np.float32))
                 for entry in media
             ]
 

@@ -50,13 +50,20 @@ class MeshGeometry:
         self._dentins: dict[int, DentinShape] = {k: dentin for k, dentin in enumerate(dentins) if dentin is not None}
         meshes = [*fixed.values(), *(dentin.base for dentin in self._dentins.values())]
         first = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in meshes])
-        self._faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first, strict=False)]).astype(np.uint32)
+        self._faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first, strict=False)]).astype(
+            np.uint32
+        )
         self._fixed_mm = np.concatenate([mesh.vertices_mm for mesh in fixed.values()])
         self.fixed_faces = sum(len(mesh.faces) for mesh in fixed.values())
         numbers = [*fixed, *(self.teeth + k for k in self._dentins)]
         self._surface = mi.UInt32(np.repeat(numbers, [len(mesh.faces) for mesh in meshes]).astype(np.uint32))
 
-        solids_mm = np.concatenate([mesh.vertices_mm for mesh in (*(tooth.outer for tooth in recipe.teeth), *([recipe.gums] if recipe.gums else []))])
+        solids_mm = np.concatenate(
+            [
+                mesh.vertices_mm
+                for mesh in (*(tooth.outer for tooth in recipe.teeth), *([recipe.gums] if recipe.gums else []))
+            ]
+        )
         self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32), solids_mm)
         self.mixing = recipe.border_width_mm > 0 and bool(self._dentins)
         self._border = MixedBorder(recipe.border_width_mm) if self.mixing else None
@@ -73,7 +80,12 @@ class MeshGeometry:
         moved = [dentin.vertices_mm(shapes[k]) for k, dentin in self._dentins.items()]
         points = np.concatenate([self._fixed_mm, *moved])
         if moved:
-            self._clearance.move_inner([Mesh(vertices, dentin.base.faces) for vertices, dentin in zip(moved, self._dentins.values(), strict=True)])
+            self._clearance.move_inner(
+                [
+                    Mesh(vertices, dentin.base.faces)
+                    for vertices, dentin in zip(moved, self._dentins.values(), strict=True)
+                ]
+            )
         if self._border is not None:
             self._border.move(*self._dentin_now(moved))
         positions = mi.Float(points.reshape(-1).astype(np.float32))
@@ -91,7 +103,9 @@ class MeshGeometry:
         corners = points[self._faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals = mi.Float(np.ascontiguousarray((normals / np.maximum(lengths, 1e-30)).reshape(-1), dtype=np.float32))
+        self._normals = mi.Float(
+            np.ascontiguousarray((normals / np.maximum(lengths, 1e-30)).reshape(-1), dtype=np.float32)
+        )
         dr.eval(self._normals)
         changed, self._shapes = self._shapes is not None, shapes
         return changed
@@ -100,7 +114,9 @@ class MeshGeometry:
         """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a tooth's modes move its own alone."""
         first = np.cumsum([0] + [len(vertices) for vertices in moved])
         dentins = list(self._dentins.values())
-        faces = np.concatenate([dentin.base.faces + offset for dentin, offset in zip(dentins, first, strict=False)]).astype(np.int32)
+        faces = np.concatenate(
+            [dentin.base.faces + offset for dentin, offset in zip(dentins, first, strict=False)]
+        ).astype(np.int32)
         modes = np.zeros((max(self.modes_of), first[-1], 3))
         for dentin, start in zip(dentins, first, strict=False):
             modes[: len(dentin.modes_mm), start : start + len(dentin.base.vertices_mm)] = dentin.modes_mm
@@ -115,7 +131,10 @@ class MeshGeometry:
         share, slope = self._border.share(point, active & in_tooth)
         pure = mi.Float(1)
         return Mixed(
-            dr.select(in_tooth, enamel, medium), dr.select(in_tooth, enamel + 1, medium), dr.select(in_tooth, share, pure), dr.select(in_tooth, slope, 0)
+            dr.select(in_tooth, enamel, medium),
+            dr.select(in_tooth, enamel + 1, medium),
+            dr.select(in_tooth, share, pure),
+            dr.select(in_tooth, slope, 0),
         )
 
     def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
@@ -135,7 +154,10 @@ class MeshGeometry:
         self._stains, self.textures = stains, None
         if any(stain is not None for stain in stains):
             teeth = self.recipe.teeth
-            corners = [np.zeros((len(tooth.outer.faces), 3, 2)) if tooth.stain_uv is None else tooth.stain_uv for tooth in teeth]
+            corners = [
+                np.zeros((len(tooth.outer.faces), 3, 2)) if tooth.stain_uv is None else tooth.stain_uv
+                for tooth in teeth
+            ]
             self.textures = StainTextures(corners, stains)
         return True
 
@@ -165,7 +187,9 @@ class MeshGeometry:
         tables = []
         for mode in range(max(self.modes_of, default=0)):
             parts = [
-                (dentin.modes_mm[mode] if mode < len(dentin.modes_mm) else np.zeros_like(dentin.base.vertices_mm))[dentin.base.faces]
+                (dentin.modes_mm[mode] if mode < len(dentin.modes_mm) else np.zeros_like(dentin.base.vertices_mm))[
+                    dentin.base.faces
+                ]
                 for dentin in self._dentins.values()
             ]
             tables.append(mi.Float(np.ascontiguousarray(np.concatenate(parts).reshape(-1), dtype=np.float32)))
@@ -180,7 +204,9 @@ class MeshGeometry:
         outer = found.prim_index < self.fixed_faces if self._dentins else mi.Bool(True)
         surface = mi.UInt32(0) if self.single else dr.gather(mi.UInt32, self._surface, found.prim_index, valid)
         opaque = valid & (surface == 2 * self.teeth + 1) if self.opaque else mi.Bool(False)
-        return Hit(dr.select(valid, found.t, dr.inf), valid, normal, outer, opaque, surface, found.prim_index, found.prim_uv)
+        return Hit(
+            dr.select(valid, found.t, dr.inf), valid, normal, outer, opaque, surface, found.prim_index, found.prim_uv
+        )
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Distance within which no surface lies."""
@@ -192,7 +218,11 @@ class MeshGeometry:
         if self._dentins:
             dentin = (place >> self.teeth) & (2**self.teeth - 1)
             within = dr.select(dentin != 0, dentin, within)
-        return dr.select(within != 0, dr.tzcnt(within), dr.select((place >> (2 * self.teeth)) != 0, mi.UInt32(self.teeth), mi.UInt32(self.teeth + 1)))
+        return dr.select(
+            within != 0,
+            dr.tzcnt(within),
+            dr.select((place >> (2 * self.teeth)) != 0, mi.UInt32(self.teeth), mi.UInt32(self.teeth + 1)),
+        )
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Dentin over enamel over gums over air, whatever surfaces overlap."""
@@ -203,7 +233,9 @@ class MeshGeometry:
         enamel = tooth * (1 + numbers.dentin) + 1
         in_dentin = ((place >> self.teeth) & (2**self.teeth - 1)) != 0
         of_tooth = dr.select(in_dentin, enamel + 1, enamel) if self._dentins else enamel
-        return dr.select(tooth < self.teeth, of_tooth, dr.select(tooth == self.teeth, mi.UInt32(numbers.of_gums), mi.UInt32(0)))
+        return dr.select(
+            tooth < self.teeth, of_tooth, dr.select(tooth == self.teeth, mi.UInt32(numbers.of_gums), mi.UInt32(0))
+        )
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Entering sets the surface's bit and leaving clears it, so a missed hit heals at the next."""
@@ -245,4 +277,6 @@ class MeshGeometry:
 
 def _alike(one: Stain | None, other: Stain | None) -> bool:
     # By value, because a stain that travelled between processes is another object.
-    return one is other or (one is not None and other is not None and np.array_equal(one.transmittance, other.transmittance))
+    return one is other or (
+        one is not None and other is not None and np.array_equal(one.transmittance, other.transmittance)
+    )

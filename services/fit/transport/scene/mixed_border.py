@@ -79,7 +79,9 @@ def _texture(values: NDArray[np.float64]) -> mi.Texture3f:
     return mi.Texture3f(mi.TensorXf(values[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp)
 
 
-def _speeds(dentin: Mesh, modes_mm: Array, points: Array, nearest: Array, distance: Array, face: NDArray[np.int64]) -> list[Array]:
+def _speeds(
+    dentin: Mesh, modes_mm: Array, points: Array, nearest: Array, distance: Array, face: NDArray[np.int64]
+) -> list[Array]:
     """How fast q changes, -(gradient of q) . displacement of the closest surface point, a row of points per mode."""
     if len(modes_mm) == 0:
         return []

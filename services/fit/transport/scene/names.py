@@ -48,7 +48,12 @@ class Parameter:
 
 def media_numbers(recipe: SceneRecipe) -> MediaNumbers:
     """How the scene's media are numbered."""
-    return MediaNumbers(len(recipe.teeth), any(tooth.dentin is not None for tooth in recipe.teeth), recipe.gums is not None, recipe.cavity is not None)
+    return MediaNumbers(
+        len(recipe.teeth),
+        any(tooth.dentin is not None for tooth in recipe.teeth),
+        recipe.gums is not None,
+        recipe.cavity is not None,
+    )
 
 
 def parameter_names(recipe: SceneRecipe) -> dict[str, Parameter]:
@@ -78,7 +83,9 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
 
     numbers, media = media_numbers(recipe), []
     if len(mouth.teeth) != len(recipe.teeth):
-        raise InputError(f"Tissues of {len(mouth.teeth)} teeth were given for a scene of {len(recipe.teeth)}; give one for each.")
+        raise InputError(
+            f"Tissues of {len(mouth.teeth)} teeth were given for a scene of {len(recipe.teeth)}; give one for each."
+        )
     for k, (tissue, tooth) in enumerate(zip(mouth.teeth, recipe.teeth, strict=True)):
         prefix = "" if len(recipe.teeth) == 1 else f"{k}."
         require_medium(f"{prefix}enamel", tissue.enamel)
@@ -90,10 +97,14 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)
         # A solver's step that ends on a bound may be off by a rounding.
         if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
-            raise InputError(f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it.")
+            raise InputError(
+                f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it."
+            )
         require_stain(f"{prefix}stain", tissue.stain, tooth)
     if (mouth.gums is None) == numbers.gums:
-        raise InputError(f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither.")
+        raise InputError(
+            f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither."
+        )
     if mouth.gums is not None:
         require_medium("gums", mouth.gums)
         media.append(mouth.gums)
@@ -106,7 +117,9 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
             raise InputError(f"cavity.reflectance = {mouth.reflectance:.10g} must lie in 0 to 1; correct it.")
         media.append(Medium(1.0, mouth.reflectance))
     if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
-        raise InputError(f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes.")
+        raise InputError(
+            f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes."
+        )
     return media
 
 
@@ -120,15 +133,21 @@ def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
         return
     texels = stain.transmittance
     if tooth.stain_uv is None:
-        raise InputError(f"{name} is given for a tooth without texture coordinates; give its surface stain_uv, or leave the texture out.")
+        raise InputError(
+            f"{name} is given for a tooth without texture coordinates; give its surface stain_uv, or leave the texture out."
+        )
     if tooth.stain_uv.shape != (len(tooth.outer.faces), 3, 2) or not np.isfinite(tooth.stain_uv).all():
-        raise InputError(f"{name}'s coordinates have shape {tooth.stain_uv.shape}; they must be finite and ({len(tooth.outer.faces)}, 3, 2), one per corner.")
+        raise InputError(
+            f"{name}'s coordinates have shape {tooth.stain_uv.shape}; they must be finite and ({len(tooth.outer.faces)}, 3, 2), one per corner."
+        )
     if texels.ndim != 2 or texels.size == 0:
         raise InputError(f"{name} has shape {texels.shape}; it must be one channel, (H, W).")
     bad = ~((texels > 0) & (texels <= 1))
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise InputError(f"{name}[{row}, {column}] = {texels[row, column]:.10g} must be above 0 and at most 1; correct {int(bad.sum())} texels.")
+        raise InputError(
+            f"{name}[{row}, {column}] = {texels[row, column]:.10g} must be above 0 and at most 1; correct {int(bad.sum())} texels."
+        )
 
 
 def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:

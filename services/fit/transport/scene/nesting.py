@@ -36,7 +36,9 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
         )
     touching = int(np.count_nonzero(distance < gap_mm))
     if touching:
-        raise MeshError(f"The dentin surface touches the outer surface at {touching} of {len(points)} vertices; move it at least {gap_mm:.2g} mm inside.")
+        raise MeshError(
+            f"The dentin surface touches the outer surface at {touching} of {len(points)} vertices; move it at least {gap_mm:.2g} mm inside."
+        )
 
 
 def winding_number(mesh: Mesh, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -46,6 +48,11 @@ def winding_number(mesh: Mesh, points_mm: NDArray[np.float64]) -> NDArray[np.flo
         a, b, c = (mesh.vertices_mm[mesh.faces[:, corner]] - point for corner in range(3))
         la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
         volume = np.einsum("ij,ij->i", a, np.cross(b, c))
-        scale = la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la + np.einsum("ij,ij->i", c, a) * lb
+        scale = (
+            la * lb * lc
+            + np.einsum("ij,ij->i", a, b) * lc
+            + np.einsum("ij,ij->i", b, c) * la
+            + np.einsum("ij,ij->i", c, a) * lb
+        )
         winding[k] = np.arctan2(volume, scale).sum() / (2 * np.pi)
     return winding

@@ -48,7 +48,10 @@ class SceneRecipe:
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""
-        meshes = [*(tooth.outer for tooth in self.teeth), *(mesh for mesh in (self.gums, self.cavity) if mesh is not None)]
+        meshes = [
+            *(tooth.outer for tooth in self.teeth),
+            *(mesh for mesh in (self.gums, self.cavity) if mesh is not None),
+        ]
         return np.concatenate([mesh.vertices_mm for mesh in meshes])
 
 
