@@ -11,10 +11,10 @@ from typing import Annotated, Literal, NoReturn
 
 import typer
 
-from services.core.dask_config import as_environment
 from services.core.errors import SettingsError
 from services.core.files.private import PRIVATE
 from services.core.placement import DOME, STAGES, UNLIMITED
+from services.pipeline.dask_config import as_environment
 
 _ADDRESS = re.compile(r"([a-z]+://)?[^-\s][^\s]*:\d+")
 _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}

@@ -16,7 +16,8 @@ import typer
 from services.cli.arguments import JobFile, Json, Workers
 
 if TYPE_CHECKING:
-    from services.core.records import AssetManifest, JobSpec
+    from services.core.records import JobSpec
+    from services.core.results import AssetManifest
     from services.core.stage import StageName
 
 

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from services.core.records import Verdict
+from services.core.results import Verdict
 from services.core.verdict import NOT_CONVERGED_STATUS
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from services.core.errors import CorruptStoreError
-from services.core.records import AssetManifest, Estimate
+from services.core.results import AssetManifest, Estimate
 from services.core.store import open_stage
 
 PARAMETERS = "parameters.json"

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Literal
 
-from services.core.records import Figure, FitReport, Verdict
+from services.core.results import Figure, FitReport, Verdict
 
 MAX_ERROR = 0.15
 """Relative error on the fitted or on the held-out images of a channel above which a fit is not called converged,

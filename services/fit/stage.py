@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from services.core.choices import chosen
 from services.core.geometry import Mesh
 from services.core.installed import require_packages
-from services.core.records import AssetManifest, FitReport, JobSpec, PreparedManifest, ToothReport
+from services.core.records import JobSpec, PreparedManifest
+from services.core.results import AssetManifest, FitReport, ToothReport
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 from services.core.verdict import VERDICT, verdict_of

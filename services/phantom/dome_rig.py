@@ -69,6 +69,5 @@ def _framed(name: str, pose: NDArray[np.float64], pixel_mm: float, meshes: tuple
     low, high = np.floor(image.min(axis=0)) - MARGIN_PX, np.ceil(image.max(axis=0)) + MARGIN_PX
     width, height = (int(extent) for extent in high - low)
     K = ((focal, 0.0, float(-low[0])), (0.0, focal, float(-low[1])), (0.0, 0.0, 1.0))
-    return Camera(
-        name=name, size=(width, height), K=K, camera_from_world=tuple(tuple(float(v) for v in row) for row in pose)
-    )  # type: ignore[arg-type]
+    camera_from_world = tuple(tuple(float(v) for v in row) for row in pose)
+    return Camera(name=name, size=(width, height), K=K, camera_from_world=camera_from_world)  # type: ignore[arg-type]

@@ -15,32 +15,24 @@ same workers and secedes from its own slot meanwhile.
 from __future__ import annotations
 
 import fcntl
-import importlib
-import secrets
-import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from services.core.errors import (
     CorruptStoreError,
     InputError,
-    JobCancelledError,
     MissingStageError,
-    PlatformError,
     SchedulerLostError,
-    WorkerLostError,
 )
-from services.core.events import JobEvent
 from services.core.job_kinds import job_kinds
 from services.core.masks import is_stale
-from services.core.placement import DOME, STAGES, rank
-from services.core.records import LIMITS_OF_A_RIG, AssetManifest, JobSpec
-from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent, StageName
+from services.core.records import LIMITS_OF_A_RIG, JobSpec
+from services.core.results import AssetManifest
+from services.core.stage import CANCEL_FLAG, StageName
 from services.core.store import (
     is_published,
     open_stage,
@@ -50,30 +42,17 @@ from services.core.store import (
     withdraw,
     write_record,
 )
-from services.pipeline.database import patiently
-from services.pipeline.event_log import EventAddress, EventLog, folder_events
-from services.pipeline.machine_class import machine_class
+from services.pipeline.event_log import EventAddress, folder_events
+from services.pipeline.following import Listener, Watch, follow_stage
+from services.pipeline.stage_task import PUBLISHED_AS, StageTask
 from services.pipeline.workers import Workers
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
-
-Listener = Callable[[JobEvent], None]
 
 JOB_FILE = "job.json"
 DAMAGE_FLAG = ".damaged"
 """In a job's folder: a stage found another one's published files damaged, so the next run looks for what it must make anew."""
-POLL_S = 0.25
-KEEP_S = 10.0
-"""How often workers that were given up are started again."""
-GRACE_S = 5.0
-"""How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
 
 DOORS: Mapping[StageName, str] = MappingProxyType({})
 """``module:function`` of stages that are entered elsewhere than a job's kind says."""
-_PUBLISHED_AS = {"phantom": "phantom", "capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
-_EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
-"""What to install where a stage runs."""
 
 
 def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
@@ -84,7 +63,7 @@ def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
 
 def first_stage(spec: JobSpec, root: Path) -> StageName | None:
     """The first stage of a job that is not published yet; None where all are."""
-    return next((stage for stage in stages_of(spec) if not is_published(root, _PUBLISHED_AS[stage])), None)
+    return next((stage for stage in stages_of(spec) if not is_published(root, PUBLISHED_AS[stage])), None)
 
 
 def run_job(
@@ -156,9 +135,9 @@ def run_stages(
         if "prepare" in stages and is_stale(root):
             _withdraw_prepared(root)
         address = events or folder_events(root)
-        todo = tuple(stage for stage in stages if again or not is_published(root, _PUBLISHED_AS[stage]))
+        todo = tuple(stage for stage in stages if again or not is_published(root, PUBLISHED_AS[stage]))
         with address.open() as log:
-            watch = _Watch(log, listener, log.newest_id())
+            watch = Watch(log, listener, log.newest_id())
             if todo:
                 entered = {**job_kinds()[spec.kind].doors, **doors}
                 tasks = [
@@ -176,7 +155,7 @@ def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None)
     """The options as a stage sees them: the demonstration's mouth is where such mouths are kept, and then the one made for this job."""
     if spec.rig is None or not spec.is_demo:
         return spec
-    mouth = (phantoms or spec.rig.mouth) if stage == "phantom" else root / _PUBLISHED_AS["phantom"]
+    mouth = (phantoms or spec.rig.mouth) if stage == "phantom" else root / PUBLISHED_AS["phantom"]
     return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": mouth})})
 
 
@@ -190,86 +169,12 @@ def withdraw_cancel(root: Path) -> None:
     (root / CANCEL_FLAG).unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class StageTask:
-    """What a worker needs to run one stage."""
-
-    stage: StageName
-    door: str
-    spec: JobSpec
-    root: Path
-    events: EventAddress
-    again: bool = False
-    is_logged: bool = False
-
-    def __call__(self) -> str:
-        """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
-        folder = _PUBLISHED_AS[self.stage]
-        if is_published(self.root, folder) and not self.again:
-            return self.stage
-        with self.events.open() as log:
-            lease = self.root / f"{folder}.lease"
-            known, machine = int(lease.read_text()) if lease.exists() else 0, machine_class()
-            attempt = patiently(lambda: log.begin_stage(self.stage, known, machine))
-            told: set[str] = set()
-
-            def tell(event: StageEvent) -> None:
-                if event.kind != "started":  # begin_stage has recorded it
-                    patiently(lambda: log.append(attempt, event))
-                told.add(event.kind)
-                write_line(event)
-
-            with self._logs(attempt) as write_line:
-                context = LocalContext(self.root, attempt, tell)
-                context.raise_if_cancelled()
-                module, function = self.door.split(":")
-                with telling_disk_faults(self.root), _telling_a_missing_package(self.stage):
-                    getattr(importlib.import_module(module), function)(self.spec, context)
-                if "finished" not in told:
-                    tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
-        return self.stage
-
-    def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
-        """The worker's log lines, or silence."""
-        if not self.is_logged:
-            return nullcontext(lambda _event: None)
-        from services.pipeline.logs import stage_logs
-
-        return stage_logs(self.stage, attempt, self.events)
-
-
-@contextmanager
-def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as problem:
-        if (problem.name or "services").partition(".")[0] == "services":
-            raise
-        extra = _EXTRAS[stage]
-        what = f"Stage {stage} needs {problem.name}, which its workers do not have; install dentine[{extra}] where they run, then retry the job."
-        raise PlatformError(what) from problem
-
-
-class _Watch:
-    """Passes new rows of the event table to the listener."""
-
-    def __init__(self, log: EventLog, listener: Listener | None, after: int) -> None:
-        self._log, self._listener, self._after = log, listener, after
-
-    def tell(self) -> None:
-        while new := patiently(lambda: self._log.read(self._after)):
-            for event in new:
-                if self._listener is not None:
-                    self._listener(event)
-            self._after = new[-1].id
-
-
 def _go_on() -> None:
     """Nothing keeps the next stage."""
 
 
 def _run_tasks(
-    processes: Workers, count: int, tasks: list[StageTask], watch: _Watch, before: Callable[[], None]
+    processes: Workers, count: int, tasks: list[StageTask], watch: Watch, before: Callable[[], None]
 ) -> None:
     """Submit each stage once the one before has ended, follow its events, and raise what it raises."""
     from distributed.comm import CommClosedError
@@ -279,67 +184,11 @@ def _run_tasks(
             for task in tasks:
                 if task.stage != "capture":
                     before()
-                _follow_stage(client, processes.keep, task, watch)
+                follow_stage(client, processes.keep, task, watch)
     except (CancelledError, CommClosedError) as problem:
         raise SchedulerLostError(
             "The workers' scheduler went away; the job goes on from what it had published once it answers again."
         ) from problem
-
-
-def _follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: _Watch) -> None:
-    from distributed import KilledWorker
-
-    key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
-    needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
-    stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
-    flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
-    has_ended = False
-    while not has_ended:
-        has_ended = _has_ended(stage)
-        watch.tell()
-        if time.monotonic() > keep_at:
-            keep_workers()
-            keep_at = time.monotonic() + KEEP_S
-        if give_up_at is None and flag.exists():
-            give_up_at = time.monotonic() + GRACE_S
-        # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
-        if not has_ended and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
-            _stop_workers_of(client, key)
-            raise JobCancelledError(
-                "The job was cancelled on request; its workers were stopped, and what it had published is kept."
-            )
-    try:
-        if stage.status != "finished":
-            stage.result()
-    except KilledWorker as problem:
-        raise WorkerLostError(
-            f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
-            {"stage": task.stage, "deaths": problem.allowed_failures + 1},
-        ) from problem
-
-
-def _has_ended(stage: Future) -> bool:
-    """Whether a task has failed, or its result is here; asks for ``POLL_S`` at most.
-
-    A task that has finished has not ended before that: its worker may die with the result, and then the task runs again.
-    """
-    from distributed import wait
-
-    try:
-        wait([stage], timeout=POLL_S)
-        if stage.status == "finished":
-            stage.result(timeout=POLL_S)
-    except TimeoutError:
-        return False
-    return True
-
-
-def _stop_workers_of(client: Client, stage: str) -> None:
-    # Those that hold the stage or tasks that it has made, whose keys begin with its own. Each is started again, and what
-    # another job had there runs again.
-    busy = [worker for worker, keys in client.processing().items() if any(str(key).startswith(stage) for key in keys)]
-    with suppress(TimeoutError):
-        client.restart_workers(busy, timeout=GRACE_S)
 
 
 @contextmanager

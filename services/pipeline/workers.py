@@ -11,9 +11,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import urlsplit
 
-from services.core.dask_config import DASK_CONFIG
 from services.core.errors import PlatformError, SchedulerLostError
 from services.core.placement import DOME, STAGES, UNLIMITED
+from services.pipeline.dask_config import DASK_CONFIG
 from services.pipeline.dask_tls import Certificates, scheduler_address
 from services.pipeline.garbage_collection import leave_alone_what_is_loaded
 from services.pipeline.worker_check import OwnCheck

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.fits.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.checks.thickness import thickness_image

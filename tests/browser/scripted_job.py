@@ -11,7 +11,8 @@ import numpy as np
 from playwright.sync_api import Page
 
 from services.core.errors import DentineError
-from services.core.records import Estimate, JobSpec, Verdict
+from services.core.records import JobSpec
+from services.core.results import Estimate, Verdict
 from services.core.stage import StageEvent
 from services.core.verdict import VERDICT
 from services.pipeline.event_log import EventAddress

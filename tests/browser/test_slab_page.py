@@ -38,7 +38,8 @@ def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
             log.append(fit, StageEvent(stage="fit", kind="progress", done=number / 2, message=message, data=data))
         log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged."))
         export = log.begin_stage("export")
-        row = '{"sigma_s": {"value": 1.204, "se": 0.008, "unit": "1/mm", "determined": true}, "g": {"value": 0.61, "se": 0.2, "unit": "1", "determined": false}}'  # noqa: E501
+        sigma = '"sigma_s": {"value": 1.204, "se": 0.008, "unit": "1/mm", "determined": true}'
+        row = f'{{{sigma}, "g": {{"value": 0.61, "se": 0.2, "unit": "1", "determined": false}}}}'
         (folder / "parameters.json").write_text("{" + ", ".join(f'"{nm}": {row}' for nm in WAVELENGTHS_NM) + "}")
         p = hg_values(0.6)
         told = tuple(bool(angle > 0.12) for angle in ANGLES_RAD)

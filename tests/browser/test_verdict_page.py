@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, expect
 
 from services.api.app import create_app
 from services.api.jobs.admission import Machine
-from services.core.records import Estimate, FitReport
+from services.core.results import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of
 from services.fit.export.report import _spread

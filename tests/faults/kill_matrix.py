@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from services.core.errors import StoreError
-from services.core.records import AssetManifest
+from services.core.results import AssetManifest
 from services.core.store import open_stage
 from tests.faults.strikes import FAULTS, Held
 from tests.support.small_system import SmallSystem, small_system

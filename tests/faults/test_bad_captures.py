@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.fit.stage import export, run
 from services.phantom.tooth import write_phantom

@@ -14,7 +14,8 @@ import dask
 import pytest
 from distributed import Client, LocalCluster
 
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.execution.executors import DaskExecutor

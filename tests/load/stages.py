@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.stage import StageContext, StageEvent, StageName
 from tests.support import toy_stages
 

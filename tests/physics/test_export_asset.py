@@ -16,7 +16,8 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
-from services.core.records import Boundary, Estimate, FitReport
+from services.core.records import Boundary
+from services.core.results import Estimate, FitReport
 from services.fit.export.asset import tissue_of, write_asset
 from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
 from services.fit.inputs.stain_uv import ToothStains, stain_layout

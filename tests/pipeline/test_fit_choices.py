@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.fit.execution.journal import read_entries
 from services.fit.stage import run

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.stage import run

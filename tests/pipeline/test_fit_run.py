@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.core.errors import CaptureInputError, DentineError, JobCancelledError, MissingStageError, SettingsError
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.core.verdict import VERDICT, verdict_of

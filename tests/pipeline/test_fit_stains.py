@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from services.core.files.meshes import read_mesh
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.fit.execution.journal import read_entries
 from services.fit.export.stains import kept_stains

@@ -26,7 +26,8 @@ from services.core.records import JobSpec, MaskBit
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
 from services.pipeline.event_log import EventAddress
-from services.pipeline.stages import StageTask, run_stages
+from services.pipeline.stage_task import StageTask
+from services.pipeline.stages import run_stages
 from services.preprocess import stage
 from tests.support import toy_stages
 from tests.support.live_server import serving

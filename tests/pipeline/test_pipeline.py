@@ -22,7 +22,8 @@ from services.core.records import JobSpec, RigSpec
 from services.core.stage import StageEvent
 from services.core.store import is_published
 from services.pipeline.event_log import folder_events
-from services.pipeline.stages import StageTask, request_cancel, run_job, stages_of, withdraw_cancel
+from services.pipeline.stage_task import StageTask
+from services.pipeline.stages import request_cancel, run_job, stages_of, withdraw_cancel
 from tests.support.toy_stages import DOORS
 
 RIG = JobSpec(rig=RigSpec(mouth=Path("/mouth")), workers=2)
@@ -94,7 +95,7 @@ def test_cancel_waits_until_the_dome_is_dark(tmp_path: Path) -> None:
 
 
 def test_cancel_frees_workers_that_do_not_listen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.pipeline.stages.GRACE_S", 0.5)
+    monkeypatch.setattr("services.pipeline.following.GRACE_S", 0.5)
     (tmp_path / "deaf-fit").touch()
     with pytest.raises(JobCancelledError):
         run(FOLDER, tmp_path, lambda event: request_cancel(tmp_path) if event.stage == "fit" else None)

@@ -14,7 +14,8 @@ import pytest
 
 from services.api.presets import find_preset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.settings import job_from_tree
 from services.core.slab_folder import SlabFolder
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent

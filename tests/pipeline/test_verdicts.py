@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from services.api.app import create_app
 from services.cli.app import build_app
-from services.core.records import AssetManifest, FitReport, JobSpec, Verdict
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, FitReport, Verdict
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from services.core.verdict import NOT_CONVERGED_STATUS, VERDICT, verdict_of

@@ -7,7 +7,8 @@ import time
 from pathlib import Path
 
 from services.core.placement import WEIGHTS
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.stage import CANCEL_FLAG, StageContext
 from services.fit.execution.executors import executor
 from tests.support import toy_stages

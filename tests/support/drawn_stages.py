@@ -5,7 +5,8 @@ from __future__ import annotations
 import random
 import time
 
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.stage import StageContext, StageEvent, StageName
 from services.core.store import StageWriter
 

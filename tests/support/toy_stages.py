@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 from services.core.errors import CaptureInputError, JobCancelledError
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.stage import StageContext, StageEvent, StageName
 from services.core.store import StageWriter, require_intact
 

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 
-from services.core.dask_config import DASK_CONFIG, as_environment
+from services.pipeline.dask_config import DASK_CONFIG, as_environment
 
 ASK = "import dask, distributed, json, sys; print(json.dumps([dask.config.get(name) for name in sys.argv[1:]]))"
 

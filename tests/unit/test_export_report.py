@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.records import Correlation, Estimate, FitReport
+from services.core.results import Correlation, Estimate, FitReport
 from services.fit.checks.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
 from services.fit.export.pictures import Picture

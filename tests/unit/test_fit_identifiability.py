@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.core.records import Correlation, Estimate
+from services.core.results import Correlation, Estimate
 from services.fit.checks.identifiability import correlation, told
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty

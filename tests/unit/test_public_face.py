@@ -10,7 +10,7 @@ import pytest
 
 import dentine
 from services.core.errors import CorruptStoreError, MissingStageError
-from services.core.records import AssetManifest, Estimate
+from services.core.results import AssetManifest, Estimate
 from services.core.store import StageWriter, write_atomic
 
 HEAVY = ("sqlalchemy", "fastapi", "dask", "distributed", "cv2", "mitsuba", "drjit", "zarr", "pymodbus", "scipy")

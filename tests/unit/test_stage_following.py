@@ -13,6 +13,8 @@ from services.core.records import JobSpec
 from services.core.stage import StageName
 from services.pipeline import stages
 from services.pipeline.event_log import EventAddress
+from services.pipeline.following import follow_stage
+from services.pipeline.stage_task import StageTask
 
 SPEC = JobSpec(capture=Path("/mouth"))
 
@@ -40,11 +42,11 @@ def follow(monkeypatch: pytest.MonkeyPatch, folder: Path, task: Task, stage: Sta
             raise TimeoutError
 
     monkeypatch.setattr("distributed.wait", wait)
-    monkeypatch.setattr("services.pipeline.stages.GRACE_S", 0.0)
+    monkeypatch.setattr("services.pipeline.following.GRACE_S", 0.0)
     client: Any = SimpleNamespace(submit=lambda *_, **__: task, processing=dict, restart_workers=lambda *_, **__: None)
     watch: Any = SimpleNamespace(tell=lambda: None)
-    described = stages.StageTask(stage, "door", SPEC, folder, EventAddress("sqlite://", "job"))
-    stages._follow_stage(client, lambda: None, described, watch)
+    described = StageTask(stage, "door", SPEC, folder, EventAddress("sqlite://", "job"))
+    follow_stage(client, lambda: None, described, watch)
 
 
 def test_a_task_that_no_worker_takes_on_is_given_up_after_a_cancel(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.records import Estimate, Figure, FitReport
+from services.core.results import Estimate, Figure, FitReport
 from services.core.verdict import MAX_ERROR, mean_figure, percent, verdict_of
 
 

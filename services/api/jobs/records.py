@@ -12,7 +12,8 @@ from services.api.jobs.server_paths import without_folders
 from services.core.errors import DentineError
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP, Viewer
-from services.core.records import JobName, JobSpec, Verdict
+from services.core.records import JobName, JobSpec
+from services.core.results import Verdict
 from services.core.stage import StageName
 
 

@@ -15,7 +15,7 @@ from pydantic_core import from_json
 
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Job
-from services.core.records import Verdict
+from services.core.results import Verdict
 from services.core.verdict import VERDICT
 from services.pipeline.event_log import event_table
 

@@ -18,7 +18,8 @@ from services.bench.figures.fitted import Fitted
 from services.bench.figures.surroundings import seen_under
 from services.bench.fits.tooth_capture import tissue_of
 from services.core.files.meshes import read_mesh
-from services.core.records import FitReport, FolderCapture
+from services.core.records import FolderCapture
+from services.core.results import FitReport
 from services.core.store import read_record
 from services.phantom.reflection import ROUGHNESS
 

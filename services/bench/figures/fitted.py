@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.bench.figures.cases import job_of
 from services.bench.fits.tooth_capture import tissue_of
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.store import open_stage
 from services.fit.checks.evaluate import ErrorSums, error_sums
 from services.fit.export.asset import mouth_of

@@ -53,9 +53,8 @@ def mosaic(
             f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name for each; correct it."
         )
     heights = [scale * max((image.shape[0] for image in row if image is not None), default=1) for row in rows]
-    widths = [
-        scale * max((row[k].shape[1] for row in rows if row[k] is not None), default=1) for k in range(len(columns))
-    ]  # type: ignore[union-attr]
+    by_column = [[image for row in rows if (image := row[k]) is not None] for k in range(len(columns))]
+    widths = [scale * max((image.shape[1] for image in images), default=1) for images in by_column]
     font = ImageFont.load_default(FONT_PX)
     label_px = GAP_PX + int(max((font.getlength(name) for name in names), default=0))
     lefts, x = list[int](), label_px + GAP_PX

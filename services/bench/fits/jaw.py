@@ -21,7 +21,8 @@ import numpy as np
 
 from services.bench import Row
 from services.bench.fits.tooth_capture import CHANNEL, PreparedTooth, prepare, write_photograph
-from services.core.records import FitReport, FolderCapture, JobSpec
+from services.core.records import FolderCapture, JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, read_record
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue

@@ -16,11 +16,12 @@ from typing import Any
 
 from services.bench import Row
 from services.bench.fits.tooth_capture import prepare
-from services.core.dask_config import DASK_CONFIG
 from services.core.errors import InputError
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
+from services.pipeline.dask_config import DASK_CONFIG
 
 PIXEL_MM, CAMERAS, LIGHTS, SAMPLES = 0.064, 3, 54, 64
 CACHE = Path(".cache")

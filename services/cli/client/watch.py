@@ -42,7 +42,7 @@ def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
         raise typer.Exit(failure["exit_status"])
     if (verdict := job["verdict"]) is not None:
         from services.cli.verdict import require_converged
-        from services.core.records import Verdict
+        from services.core.results import Verdict
 
         require_converged(Verdict.model_validate(verdict))
 

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from services.core.records import Correlation, Estimate
+from services.core.results import Correlation, Estimate
 from services.fit.solve.covariance import Uncertainty
 
 NOTHING = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."

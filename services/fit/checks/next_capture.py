@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera
-from services.core.records import Estimate
+from services.core.results import Estimate
 from services.fit.checks.identifiability import QUANTITIES, in_words
 from services.fit.execution.blocks import (
     Block,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Camera, Mesh
-from services.core.records import Estimate
+from services.core.results import Estimate
 from services.fit.transport.rays import RayScene, pixel_rays
 
 MIN_STEP = 0.01

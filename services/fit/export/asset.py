@@ -22,7 +22,8 @@ from typing import Any
 
 from services.core.files.meshes import write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
-from services.core.records import Boundary, Estimate, FitReport
+from services.core.records import Boundary
+from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic
 from services.core.verdict import VERDICT, verdict_of
 from services.fit.export.mitsuba_scene import nested_scene

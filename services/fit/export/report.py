@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Correlation, Estimate, Figure, FitReport, ToothReport
+from services.core.results import Correlation, Estimate, Figure, FitReport, ToothReport
 from services.core.store import write_atomic
 from services.core.verdict import mean_figure, percent, verdict_of
 from services.fit.checks.thickness import ThicknessMap

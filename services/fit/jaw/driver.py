@@ -12,7 +12,8 @@ from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
 from services.core.geometry import Camera, Tooth
 from services.core.job_kinds import job_kinds
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.fit.execution.attempt import Attempt
 from services.fit.execution.blocks import GUMS
 from services.fit.execution.executors import Executor

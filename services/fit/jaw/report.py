@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
-from services.core.records import Estimate, FitReport, ToothReport
+from services.core.results import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.alignment import offsets_told
 from services.fit.checks.evaluate import ErrorSums, Evaluation

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from services.core.errors import CaptureInputError, JobCancelledError
 from services.core.placement import WEIGHTS
-from services.core.records import AssetManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
 from services.core.slab_folder import SlabFolder, read_folder
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record

@@ -24,7 +24,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Estimate
+from services.core.results import Estimate
 from services.fit.optics.domain import UNITS, Domain, kind_of, natural_derivative
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, Response, response

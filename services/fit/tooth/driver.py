@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
-from services.core.records import FitReport, JobSpec
+from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.fit.checks.alignment import offsets_told
 from services.fit.checks.identifiability import NOTHING, correlation, told
 from services.fit.checks.thickness import ThicknessMap, thickness_map

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import Estimate, Figure, Verdict
+from services.core.results import Estimate, Figure, Verdict
 from services.core.store import write_atomic
 from services.core.verdict import percent
 from services.fit.export.pictures import DIVERGING, data_uri, enlarge, signed_map, tone_map, white_level

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from services.core.geometry import Record
-from services.core.records import FitReport, Verdict
+from services.core.results import FitReport, Verdict
 from services.core.verdict import verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
 from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes

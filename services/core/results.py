@@ -1,0 +1,127 @@
+"""What a fit has found, as records: estimates with their ±, the report, the verdict and the exported asset."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from services.core.geometry import Record, Vector3
+
+
+class Estimate(Record):
+    """A number with its unit and uncertainty. Undetermined numbers are flagged, never bare."""
+
+    value: float
+    se: float | None = Field(description="one standard error; null where the parameter was not fitted")
+    unit: str = Field(description="'1' for dimensionless")
+    determined: bool = Field(description="whether the data fixes this number")
+
+
+class ToothReport(Record):
+    """One tooth of a jaw."""
+
+    state: Literal["fitted", "tied", "failed"] = Field(
+        description="from its own pixels; held near other teeth for lack of them; or its own fit raised"
+    )
+    sentence: str = Field(description="why it is tied or failed, or what is wrong with it; may be empty")
+    told: str = Field(default="", description="in plain words, what the capture tells of it and what it cannot")
+    pixels: int = Field(description="pixels that show it and enter the fit, over all views")
+    parameters: dict[str, dict[str, Estimate]] = Field(description="per channel, as in FitReport")
+    fit_error: dict[str, float] = Field(description="per channel, on its pixels; absent where none was fitted")
+    held_out_error: dict[str, float] = Field(description="per channel, on its pixels")
+    shape: tuple[float, ...] = Field(
+        default=(), description="dentin's blend weights, all channels alike; empty where the dentin is known or absent"
+    )
+    enamel_thickness: Estimate | None = Field(
+        default=None,
+        description="mean over what the first camera sees of the tooth; null if nothing, or without dentin",
+    )
+
+
+class Correlation(Record):
+    """How errors go together, between -1 and 1."""
+
+    names: tuple[str, ...] = Field(
+        description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)"
+    )
+    matrix: tuple[tuple[float, ...], ...]
+
+
+class FitReport(Record):
+    """Published by the fit stage, and as parameters.json and errors.json by export."""
+
+    converged: bool
+    advice: str = Field(description="what to do when it did not converge, or for a better answer; may be empty")
+    parameters: dict[str, dict[str, Estimate]] = Field(
+        description="per channel: name -> estimate, derived quantities included"
+    )
+    fit_error: dict[str, float] = Field(description="per channel: relative image error on fitted images")
+    held_out_error: dict[str, float] = Field(description="per channel: relative image error on held-out images")
+    fit_error_se: dict[str, float] = Field(
+        default={}, description="per channel: standard error of fit_error by the renders' noise"
+    )
+    held_out_error_se: dict[str, float] = Field(default={}, description="per channel: the same of held_out_error")
+    steps: int
+    shape: tuple[float, ...] = Field(default=(), description="dentin blend weights, in the order of anatomy's modes")
+    shape_covariance: tuple[tuple[float, ...], ...] = Field(
+        default=(), description="of the blend weights; empty where they were not fitted"
+    )
+    enamel_thickness: Estimate | None = Field(
+        default=None,
+        description="mean over what the first camera sees of the tooth; null if nothing, or without dentin",
+    )
+    teeth: dict[str, ToothReport] = Field(
+        default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone"
+    )
+    correlations: dict[str, Correlation] = Field(
+        default={}, description="per channel: correlation of the fitted coordinates"
+    )
+    told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
+    notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
+    next_capture: str = Field(
+        default="",
+        description="in plain words, which further light or view would help most; empty where none was looked for",
+    )
+    seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
+
+
+class Figure(Record):
+    """A relative image error with what rendering leaves open of it."""
+
+    value: float = Field(description="relative image error, 0.05 for 5 %")
+    se: float | None = Field(description="one standard error by the renders' noise; null where it is not known")
+
+
+class Verdict(Record):
+    """How well a fit went, in the numbers that its report leads with."""
+
+    headline: str = Field(description="one sentence, the worst first")
+    converged: bool = Field(description="whether the numbers are those of a fit that ended where it should")
+    is_above_limit: bool = Field(
+        description="whether an image error, fitted or held out, of some channel is above the limit"
+    )
+    limit: float = Field(description="relative image error above which no fit is called converged")
+    error_of: Literal["held-out", "fitted"] = Field(
+        description="which images the errors are of; fitted ones where none was held out"
+    )
+    error: Figure = Field(description="mean over the channels")
+    channels: dict[str, Figure] = Field(description="by channel")
+    enamel_thickness: Estimate | None = Field(
+        description="of a single tooth, mean over what the first camera sees; null without dentin and of a jaw"
+    )
+    steps: int
+    advice: str = Field(description="what to do where it did not converge, or for a better answer; may be empty")
+
+
+class AssetManifest(Record):
+    """Published by the export stage."""
+
+    files: tuple[str, ...]
+    held_out_error: float = Field(description="mean over channels")
+    converged: bool = Field(default=True, description="whether the fit behind it did")
+    advice: str = Field(default="", description="what to do where it did not")
+    verdict: Verdict | None = Field(
+        default=None, description="how well the fit went; null where an earlier version exported it"
+    )
+    centre_mm: Vector3 = (0.0, 0.0, 0.0)

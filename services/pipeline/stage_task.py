@@ -1,0 +1,82 @@
+"""One stage of a job, as the task that a worker runs."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.core.errors import PlatformError
+from services.core.records import JobSpec
+from services.core.stage import LocalContext, StageEvent, StageName
+from services.core.store import is_published, telling_disk_faults
+from services.pipeline.database import patiently
+from services.pipeline.event_log import EventAddress
+from services.pipeline.machine_class import machine_class
+
+PUBLISHED_AS = {"phantom": "phantom", "capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
+"""Folder of what each stage publishes, in the job's."""
+_EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
+"""What to install where a stage runs."""
+
+
+@dataclass(frozen=True)
+class StageTask:
+    """What a worker needs to run one stage."""
+
+    stage: StageName
+    door: str
+    spec: JobSpec
+    root: Path
+    events: EventAddress
+    again: bool = False
+    is_logged: bool = False
+
+    def __call__(self) -> str:
+        """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
+        folder = PUBLISHED_AS[self.stage]
+        if is_published(self.root, folder) and not self.again:
+            return self.stage
+        with self.events.open() as log:
+            lease = self.root / f"{folder}.lease"
+            known, machine = int(lease.read_text()) if lease.exists() else 0, machine_class()
+            attempt = patiently(lambda: log.begin_stage(self.stage, known, machine))
+            told: set[str] = set()
+
+            def tell(event: StageEvent) -> None:
+                if event.kind != "started":  # begin_stage has recorded it
+                    patiently(lambda: log.append(attempt, event))
+                told.add(event.kind)
+                write_line(event)
+
+            with self._logs(attempt) as write_line:
+                context = LocalContext(self.root, attempt, tell)
+                context.raise_if_cancelled()
+                module, function = self.door.split(":")
+                with telling_disk_faults(self.root), _telling_a_missing_package(self.stage):
+                    getattr(importlib.import_module(module), function)(self.spec, context)
+                if "finished" not in told:
+                    tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
+        return self.stage
+
+    def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
+        """The worker's log lines, or silence."""
+        if not self.is_logged:
+            return nullcontext(lambda _event: None)
+        from services.pipeline.logs import stage_logs
+
+        return stage_logs(self.stage, attempt, self.events)
+
+
+@contextmanager
+def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as problem:
+        if (problem.name or "services").partition(".")[0] == "services":
+            raise
+        extra = _EXTRAS[stage]
+        what = f"Stage {stage} needs {problem.name}, which its workers do not have; install dentine[{extra}] where they run, then retry the job."
+        raise PlatformError(what) from problem
