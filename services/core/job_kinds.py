@@ -69,8 +69,8 @@ JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
 @cache
 def job_kinds() -> Mapping[str, JobKind]:
     """All kinds that this process knows: this package's, which nobody replaces, and those of installed packages."""
-    added = {point.name: point.load() for point in entry_points(group=ENTRY_POINTS)}
-    return MappingProxyType({**added, **JOB_KINDS})
+    added = {point.name: point.load() for point in entry_points(group=ENTRY_POINTS) if point.name not in JOB_KINDS}
+    return MappingProxyType({**JOB_KINDS, **added})
 
 
 def known_kind(name: str) -> str:
@@ -80,7 +80,7 @@ def known_kind(name: str) -> str:
         ValueError: there is no such kind; the message lists those that there are.
     """
     if name not in job_kinds():
-        raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(sorted(job_kinds()))}")
+        raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(job_kinds())}")
     return name
 
 

@@ -116,7 +116,7 @@ def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(
                 "uploads.Uploads.begin",
                 "captures.Captures.commit",
             ):
-                monkeypatch.setattr(f"services.api.{place}", hanging)
+                monkeypatch.setattr(place, hanging)
             monkeypatch.setattr("services.api.jobs.jobs.Jobs.capturing", lambda _: [])
             with occupy(str(client.base_url), job):
                 wait_until(lambda: hanging.begun >= sum(POOLS))
@@ -212,34 +212,34 @@ def test_a_body_of_many_faults_is_refused_at_its_first_ones(
 MANIFEST = {"files": [{"path": f"{number}.png", "bytes": 1, "sha256": "0" * 64} for number in range(200)]}
 """Longer than what is parsed on the loop."""
 WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
-    ("bodies.parse", "POST", "/v1/captures", {"json": MANIFEST}),
-    ("captures.Captures.commit", "POST", "/v1/captures/absent/commit", {}),
+    ("services.api.http.bodies.parse", "POST", "/v1/captures", {"json": MANIFEST}),
+    ("services.api.captures.captures.Captures.commit", "POST", "/v1/captures/absent/commit", {}),
     (
-        "captures.Captures.create",
+        "services.api.captures.captures.Captures.create",
         "POST",
         "/v1/captures",
         {"json": {"files": [{"path": "capture.json", "bytes": 1, "sha256": "0" * 64}]}},
     ),
     (
-        "uploads.Uploads.begin",
+        "services.api.captures.uploads.Uploads.begin",
         "PATCH",
         "/v1/uploads/absent/0",
         {"content": b"x", "headers": dict(line.split(": ") for line in TUS.splitlines())},
     ),
-    ("masks.Masks.put", "PUT", "/v1/jobs/{job}/masks/a/all", {"content": b"x"}),
+    ("services.api.masks.masks.Masks.put", "PUT", "/v1/jobs/{job}/masks/a/all", {"content": b"x"}),
     (
-        "calibrations.Calibrations.put",
+        "services.api.calibrations.calibrations.Calibrations.put",
         "PUT",
         "/v1/calibrations/x",
         {"json": {"units": "mm", "channels": [], "lights": [], "cameras": []}},
     ),
-    ("routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts", {}),
-    ("routes.open_artifact", "GET", "/v1/jobs/{job}/artifacts/report.html", {}),
-    ("observe_routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts.zip", {}),
-    ("history.Histories.read", "GET", "/v1/jobs/{job}/history", {}),
-    ("feed._read", "GET", "/v1/jobs/{job}/events", {}),
-    ("worker_routes.list_workers", "GET", "/v1/workers", {}),
-    ("readiness.Readiness.checks", "GET", "/v1/health/ready", {}),
+    ("services.api.jobs.routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts", {}),
+    ("services.api.jobs.routes.open_artifact", "GET", "/v1/jobs/{job}/artifacts/report.html", {}),
+    ("services.api.jobs.history_routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts.zip", {}),
+    ("services.api.jobs.history.Histories.read", "GET", "/v1/jobs/{job}/history", {}),
+    ("services.api.jobs.event_stream._read", "GET", "/v1/jobs/{job}/events", {}),
+    ("services.api.health.worker_routes.list_workers", "GET", "/v1/workers", {}),
+    ("services.api.health.readiness.Readiness.checks", "GET", "/v1/health/ready", {}),
 )
 """Functions that parse, read or write, and requests that end in them."""
 
@@ -260,6 +260,6 @@ def test_the_loop_goes_on_while_something_is_parsed_read_or_written(
         has_gone_on.append(loop_server.turns >= before + TURNS)
         raise DentineError("It was slow.")
 
-    monkeypatch.setattr(f"services.api.{place}", work_slowly)
+    monkeypatch.setattr(place, work_slowly)
     loop_server.client.request(method, path.format(job=loop_server.job), **sent)
     assert has_gone_on == [True], f"while {place} worked, the loop that serves everybody stood still"

@@ -18,6 +18,8 @@ closer than the noise.
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +39,7 @@ MIN_RESIDUAL = 0.1
 
 def is_reweighted(loss: Loss) -> bool:
     """Whether weights follow residuals."""
-    return loss in {"l1", "relative_l1", "robust"}
+    return chosen("Loss", loss, {name: name not in {"l2", "relative_l2"} for name in get_args(Loss)})
 
 
 def first_weights(loss: Loss, reference: Array, variance: Array) -> Array:
@@ -60,16 +62,15 @@ def weights(loss: Loss, reference: Array, variance: Array, residual: Array, resi
         residual: render minus reference of a seed used for nothing else.
         residual_variance: Monte Carlo variance of that render.
     """
+    if not is_reweighted(loss):
+        return first_weights(loss, reference, variance)
     spread = np.sqrt(np.maximum(variance + residual_variance, 1e-300))
     if loss == "robust":
         deviation = residual / spread
         scale = max(float(np.median(np.abs(deviation))) / MEDIAN_OF_NORMAL, 1e-12)
         return _scaled(1 / (1 + (deviation / (CAUCHY * scale)) ** 2), variance)
     size = np.maximum(np.abs(residual), MIN_RESIDUAL * spread)
-    return _scaled(
-        chosen("Loss with changing weights", loss, {"l1": 1 / size, "relative_l1": 1 / (size * _floored(reference))}),
-        variance,
-    )
+    return _scaled(1 / size if loss == "l1" else 1 / (size * _floored(reference)), variance)
 
 
 def _floored(reference: Array) -> Array:
