@@ -17,7 +17,7 @@ PACKAGE = '''
 from pathlib import Path
 
 from services.core.job_kinds import JobKind
-from services.core.records import AssetManifest
+from services.core.results import AssetManifest
 from services.core.store import StageWriter
 
 KIND = JobKind("weight of a capture in bytes", ("export",), {"export": "weighing:export"}, frozenset())

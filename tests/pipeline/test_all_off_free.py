@@ -111,10 +111,10 @@ def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(
             for owner, name in ((Repository, "page"), (Jobs, "delete")):
                 monkeypatch.setattr(owner, name, hanging)
             for place in (
-                "routes.list_artifacts",
-                "observe_routes.list_artifacts",
-                "uploads.Uploads.begin",
-                "captures.Captures.commit",
+                "services.api.jobs.routes.list_artifacts",
+                "services.api.jobs.history_routes.list_artifacts",
+                "services.api.captures.uploads.Uploads.begin",
+                "services.api.captures.captures.Captures.commit",
             ):
                 monkeypatch.setattr(place, hanging)
             monkeypatch.setattr("services.api.jobs.jobs.Jobs.capturing", lambda _: [])
