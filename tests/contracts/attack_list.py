@@ -22,8 +22,11 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "services" / "api" / "ATTACKS.md"
 MARK = re.compile(
-    r'^@pytest\.mark\.attack\("(?P<kind>[^"]+)", "(?P<what>[^"]+)"\)\n(?:@.*\n)*def (?P<test>\w+)\(', re.MULTILINE
+    r'^@pytest\.mark\.attack\(\s*"(?P<kind>[^"]+)", "(?P<what>[^"]+)"\s*\)\n'
+    r"(?:(?!def |@pytest\.mark\.attack).*\n)*def (?P<test>\w+)\(",
+    re.MULTILINE,
 )
+"""A mark, the decorators below it, each on one line or on several, and the test's name."""
 TITLE = """# Attacks that are tried
 
 `make attacks` runs these tests and writes this page; what each of them does stands in its source below `tests/`. `make contracts` sends ten thousand generated
