@@ -128,7 +128,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             await asyncio.gather(*tasks, return_exceptions=True)
             closing = ThreadPool(1)  # a thread of its own, as all others may hang; darkness first
             everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators, parsers)
-            for close in (darken, *(clerks.close for clerks in everybody), jobs.close, workers.close):
+            for close in (darken, *(pool.close for pool in everybody), jobs.close, workers.close):
                 await closing.ask(close)
 
     app = FastAPI(

@@ -23,7 +23,7 @@ from services.pipeline.dask_tls import Certificates
 
 
 class Observation:
-    """Belongs to one application; ``webhook_sender`` is to be run while the application lives."""
+    """Belongs to one application; ``webhooks.sender`` is to be run while the application lives."""
 
     def __init__(
         self,

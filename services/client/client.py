@@ -1,4 +1,4 @@
-"""Typed clients of the REST API: one that blocks, as the command line uses it, and one for asyncio. What they say is in ``exchange``."""
+"""Typed clients of the REST API: one that blocks, as the command line uses it, and one for asyncio. What they say is in ``requests``."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Client:
     """Speaks to one server; a context manager."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
-        self._exchange = Requests(server, token)
-        connection = self._exchange.connection()
+        self._requests = Requests(server, token)
+        connection = self._requests.connection()
         import httpx
 
         self._http = httpx.Client(**connection)
@@ -44,20 +44,20 @@ class Client:
 
     def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
         """Submit a job, under a label where it is given one; the same key and options give the same job."""
-        return self.run(self._exchange.submit(spec, key, name))
+        return self.run(self._requests.submit(spec, key, name))
 
     def jobs(self, limit: int = 50, before: int | None = None, **only: Any) -> dict[str, Any]:
         """Some jobs, newest first; ``only`` are the filters of GET /v1/jobs."""
-        return self.run(self._exchange.jobs(limit, before, **only))
+        return self.run(self._requests.jobs(limit, before, **only))
 
     def delete(self, job_id: str) -> dict[str, Any]:
         """Remove what is stored of a job that has ended; the answer is the receipt."""
-        return self.run(self._exchange.delete(job_id))
+        return self.run(self._requests.delete(job_id))
 
     def download(self, job_id: str, out: Path) -> int:
         """Write all files of a job into one zip; returns its size in bytes. A broken download leaves no file."""
-        ask = self._exchange.archive(job_id)
-        with telling_lost(self._exchange.server), self._http.stream(ask.method, ask.path) as response:
+        ask = self._requests.archive(job_id)
+        with telling_lost(self._requests.server), self._http.stream(ask.method, ask.path) as response:
             if response.is_error:
                 response.read()
                 raise error_in(response)
@@ -68,7 +68,7 @@ class Client:
 
     def calibration(self, name: str) -> dict[str, Any]:
         """A stored calibration; its 'option' is what a job takes."""
-        return self.run(self._exchange.calibration(name))
+        return self.run(self._requests.calibration(name))
 
     def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
@@ -79,29 +79,29 @@ class Client:
             progress: called as files are hashed and sent.
             subject: pseudonymous label of the person.
         """
-        return self.run(self._exchange.upload(folder, progress, subject))
+        return self.run(self._requests.upload(folder, progress, subject))
 
     def get(self, job_id: str) -> dict[str, Any]:
         """One job with its stages."""
-        return self.run(self._exchange.get(job_id))
+        return self.run(self._requests.get(job_id))
 
     def cancel(self, job_id: str) -> dict[str, Any]:
         """Ask a job to stop."""
-        return self.run(self._exchange.cancel(job_id))
+        return self.run(self._requests.cancel(job_id))
 
     def retry(self, job_id: str) -> dict[str, Any]:
         """Queue a failed or cancelled job again."""
-        return self.run(self._exchange.retry(job_id))
+        return self.run(self._requests.retry(job_id))
 
     def workers(self) -> dict[str, Any]:
         """The workers, what each is doing, and how many jobs they got done."""
-        return self.run(self._exchange.workers())
+        return self.run(self._requests.workers())
 
     def events(self, job_id: str, after: int = 0) -> Iterator[JobEvent]:
         """A job's events until it ends; survives a restart of the server without loss or repetition."""
         import httpx
 
-        cursor = EventCursor(self._exchange.server, job_id, after)
+        cursor = EventCursor(self._requests.server, job_id, after)
         while True:
             try:
                 ask = cursor.ask()
@@ -148,8 +148,8 @@ class AsyncClient:
     """The same for asyncio; an asynchronous context manager. Files are hashed and read in threads."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
-        self._exchange = Requests(server, token)
-        connection = self._exchange.connection()
+        self._requests = Requests(server, token)
+        connection = self._requests.connection()
         import httpx
 
         self._http = httpx.AsyncClient(**connection)
@@ -164,20 +164,20 @@ class AsyncClient:
 
     async def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.submit(spec, key, name))
+        return await self.run(self._requests.submit(spec, key, name))
 
     async def jobs(self, limit: int = 50, before: int | None = None, **only: Any) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.jobs(limit, before, **only))
+        return await self.run(self._requests.jobs(limit, before, **only))
 
     async def delete(self, job_id: str) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.delete(job_id))
+        return await self.run(self._requests.delete(job_id))
 
     async def download(self, job_id: str, out: Path) -> int:
         """See ``Client``."""
-        ask = self._exchange.archive(job_id)
-        with telling_lost(self._exchange.server):
+        ask = self._requests.archive(job_id)
+        with telling_lost(self._requests.server):
             async with self._http.stream(ask.method, ask.path) as response:
                 if response.is_error:
                     await response.aread()
@@ -189,35 +189,35 @@ class AsyncClient:
 
     async def calibration(self, name: str) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.calibration(name))
+        return await self.run(self._requests.calibration(name))
 
     async def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
     ) -> UploadResult:
         """See ``Client``. ``progress`` may be called in another thread."""
-        return await self.run(self._exchange.upload(folder, progress, subject))
+        return await self.run(self._requests.upload(folder, progress, subject))
 
     async def get(self, job_id: str) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.get(job_id))
+        return await self.run(self._requests.get(job_id))
 
     async def cancel(self, job_id: str) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.cancel(job_id))
+        return await self.run(self._requests.cancel(job_id))
 
     async def retry(self, job_id: str) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.retry(job_id))
+        return await self.run(self._requests.retry(job_id))
 
     async def workers(self) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._exchange.workers())
+        return await self.run(self._requests.workers())
 
     async def events(self, job_id: str, after: int = 0) -> AsyncIterator[JobEvent]:
         """See ``Client``."""
         import httpx
 
-        cursor = EventCursor(self._exchange.server, job_id, after)
+        cursor = EventCursor(self._requests.server, job_id, after)
         while True:
             try:
                 ask = cursor.ask()

@@ -34,7 +34,7 @@ class CaptureReader(Protocol):
     def content_faults(
         self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        """Names of files, which are given with where they lie, and what is wrong with their contents; see ``capture_contents``."""
+        """Names of files, which are given with where they lie, and what is wrong with their contents; see ``contents``."""
 
     def describe(self, capture: Path) -> Described:
         """See ``describe``."""

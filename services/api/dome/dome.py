@@ -1,4 +1,4 @@
-"""What can be done with the dome by hand: look, ALL OFF, one light, preflight. What drives it is a process of its own; see ``dome_process``."""
+"""What can be done with the dome by hand: look, ALL OFF, one light, preflight. What drives it is a process of its own; see ``process``."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def database_lost(path: str) -> Response:
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What the description says of routes that may answer so, besides what the shield, the gate and a lost database answer everywhere."""
+    """What the description says of routes that may answer so, besides what browser protection, authentication and a lost database answer everywhere."""
     chosen = sorted({400, 401, 403, 429, 503, *statuses})
     return {
         status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen

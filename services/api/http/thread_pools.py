@@ -24,7 +24,7 @@ class ThreadPool:
     """So many threads, begun when there is work. What may take long, or waits for others, belongs elsewhere."""
 
     def __init__(self, count: int) -> None:
-        self._pool = ThreadPoolExecutor(count, "clerk")
+        self._pool = ThreadPoolExecutor(count, "short work")
 
     @classmethod
     def reading(cls, engine: sql.Engine) -> Self:
@@ -48,6 +48,6 @@ class ThreadPool:
 
     def close(self) -> None:
         """Wait for what is under way, but not for what hangs."""
-        closing = threading.Thread(target=self._pool.shutdown, name="clerks' end", daemon=True)
+        closing = threading.Thread(target=self._pool.shutdown, name="end of short work", daemon=True)
         closing.start()
         closing.join(CLOSE_S)

@@ -12,12 +12,12 @@ from services.api.http.thread_pools import ThreadPool
 
 def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.api.http.thread_pools.CLOSE_S", 0.01)
-    clerks, goes_on = ThreadPool(1), threading.Event()
+    pool, goes_on = ThreadPool(1), threading.Event()
 
     async def close_while_it_works() -> bool:
-        work = asyncio.create_task(clerks.ask(goes_on.wait, 30))
+        work = asyncio.create_task(pool.ask(goes_on.wait, 30))
         await asyncio.sleep(0)
-        clerks.close()
+        pool.close()
         assert not work.done()
         goes_on.set()
         return await work
@@ -26,12 +26,12 @@ def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pyte
 
 
 def test_what_is_under_way_is_awaited() -> None:
-    clerks, is_done = ThreadPool(1), threading.Event()
+    pool, is_done = ThreadPool(1), threading.Event()
 
     async def close_after_asking() -> None:
-        asked = asyncio.create_task(clerks.ask(is_done.set))
+        asked = asyncio.create_task(pool.ask(is_done.set))
         await asyncio.sleep(0)
-        clerks.close()
+        pool.close()
         assert is_done.is_set()
         await asked
 
