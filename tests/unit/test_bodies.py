@@ -14,15 +14,11 @@ from services.core.errors import SettingsError
 from services.core.settings import ServerSettings, UploadLimits
 
 
-def manifest_of(files: int) -> bytes:
-    """A manifest of so many files."""
+def manifest_of(files: int, path: str = "images/camera-1/light-{:05d}.png") -> bytes:
+    """A manifest of so many files, without spaces."""
     return json.dumps(
-        {
-            "files": [
-                {"path": f"images/camera-1/light-{number:05d}.png", "bytes": 1, "sha256": "0" * 64}
-                for number in range(files)
-            ]
-        }
+        {"files": [{"path": path.format(number), "bytes": 1, "sha256": "0" * 64} for number in range(files)]},
+        separators=(",", ":"),
     ).encode()
 
 
@@ -40,9 +36,10 @@ def test_an_object_of_too_many_members_is_refused_wherever_it_is() -> None:
         parse(json.dumps({"rig": {f"a{number}": 0 for number in range(MAX_MEMBERS + 1)}}).encode())
 
 
+@pytest.mark.parametrize("path", ["images/camera-1/light-{:05d}.png", "{}.png"])
 @pytest.mark.parametrize("files", [UploadLimits().most_files, 10 * UploadLimits().most_files])
-def test_a_manifest_of_as_many_files_as_the_settings_allow_is_parsed(files: int) -> None:
-    assert len(parse(manifest_of(files))["files"]) == files
+def test_a_manifest_of_as_many_files_as_the_settings_allow_is_parsed(files: int, path: str) -> None:
+    assert len(parse(manifest_of(files, path))["files"]) == files
 
 
 def test_every_route_with_a_body_in_json_bounds_it(tmp_path: Path) -> None:

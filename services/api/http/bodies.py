@@ -28,8 +28,9 @@ MAX_MEMBERS = 1000
 """Of any object in a body. The longest are a light's intensities, one a channel."""
 MAX_VALUES = 40_000
 """In one body: a manifest of five thousand files, the most by default, has twenty thousand."""
-BYTES_PER_VALUE = 30
-"""A body may hold more values than that if it has so many bytes for each, as a longer manifest has where the settings let it pass."""
+BYTES_PER_VALUE = 20
+"""A body may hold more values than that if it has so many bytes for each. A longer manifest, which the settings may allow, has 25
+at least: four values a file, of which the SHA-256 alone takes 66 bytes."""
 SHORT_BYTES = 2**14
 """A body up to here is parsed on the loop, in a millisecond; a longer one waits its turn in a thread."""
 T = TypeVar("T")
