@@ -58,6 +58,13 @@ def test_a_job_is_named_downloaded_and_deleted(
     with zipfile.ZipFile(tmp_path / "files.zip") as archive:
         assert {"report.html", "parameters.json"} <= set(archive.namelist())
 
+    with page.expect_download() as download:
+        page.get_by_role("link", name="As a table for a spreadsheet (CSV)").click()
+    download.value.save_as(tmp_path / "parameters.csv")
+    assert download.value.suggested_filename == f"dentine-{newer}.csv"
+    assert f"{newer},green,enamel.sigma,4.0321,0.0512,1/mm,true" in (tmp_path / "parameters.csv").read_text()
+    looked_at(page, f"parameters-{shown}")
+
     page.get_by_role("button", name="Delete…").click()
     dialog = page.get_by_role("dialog", name="Delete job 2, “Anna, upper left”?")
     expect(dialog).to_contain_text("files that can be downloaded")

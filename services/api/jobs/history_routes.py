@@ -14,8 +14,10 @@ from services.api.http.thread_pools import ThreadPool
 from services.api.http.zip_stream import stream_zip
 from services.api.jobs.history import Histories, History, LogPage, PreviewPage, read_log, read_previews
 from services.api.jobs.jobs import Jobs
+from services.api.jobs.parameter_table import parameter_table
 from services.api.presets import Preset, find_preset, list_presets
 from services.client.errors import UnknownJobError
+from services.core.asset import PARAMETERS
 from services.core.stage import StageName
 from services.pipeline.database import MAX_ID
 from services.pipeline.event_log import EventLog
@@ -98,6 +100,21 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
         names = [artifact.path for artifact in list_artifacts(root)]
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.zip"', "Cache-Control": "no-store"}
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
+
+    @router.get(
+        "/jobs/{job_id}/parameters.csv",
+        response_class=Response,
+        responses=refusals(409) | {200: {"content": {"text/csv": {}}}},
+        tags=["artifacts"],
+        dependencies=[needs("read", audited=True)],
+    )
+    @openers.answering
+    def parameters(job_id: str) -> Response:
+        """What the job has measured, for a spreadsheet: a row per channel and parameter with value, standard error and unit."""
+        job = jobs.repository.get(job_id)
+        table = parameter_table(job.id, open_artifact(jobs.folder(job.id), PARAMETERS))
+        headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.csv"', "Cache-Control": "no-store"}
+        return Response(table, headers=headers, media_type="text/csv")
 
     @router.get("/presets", tags=["options"], dependencies=[needs("read")])
     @readers.answering

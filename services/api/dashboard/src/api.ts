@@ -262,6 +262,7 @@ export const listArtifacts = (id: string): Promise<Artifact[]> => ask(`/jobs/${i
 export const getParameters = (id: string): Promise<Parameters> => ask(`/jobs/${id}/artifacts/parameters.json`);
 
 export const archiveUrl = (id: string): string => `/v1/jobs/${id}/artifacts.zip`;
+export const parameterTableUrl = (id: string): string => `/v1/jobs/${id}/parameters.csv`;
 
 export function artifactUrl(id: string, path: string): string {
   return `/v1/jobs/${id}/artifacts/${path.split("/").map(encodeURIComponent).join("/")}`;

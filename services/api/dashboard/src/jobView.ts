@@ -10,6 +10,7 @@ import {
   type JobEvent,
   listArtifacts,
   mayPass,
+  parameterTableUrl,
   sentenceOf,
   Unauthenticated,
 } from "./api";
@@ -40,6 +41,7 @@ export class JobView {
   private readonly stages = new StageList();
   private readonly chart = new LossChart();
   private readonly parameters = new ParameterTable();
+  private readonly parameterTable = element("a", { class: "soft", download: "" }, "As a table for a spreadsheet (CSV)");
   private readonly comparison: Comparison;
   private readonly slab: SlabView;
   private isSlab = false;
@@ -66,6 +68,8 @@ export class JobView {
     this.filesRefusal.hidden = true;
     this.report.hidden = true;
     this.report.href = artifactUrl(id, "report.html");
+    this.parameterTable.hidden = true;
+    this.parameterTable.href = parameterTableUrl(id);
     const then = { changed: (job: Job, again: boolean) => this.changed(job, again), deleted: onDeleted, refused: (problem: unknown) => this.refuse(problem) };
     this.actions = new JobActions(id, then, mayChange);
   }
@@ -89,7 +93,7 @@ export class JobView {
       ...(this.isSlab
         ? [section("Fit", this.slab.progress), section("Phase function", this.slab.phases)]
         : [section("Fit", this.chart.root), section("Render and photograph", this.comparison.root)]),
-      section("Parameters", this.parameters.root),
+      section("Parameters", this.parameters.root, this.parameterTable),
       section("Files", this.filesRefusal, this.files),
     );
     this.show(job);
@@ -209,7 +213,8 @@ export class JobView {
       this.list(files);
       this.slab.list(files);
       const heading = (channel: string) => (this.isSlab ? `${channel} nm` : channel);
-      if (files.some((file) => file.path === "parameters.json")) this.parameters.showResult(await getParameters(this.id), heading);
+      this.parameterTable.hidden = !files.some((file) => file.path === "parameters.json");
+      if (!this.parameterTable.hidden) this.parameters.showResult(await getParameters(this.id), heading);
       this.filesRefusal.hidden = true;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
