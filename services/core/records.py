@@ -226,11 +226,16 @@ class JobSpec(Record):
         """Whether the job begins by making the mouth that it captures."""
         return self.rig is not None and self.rig.mouth == DEMO_MOUTH
 
+    @property
+    def changed_options(self) -> frozenset[str]:
+        """Names of the options that have another value than their default."""
+        fields = JobSpec.model_fields.items()
+        return frozenset(name for name, field in fields if getattr(self, name) != field.get_default())
+
     @model_validator(mode="after")
     def _options_of_its_kind(self) -> JobSpec:
         # Stored options hold every field, so what an option was set to tells, and not whether it was.
-        told = {name for name, field in type(self).model_fields.items() if getattr(self, name) != field.get_default()}
-        if foreign := sorted(foreign_options(self.kind, frozenset(told) & JobSpec.model_fields.keys())):
+        if foreign := sorted(foreign_options(self.kind, self.changed_options)):
             own = sorted(JobSpec.model_fields.keys() - foreign_options(self.kind, frozenset(JobSpec.model_fields)))
             raise ValueError(f"a job of kind {self.kind} has no option '{foreign[0]}'; it has {', '.join(own)}")
         return self

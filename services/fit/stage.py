@@ -137,7 +137,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         "title": title,
         "boundary": spec.boundary,
         "ior": spec.ior,
-        "provenance": {"source": _source(spec), "seed": str(spec.seed)},
+        "provenance": {"source": _source(spec), "seed": str(spec.seed), "options": describe_options(spec)},
     }
     thickness = (
         None
@@ -203,6 +203,14 @@ def _is_layered(tooth: ToothReport) -> bool:
 
 def _with_dentin(tooth: Tooth, dentin: DentinShape | None, shape: tuple[float, ...]) -> Tooth:
     return replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(shape), dentin.base.faces))
+
+
+def describe_options(spec: JobSpec) -> str:
+    """The options with which a fit was made, where they are not at their defaults. Paths lead nowhere for whoever reads a report."""
+    named = spec.changed_options - {"kind", "capture", "rig", "calibration", "seed", "workers", "priority"}
+    values = spec.model_dump(mode="json", include=set(named))
+    rows = [f"{name} = {value if isinstance(value, str) else json.dumps(value)}" for name, value in values.items()]
+    return "; ".join(rows) + "; all others at their defaults" if rows else "all at their defaults"
 
 
 def _source(spec: JobSpec) -> str:

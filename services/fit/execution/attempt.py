@@ -27,6 +27,39 @@ from services.fit.export.previews import write_pictures, write_preview
 from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 
 CHECKPOINT = "fit-checkpoint"
+NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "effort"})
+"""Options that the answer of a fit does not depend on; what the capture holds counts by its contents."""
+ALWAYS_NAMED = frozenset(
+    [
+        "kind",
+        "calibration",
+        "boundary",
+        "ior",
+        "dentin",
+        "held",
+        "loss",
+        "solver",
+        "adam_steps",
+        "adam_rate",
+        "prior",
+        "stains",
+        "lobes",
+        "held_out_lights",
+        "channels",
+        "seed",
+        "pixel_step",
+        "samples_per_pixel",
+        "max_samples_per_pixel",
+        "max_steps",
+        "search_candidates",
+        "advise",
+        "sensor_noise_relative",
+        "sensor_noise_floor",
+        "device",
+    ]
+)
+"""Options of version 0.1, whose checkpoints name them all. A later one is named where it is not at its default, and so is to
+be added nowhere here: fits that were begun before there was such an option go on."""
 PREVIEW_EVERY = 3
 """A preview after the first step and after every so many."""
 
@@ -138,7 +171,8 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
     """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
-    parts = [numerics_name(), engine, spec.model_dump_json(exclude={"workers", "capture", "rig", "priority", "effort"})]
+    asked = (ALWAYS_NAMED | spec.changed_options) - NOT_OF_THE_ANSWER
+    parts = [numerics_name(), engine, spec.model_dump_json(include=set(asked))]
     for channel in files:
         parts += [
             channel.channel,

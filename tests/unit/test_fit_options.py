@@ -1,0 +1,44 @@
+"""How a job's options enter the name of its checkpoints and the report of its fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.core.records import JobSpec
+from services.fit.execution.attempt import fingerprint
+from services.fit.stage import describe_options
+
+CAPTURE = Path("/captures/anna")
+# Digests of the code before any option was added to those of version 0.1, "numerics" and "engine" standing for the names of both.
+DEFAULTS = "e33e4fc488397004ade7c2cdd7597ecd3f3abfabb456bad41b5432e95fe798e5"
+CHANGED = "b324cf722b393bbd186c58817ac47d75250a935e80cb1d6f3df350ab132599a0"
+OPTIONS = {"max_steps": 4, "loss": "robust", "held": {"enamel.sigma": 4.5}}
+
+
+@pytest.fixture(autouse=True)
+def numerics(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.fit.execution.attempt.numerics_name", lambda: "numerics")
+
+
+def digest(**options: object) -> str:
+    return fingerprint(JobSpec.model_validate({"capture": CAPTURE} | options), "engine", [])
+
+
+def test_checkpoints_keep_their_names_though_options_are_added() -> None:
+    assert digest() == DEFAULTS
+    assert digest(**OPTIONS, workers=5) == CHANGED
+
+
+def test_every_option_that_changes_the_answer_makes_another_checkpoint() -> None:
+    assert len({digest(), digest(max_steps=4), digest(seed=2), digest(prior="literature")}) == 4
+
+
+def test_the_report_names_the_options_that_were_set() -> None:
+    assert describe_options(JobSpec(capture=CAPTURE)) == "all at their defaults"
+    told = describe_options(JobSpec(capture=CAPTURE, calibration=CAPTURE, held_out_lights=("l1",), **OPTIONS))
+    assert told == (
+        'held = {"enamel.sigma": 4.5}; loss = robust; held_out_lights = ["l1"]; max_steps = 4; '
+        "all others at their defaults"
+    )
