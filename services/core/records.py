@@ -200,6 +200,13 @@ class JobSpec(Record):
     )
     max_samples_per_pixel: Whole = Field(default=1024, ge=2, le=65536, description="most paths per pixel and pass")
     max_steps: Whole = Field(default=12, ge=1, le=200, description="most Gauss-Newton steps")
+    image_tolerance: Number = Field(
+        default=0.004,
+        ge=0.0001,
+        le=0.1,
+        description="a fit has converged when what noise leaves open of its parameters changes the images by no more, "
+        "as a fraction; a smaller one goes on to smaller ±, as far as max_samples_per_pixel allows",
+    )
     search_candidates: Whole = Field(default=50_000, ge=100, description="table-search points per channel")
     advise: bool = Field(default=True, description="say at the end which further light or view would help most")
     sensor_noise_relative: Unit = Field(

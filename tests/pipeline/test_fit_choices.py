@@ -58,6 +58,19 @@ def require_truth(report: FitReport, largest: float = 0.1) -> None:
     assert all((table[f"{part}.{leaf}"].se or 1) < largest * table[f"{part}.{leaf}"].value for part, leaf in QUANTITIES)
 
 
+def test_a_tighter_tolerance_goes_on_to_smaller_errors(tmp_path: Path) -> None:
+    # One seed, so that both fits are the same until the one at the default has converged.
+    reports = []
+    for name, options in (("default", {}), ("tight", {"image_tolerance": 0.0001})):
+        write_prepared(tmp_path / name)
+        reports.append(fit(tmp_path / name, seed=3, advise=False, max_samples_per_pixel=4096, max_steps=20, **options))
+    usual, tight = reports
+    assert usual.converged
+    assert tight.steps > usual.steps
+    errors = [report.parameters["green"]["enamel.sigma_s_reduced"].se or 0.0 for report in reports]
+    assert 0 < errors[1] < errors[0]
+
+
 @pytest.mark.parametrize("loss", ["relative_l2", "l1", "relative_l1", "robust"])
 def test_every_loss_finds_the_truth_where_the_model_holds(loss: str, tmp_path: Path) -> None:
     # Unmodelled is the noise alone, so all losses have one minimum.

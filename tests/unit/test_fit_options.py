@@ -32,13 +32,22 @@ def test_checkpoints_keep_their_names_though_options_are_added() -> None:
 
 
 def test_every_option_that_changes_the_answer_makes_another_checkpoint() -> None:
-    assert len({digest(), digest(max_steps=4), digest(seed=2), digest(prior="literature")}) == 4
+    assert (
+        len({digest(), digest(max_steps=4), digest(seed=2), digest(prior="literature"), digest(image_tolerance=0.01)})
+        == 5
+    )
+
+
+def test_an_option_that_was_added_is_named_by_its_default_nowhere() -> None:
+    assert digest(image_tolerance=0.004) == DEFAULTS
 
 
 def test_the_report_names_the_options_that_were_set() -> None:
     assert describe_options(JobSpec(capture=CAPTURE)) == "all at their defaults"
-    told = describe_options(JobSpec(capture=CAPTURE, calibration=CAPTURE, held_out_lights=("l1",), **OPTIONS))
+    told = describe_options(
+        JobSpec(capture=CAPTURE, calibration=CAPTURE, held_out_lights=("l1",), image_tolerance=0.01, **OPTIONS)
+    )
     assert told == (
-        'held = {"enamel.sigma": 4.5}; loss = robust; held_out_lights = ["l1"]; max_steps = 4; '
+        'held = {"enamel.sigma": 4.5}; loss = robust; held_out_lights = ["l1"]; max_steps = 4; image_tolerance = 0.01; '
         "all others at their defaults"
     )

@@ -28,10 +28,9 @@ from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
 
-IMAGE_TOLERANCE = 0.004
-"""A stage has converged when its next step is within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SIMILAR_TOLERANCE = 0.02
-"""The same of a stage in similar media."""
+"""What the option ``image_tolerance`` is for exact media: a stage in similar ones has converged when its next step is within
+Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SLOPE_ERROR = 0.5
 """Relative error of what Jacobians of similar media promise for one tooth's exact images, however short the step; several are wrong independently."""
 CLOSING_SHARE = 2
@@ -165,13 +164,13 @@ class Stages(ABC, Generic[Optics]):
         return history_key(self.files.channel, self.steps) in self.journal.entries
 
     def options(self, level: Level) -> Options:
-        """Limits of a stage on images of this resolution; it has converged within ``IMAGE_TOLERANCE``."""
+        """Limits of a stage on images of this resolution; it has converged within ``image_tolerance``."""
         most = self.spec.max_samples_per_pixel
         samples = self.fewer(most) if level is self.files.full else most
         return Options(
             max_steps=self.spec.max_steps,
             max_samples=samples,
-            tolerance=0.5 * IMAGE_TOLERANCE**2 * level.signal,
+            tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
             parts=self.things,
         )
 
