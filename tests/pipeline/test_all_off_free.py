@@ -17,6 +17,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
+from pydantic import TypeAdapter
 
 from services.api.app import create_app
 from services.api.http import problems
@@ -138,6 +139,8 @@ class Looped:
     job: str
     turns: int = 0
     listed: list[int] = field(default_factory=list)
+    built: list[object] = field(default_factory=list)
+    """Types whose validators were built for the first request."""
 
     async def count_turns(self) -> None:
         """One turn of the loop each, for ever."""
@@ -161,7 +164,14 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Looped]:
 
     app.router.lifespan_context = counting
     with serving(app) as client:
-        looped.client, looped.job = client, client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
+        with pytest.MonkeyPatch.context() as patch:
+            build = TypeAdapter._init_core_attrs
+            patch.setattr(
+                TypeAdapter,
+                "_init_core_attrs",
+                lambda self, *_, **__: looped.built.append(self) or build(self, *_, **__),
+            )
+            looped.client, looped.job = client, client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
         yield looped
 
 
@@ -176,6 +186,10 @@ def loop_server(counted: Looped, monkeypatch: pytest.MonkeyPatch) -> Looped:
 
     monkeypatch.setattr(problems, "_sentence", count)
     return counted
+
+
+def test_the_first_request_finds_its_route_built(counted: Looped) -> None:
+    assert counted.built == [], "the loop built validators while others waited"
 
 
 def many(item: object) -> str:
