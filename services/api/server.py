@@ -26,6 +26,7 @@ from services.core.settings import ServerSettings
 from services.core.stage import StageName
 from services.pipeline.database import open_database
 from services.pipeline.garbage_collection import leave_alone_what_is_loaded
+from services.pipeline.log_stream import queued
 from services.pipeline.logs import configure_logs
 from services.pipeline.stages import DOORS
 
@@ -51,7 +52,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
     except ModuleNotFoundError as problem:
         raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
 
-    with _sole_server(settings.data), closing(_listen(settings)) as listener:
+    with _sole_server(settings.data), closing(_listen(settings)) as listener, queued(sys.stderr) as log:
         if not is_dashboard_built():
             print(
                 "The dashboard is not built; run make dashboard and start again. The API works without it.",
@@ -59,7 +60,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
             )
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
-        configure_logs(sys.stderr)
+        configure_logs(log)
         with _telling_what_cannot_be_written(settings.data):
             proxies, app = settings.trusted_proxies, create_app(settings, run, doors)
             if settings.access == "tokens":

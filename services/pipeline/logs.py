@@ -17,9 +17,10 @@ from services.core.stage import StageEvent, StageName
 
 if TYPE_CHECKING:
     from services.pipeline.event_log import EventAddress
+    from services.pipeline.log_stream import QueuedStream
 
 
-def configure_logs(stream: TextIO) -> None:
+def configure_logs(stream: TextIO | QueuedStream) -> None:
     """Write every log line of this process to a stream, as JSON unless it is a terminal. Other packages are heard from warnings on."""
     import structlog
 
