@@ -1,0 +1,1 @@
+"""Webhooks over faults of the receiver, the network and the server."""

@@ -1,0 +1,1 @@
+"""The capture stage with the simulated dome and cameras."""

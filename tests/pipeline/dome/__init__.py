@@ -1,0 +1,1 @@
+"""The dome by hand, over the API."""

@@ -1,0 +1,1 @@
+"""Folder captures as the prepare stage imports them."""

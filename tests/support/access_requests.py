@@ -1,0 +1,26 @@
+"""What tests of access ask of a server that asks for tokens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, FastAPI
+
+from services.api.auth.tokens import Scope
+from tests.support.guarded_server import Guarded
+
+
+def write_report(_spec: object, folder: Path, _events: object) -> None:
+    (folder / "report.html").write_text("<!doctype html>")
+
+
+def add_first(app: FastAPI, router: APIRouter) -> None:
+    """Include a router before the page, which takes whatever is left."""
+    app.include_router(router)
+    app.router.routes.insert(0, app.router.routes.pop())
+
+
+def audit(server: Guarded, **query: Any) -> list[dict[str, Any]]:
+    entries: list[dict[str, Any]] = server.ask("GET", "/v1/audit", Scope.ADMIN, params=query).json()["entries"]
+    return entries
