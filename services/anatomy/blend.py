@@ -172,7 +172,7 @@ def _shallowest_corner_mm(
 ) -> NDArray[np.float64]:
     # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the lingual hollow.
     weights = np.stack(np.meshgrid(*[(0.0, 0.5, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
-    return np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0)
+    return np.asarray(np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0))
 
 
 def _turned_over(base: Mesh, modes: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -158,7 +158,7 @@ def _even_turns(count: int) -> Array:
 def _angles_deg(one: Array, two: Array) -> Array:
     # Of the rotations between axes (N, 3, 3) and (N, 3, 3).
     cosine = (np.einsum("nij,nij->n", one, two) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _middle_mm(tooth: Tooth) -> Array:

@@ -84,4 +84,4 @@ def _a_decade(low: float, high: float) -> tuple[float, float]:
 
 def write_png(figure: Figure, path: Path | BinaryIO) -> None:
     """Render without a display."""
-    FigureCanvasAgg(figure).print_png(path)
+    FigureCanvasAgg(figure).print_png(path)  # type: ignore[no-untyped-call]  # matplotlib has types, but none here

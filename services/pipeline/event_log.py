@@ -261,7 +261,10 @@ class EventLog:
         of_attempt = (columns.job == self.job) & (columns.stage == stage) & (columns.attempt == attempt)
         enough = (columns.done >= done) if done > 0 else sql.true()
         with self._engine.connect() as connection:
-            return connection.scalar(sql.select(sql.func.min(columns.time_s)).where(of_attempt, enough))
+            first_s: float | None = connection.scalar(
+                sql.select(sql.func.min(columns.time_s)).where(of_attempt, enough)
+            )
+            return first_s
 
     def begun(self) -> Begun:
         """How far the job's stages are."""

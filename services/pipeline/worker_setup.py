@@ -24,7 +24,7 @@ async def dask_setup(worker: Any) -> None:
     await worker.plugin_add(WorkerSetup(), name=WorkerSetup.name, catch_errors=False)
 
 
-class WorkerSetup(WorkerPlugin):
+class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
     """Prepares one worker."""
 
     name = "dentine-setup"

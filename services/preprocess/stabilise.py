@@ -176,7 +176,7 @@ def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[Flo
 
 
 def _lagrange(times: FloatArray, values: FloatArray, time: float) -> FloatArray:
-    total = np.zeros_like(values[0])
+    total: FloatArray = np.zeros_like(values[0])
     for k, knot in enumerate(times):
         others = np.delete(times, k)
         total = total + values[k] * np.prod((time - others) / (knot - others))

@@ -35,12 +35,12 @@ def touching_pieces(faces: Faces) -> NDArray[np.int64]:
 
 def areas_mm2(mesh: Mesh) -> NDArray[np.float64]:
     """Area (F,) of each face."""
-    return np.linalg.norm(_crosses(mesh), axis=1) / 2
+    return np.asarray(np.linalg.norm(_crosses(mesh), axis=1) / 2)
 
 
 def vector_area_mm2(mesh: Mesh) -> NDArray[np.float64]:
     """Sum of the faces' normals times their areas (3,): for a cap, the normal of its boundary loop."""
-    return _crosses(mesh).sum(axis=0) / 2
+    return np.asarray(_crosses(mesh).sum(axis=0) / 2)
 
 
 def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
@@ -230,9 +230,8 @@ def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
         _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
         return np.asarray(counts[index.reshape(-1, 3)].max(axis=1))
 
-    return (shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2) & (
-        shared_by(start * count + end) == 1
-    )
+    by_few = shared_by(np.minimum(start, end) * count + np.maximum(start, end)) <= 2
+    return np.asarray(by_few & (shared_by(start * count + end) == 1))
 
 
 def _largest_fans(faces: Faces) -> NDArray[np.bool_]:

@@ -65,7 +65,7 @@ def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
     """
     from scipy.spatial import Delaunay
 
-    triangles = np.asarray(Delaunay(outline).simplices, dtype=np.int64)
+    triangles: NDArray[np.int64] = np.asarray(Delaunay(outline).simplices, dtype=np.int64)
     a, b, c = (outline[triangles[:, k]] for k in range(3))
     turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
     triangles = np.where(turned[:, None], triangles[:, ::-1], triangles)

@@ -59,7 +59,8 @@ def insert_delivery(connection: sql.Connection, webhook_id: str, message: str, p
         "tries": 0,
     }
     row |= {"next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
-    return connection.execute(delivery_table.insert().values(row).returning(delivery_table.c.id)).scalar_one()
+    new = delivery_table.insert().values(row).returning(delivery_table.c.id)
+    return int(connection.execute(new).scalar_one())
 
 
 def message_body(kind: str, time_s: float, data: dict[str, Any]) -> str:

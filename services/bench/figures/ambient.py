@@ -102,10 +102,8 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
 
 
 def _tooth_pixels(source: Path, description: FolderCapture, camera: str) -> NDArray[np.bool_]:
-    return np.any(
-        [np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera],
-        axis=0,
-    )
+    seen = [np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera]
+    return np.asarray(np.any(seen, axis=0))
 
 
 def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Row:

@@ -40,7 +40,7 @@ def read_environment(path: Path) -> Array:
     )
     height = len(image)
     solid_angle = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
-    return image * (solid_angle.sum() * image.shape[1] * 3 / (image * solid_angle).sum())
+    return np.asarray(image * (solid_angle.sum() * image.shape[1] * 3 / (image * solid_angle).sum()))
 
 
 def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def _recipe(outer: Mesh, dentin: Mesh | None) -> SceneRecipe:
 
 
 def _towards_lights(distance_mm: float) -> NDArray[np.float64]:
-    return DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True) * distance_mm
+    return np.asarray(DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True) * distance_mm)
 
 
 def _edge_on() -> View:

@@ -95,7 +95,7 @@ def fresnel_reflectance(corners: Corners, rng: np.random.Generator) -> Floats:
     def truth(eta: Floats) -> Floats:
         beyond = np.sqrt((1 - (1 - cosine**2) / eta**2).astype(complex))
         s, p = (cosine - eta * beyond) / (cosine + eta * beyond), (eta * cosine - beyond) / (eta * cosine + beyond)
-        return (np.abs(s) ** 2 + np.abs(p) ** 2) / 2
+        return np.asarray((np.abs(s) ** 2 + np.abs(p) ** 2) / 2)
 
     right = truth(eta)
     steepness = np.abs(truth(eta * (1 + ROUNDING)) - truth(eta * (1 - ROUNDING))) / ROUNDING

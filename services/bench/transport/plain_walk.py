@@ -79,4 +79,5 @@ class PlainWalk(Walk):
             walker.active = walker.sample < limit
             return walker
 
-        return dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
+        renewed: Walker = dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
+        return renewed

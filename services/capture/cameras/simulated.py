@@ -32,7 +32,7 @@ class SensorModel:
     def __init__(self, spec: SimulatedCameraSpec, peak_radiance: float, level: float, exposure_s: float) -> None:
         self.spec = spec
         self.full_scale = 2**spec.bits - 1
-        self.radiance_per_count = (
+        self.radiance_per_count: float = (
             peak_radiance * level * exposure_s / (PEAK_FRACTION * (self.full_scale - spec.black_level))
         )
 
@@ -44,7 +44,10 @@ class SensorModel:
             signal = signal + deviation * np.random.default_rng([self.spec.seed, *noise_seed]).standard_normal(
                 signal.shape, dtype=np.float32
             )
-        return np.clip(np.rint(self.spec.black_level + signal), 0, self.full_scale).astype(np.uint16)
+        counts: NDArray[np.uint16] = np.clip(np.rint(self.spec.black_level + signal), 0, self.full_scale).astype(
+            np.uint16
+        )
+        return counts
 
 
 class SimulatedCameras:

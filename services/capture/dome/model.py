@@ -11,6 +11,7 @@ becomes 0 and the fault is latched; in the dark it only opens the supply until t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from services.capture.dome import registers as reg
@@ -97,7 +98,7 @@ class DomeModel:
             return self._held[register.name]
         if register.space == "coil":
             return [0]
-        sensors = {
+        sensors: dict[Register, Callable[[], list[int]]] = {
             reg.IDENTITY: lambda: [reg.IDENTITY_VALUE],
             reg.FIRMWARE: lambda: [reg.FIRMWARE_MAJOR << 8],
             reg.LIGHT_COUNT: lambda: [self.lights],

@@ -117,7 +117,7 @@ class DaskExecutor:
     def _most_at_once(self) -> int:
         able = self._client.scheduler_info(n_workers=-1)["workers"].values()
         threads = sum(
-            worker["nthreads"]
+            int(worker["nthreads"])
             for worker in able
             if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items())
         )
@@ -144,7 +144,7 @@ class Timed(NamedTuple):
     tasks: int
 
 
-class _EnginePlugin(WorkerPlugin):
+class _EnginePlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
     """A worker's child process, made at its first task and ended with the worker."""
 
     def __init__(self, factory: str) -> None:

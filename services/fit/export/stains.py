@@ -56,7 +56,7 @@ def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.
 
     # Barycentric weights by areas of the three triangles that a point makes with the edges.
     def doubled_area(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
     points = hits.points_mm[hits.hit]
     weights = np.stack(

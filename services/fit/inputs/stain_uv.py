@@ -152,4 +152,5 @@ def _neighbours(points_mm: Array, normals: Array, reach_mm: float) -> NDArray[np
 
     pairs = cKDTree(points_mm).query_pairs(reach_mm, output_type="ndarray").astype(np.int64)
     facing = np.einsum("ec,ec->e", normals[pairs[:, 0]], normals[pairs[:, 1]]) > SAME_SIDE
-    return pairs[facing][np.lexsort(pairs[facing].T[::-1])]
+    found: NDArray[np.int64] = pairs[facing][np.lexsort(pairs[facing].T[::-1])]
+    return found

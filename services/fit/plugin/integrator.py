@@ -158,7 +158,7 @@ def register_integrator() -> None:
             f"Integrator {PLUGIN} needs a variant such as llvm_ad_mono or llvm_ad_rgb, not {variant}; set one first."
         )
 
-    class Dentine(mi.SamplingIntegrator):
+    class Dentine(mi.SamplingIntegrator):  # type: ignore[misc]  # mitsuba has no types
         """Adapter between Mitsuba's render loop and ``ScenePaths``."""
 
         def __init__(self, props: mi.Properties) -> None:

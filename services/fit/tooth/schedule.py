@@ -281,7 +281,7 @@ class ChannelSchedule(Stages[Tissue]):
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
         # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a single start may end with enamel
         # and dentin exchanged.
-        domain, ends = self._domain(("sigma", "alpha")), []
+        domain, ends = self._domain(("sigma", "alpha")), list[Tissue]()
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values(
                 {"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma}
@@ -302,7 +302,7 @@ class ChannelSchedule(Stages[Tissue]):
 
         self.pause()
         best, _ = self.journal.once(f"{self.scope}/starts", compute)
-        return ends[best]
+        return ends[int(best)]
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:
         # A second lobe starts at its prior's centre, the first keeps the mean cosine.

@@ -5,6 +5,8 @@ A texture ``stain`` takes its share of what passes, and nothing of what is refle
 Usage: ``mi.set_variant(...)``, then ``thin_boundary.register()``, then load the scene.
 """
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -12,7 +14,7 @@ import mitsuba as mi
 def register() -> None:
     """Make ``<bsdf type="thin_boundary">`` known to Mitsuba's current variant."""
 
-    class ThinBoundary(mi.BSDF):
+    class ThinBoundary(mi.BSDF):  # type: ignore[misc]  # mitsuba has no types
         def __init__(self, props):  # type: ignore[no-untyped-def]
             mi.BSDF.__init__(self, props)
             self.ior = props.get("ior", 1.631)
@@ -21,10 +23,10 @@ def register() -> None:
             self.m_components = [mi.BSDFFlags.DeltaReflection | sides, mi.BSDFFlags.Null | sides]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
-        def reflected(self, si):  # type: ignore[no-untyped-def]
+        def reflected(self, si: Any) -> Any:
             return mi.fresnel(dr.abs(mi.Frame3f.cos_theta(si.wi)), self.ior)[0]
 
-        def passed(self, si, active):  # type: ignore[no-untyped-def]
+        def passed(self, si: Any, active: Any) -> Any:
             return mi.Spectrum(1.0) if self.stain is None else 1 - self.stain.eval(si, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):  # type: ignore[no-untyped-def]  # noqa: ARG002

@@ -68,7 +68,7 @@ class Batches:
     @property
     def mean(self) -> Array:
         """Images (images, pixels)."""
-        return self.images.mean(axis=0)
+        return np.asarray(self.images.mean(axis=0))
 
 
 def run_block(block: Block) -> BlockSums:

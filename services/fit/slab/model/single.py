@@ -108,9 +108,9 @@ def _spread(grid: Grid, beam: Beam, starts: Array, ends: Array) -> Array:
     edges_y = grid.y_from_mm + grid.pitch_y_mm * np.arange(grid.rows + 1)
     halves = 2 if grid.folded else 1
     if not beam.disc:
-        along = np.diff(ndtr((edges_x - (starts + ends)[:, None] / 2) / beam.x_mm), axis=1)
-        across = halves * np.diff(ndtr(edges_y / beam.y_mm))
-        return (along[:, :, None] * across).transpose(0, 2, 1).reshape(len(starts), -1)
+        along: Array = np.diff(ndtr((edges_x - (starts + ends)[:, None] / 2) / beam.x_mm), axis=1)
+        across: Array = halves * np.diff(ndtr(edges_y / beam.y_mm))
+        return np.asarray((along[:, :, None] * across).transpose(0, 2, 1).reshape(len(starts), -1))
     # A disc is a sum of chords: at x offset r sin(t) of weight cos^2(t), y is even within +- r cos(t).
     angles = (np.arange(DISC_NODES) + 0.5) / DISC_NODES * math.pi - math.pi / 2
     total = np.zeros((len(starts), grid.rows, grid.columns))

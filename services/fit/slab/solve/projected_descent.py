@@ -46,7 +46,7 @@ def projected(point: Array) -> Array:
     falling = falling - falling[0]
     sums = np.cumsum(falling) - 1
     count = np.nonzero(falling - sums / np.arange(1, len(falling) + 1) > 0)[0][-1] + 1
-    return np.maximum(point - np.max(point) - sums[count - 1] / count, 0)
+    return np.asarray(np.maximum(point - np.max(point) - sums[count - 1] / count, 0))
 
 
 def weight_gradient(rows: Array, material: Material, pulls: Array) -> Array:
@@ -64,7 +64,7 @@ def weight_gradient(rows: Array, material: Material, pulls: Array) -> Array:
 def image_weights(values: Array) -> Array:
     """w_m of Eq. 10 for each pixel, 1 / max(c, I^3) with I clamped at zero, in units of the brightest pixel."""
     relative = np.maximum(values, 0) / values.max()
-    return 1 / np.maximum(WEIGHT_FLOOR, relative**WEIGHT_POWER)
+    return np.asarray(1 / np.maximum(WEIGHT_FLOOR, relative**WEIGHT_POWER))
 
 
 def descend(

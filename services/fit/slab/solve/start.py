@@ -71,7 +71,7 @@ def _improved(
     change = -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(3), chain.T @ equations.gradient)
     sigma_s = math.exp(point[0])
     limits = np.array([1.0, 0.3, 0.5 * sigma_s])
-    moved = point + np.clip(change, -limits, limits)
+    moved: Array = point + np.clip(change, -limits, limits)
     moved[1] = np.clip(moved[1], SMALLEST_COSINE, LARGEST_COSINE)
     moved[2] = max(moved[2], 0.0)
     return moved

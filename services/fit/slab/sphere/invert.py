@@ -102,7 +102,7 @@ class _Problem:
 
         def misses(x: Array, nodes: int = self.nodes) -> Array:
             absorption, reduced = np.exp(x)
-            return (self.readings(absorption, reduced, extinction, nodes) - measured) / errors
+            return np.asarray((self.readings(absorption, reduced, extinction, nodes) - measured) / errors)
 
         starts = [np.log(np.array([a, s]) / width) for s, a in SEARCH if extinction is None or a / width < extinction]
         start = min(starts, key=lambda x: float(np.square(misses(x, SEARCH_NODES)).sum()))

@@ -62,7 +62,7 @@ def neighbours_in_a_row(points: NDArray[np.float64]) -> NDArray[np.int64]:
 
     def halve(chosen: NDArray[np.int64]) -> list[int]:
         if len(chosen) == 1:
-            return chosen.tolist()
+            return [int(chosen[0])]
         axis = np.argmax(np.ptp(points[chosen], axis=0))
         ordered = chosen[np.argsort(points[chosen, axis], kind="stable")]
         return [*halve(ordered[: len(ordered) // 2]), *halve(ordered[len(ordered) // 2 :])]

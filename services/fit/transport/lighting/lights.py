@@ -156,5 +156,6 @@ def shadow(
     modes = 0 if shape is None else geometry.modes_of[shape]
     lengths, border = [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)]
     ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), lengths, border, stains or [], mi.Bool(active))
-    ray, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
-    return ray
+    ended: ShadowRay
+    ended, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
+    return ended

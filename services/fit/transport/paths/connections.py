@@ -101,7 +101,7 @@ class Connections:
         """Offer a vertex; ``found.total`` is ignored."""
         importance = dr.select(active, found.carried * found.clear, 0)
         total = kept.total + importance
-        chosen = dr.select(active & (u * total < importance), found, kept)
+        chosen: Vertex = dr.select(active & (u * total < importance), found, kept)
         chosen.total = total
         return chosen
 
