@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Listener = Callable[[JobEvent], None]
 
+ENDS = ("finished", "error", "cancelled")
+"""Statuses of a task that do not change by themselves; a lost one, whose worker died with the result, runs again."""
 POLL_S = 0.25
 KEEP_S = 10.0
 """How often workers that were given up are started again."""
@@ -58,9 +60,9 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
-    has_ended = False
-    while not has_ended:
-        has_ended = _has_ended(stage)
+    ended_as = None
+    while ended_as is None:
+        ended_as = _ended_as(stage)
         watch.tell()
         if time.monotonic() > keep_at:
             keep_workers()
@@ -68,13 +70,14 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
         if give_up_at is None and flag.exists():
             give_up_at = time.monotonic() + GRACE_S
         # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
-        if not has_ended and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
+        if ended_as is None and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
             _stop_workers_of(client, key)
             raise JobCancelledError(
                 "The job was cancelled on request; its workers were stopped, and what it had published is kept."
             )
     try:
-        if stage.status != "finished":
+        # By what it ended as, and not by what it is now: a result that is here may die with its worker, and run again.
+        if ended_as != "finished":
             stage.result()
     except KilledWorker as problem:
         raise WorkerLostError(
@@ -83,20 +86,22 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
         ) from problem
 
 
-def _has_ended(stage: Future) -> bool:
-    """Whether a task has failed, or its result is here; asks for ``POLL_S`` at most.
+def _ended_as(stage: Future) -> str | None:
+    """``finished`` once a task's result is here, ``error`` or ``cancelled``; None while it may still end otherwise.
 
-    A task that has finished has not ended before that: its worker may die with the result, and then the task runs again.
+    Asks for ``POLL_S`` at most. A task that has finished has not ended before its result is here: its worker may die with it, and
+    then the task is lost for a while and runs again.
     """
     from distributed import wait
 
     try:
         wait([stage], timeout=POLL_S)
-        if stage.status == "finished":
+        status: str = stage.status
+        if status == "finished":
             stage.result(timeout=POLL_S)
     except TimeoutError:
-        return False
-    return True
+        return None
+    return status if status in ENDS else None
 
 
 def _stop_workers_of(client: Client, stage: str) -> None:

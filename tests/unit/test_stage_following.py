@@ -68,3 +68,20 @@ def test_a_result_that_dies_with_its_worker_is_waited_for_again(
     task = Task("finished", silent=2)
     follow(monkeypatch, tmp_path, task)
     assert task.asked == 3
+
+
+def test_a_task_that_is_lost_is_followed_until_it_has_run_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # A worker that dies with a result leaves the task lost: neither running nor ended.
+    task = Task("lost", "lost", "lost", "finished")
+    follow(monkeypatch, tmp_path, task)
+    assert task.asked == 1
+
+
+def test_a_task_that_has_ended_is_not_asked_again_when_its_result_is_lost_later(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    task = Task("finished", "finished", "lost")
+    follow(monkeypatch, tmp_path, task)
+    assert task.asked == 1
