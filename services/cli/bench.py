@@ -15,7 +15,9 @@ from services.core.errors import InputError
 _BENCHMARKS = MappingProxyType(
     {
         "jaw": "services.bench.fits.jaw:run",
-        "slab": "services.bench.slab:run",
+        "slab": "services.bench.slab.forward:run",
+        "slab-map": "services.bench.slab.accuracy:run",
+        "slab-mie": "services.bench.slab.dispersions:run",
         "stability": "services.bench.stability.run:run",
         "tooth": "services.bench.fits.tooth:run",
         "transport-gradient": "services.bench.transport.gradient:run",

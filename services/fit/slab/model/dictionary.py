@@ -60,6 +60,10 @@ class Material:
         """Phase function at the knots, 1/sr (KNOTS,)."""
         return self.scattering / self.scattering_per_mm
 
+    def slope_of_scattering(self) -> Array:
+        """Derivatives of sigma_s by ln f at the knots and by sigma_a (KNOTS + 1,)."""
+        return np.append(self.scattering * tent_solid_angles(), 0.0)
+
     def weights(self) -> Array:
         """Simplex weights of the tents, the absorber and vacuum (KNOTS + 2,), Eq. 11 to 13.
 

@@ -12,7 +12,7 @@ from scipy import linalg
 from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.gauss_newton import Solution
 from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import RIDGE, precision
+from services.fit.slab.solve.prior import RIDGE, Quadratic, precision
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,9 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
     directions whose curvature stands out count. The images' Monte Carlo noise is in the weights, as the shot noise is.
     """
-    return Uncertainty(*(_covariance(solution, precision(scale)) for scale in (solution.scale, flag_scales())))
+    return Uncertainty(
+        *(covariance_of(solution.quadratic, precision(scale)) for scale in (solution.scale, flag_scales()))
+    )
 
 
 def flag_scales() -> Array:
@@ -60,10 +62,11 @@ def flag_scales() -> Array:
     return np.asarray(np.maximum(SHARPEST / (1 + (from_pole / POLE_RAD) ** 2), BLUNTEST))
 
 
-def _covariance(solution: Solution, prior: Array) -> Array:
-    ridge = RIDGE * float(np.abs(np.diag(solution.quadratic.matrix)).max()) * np.eye(UNKNOWNS)
-    reference = prior + solution.quadratic.noise + ridge
-    signals, vectors = linalg.eigh(solution.quadratic.matrix, reference)
+def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
+    """Posterior covariance of the unknowns under a prior's precision (UNKNOWNS, UNKNOWNS)."""
+    ridge = RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(UNKNOWNS)
+    reference = prior + quadratic.noise + ridge
+    signals, vectors = linalg.eigh(quadratic.matrix, reference)
     # With vectors V, V^T reference V = 1, so that matrix = reference V signals V^T reference.
     told = reference @ vectors
     curvature = (told * np.where(signals > MIN_SIGNAL, signals, 0)) @ told.T
@@ -83,11 +86,14 @@ def slopes(material: Material) -> dict[str, Array]:
     }
 
 
+def phase_chain(material: Material) -> Array:
+    """Derivatives of ln p at the knots by ln f and sigma_a (KNOTS, UNKNOWNS), as ln p = ln f - ln sigma_s."""
+    return np.asarray(np.eye(KNOTS + 1)[:KNOTS] - material.slope_of_scattering() / material.scattering_per_mm)
+
+
 def phase_errors(material: Material, uncertainty: Uncertainty) -> tuple[Array, NDArray[np.bool_]]:
     """Standard errors of the phase function at the knots, 1/sr, and which of its values are determined."""
-    share = material.scattering * tent_solid_angles() / material.scattering_per_mm
-    # ln p = ln f - ln sigma_s
-    chain = np.eye(KNOTS + 1)[:KNOTS] - np.append(share, 0.0)
+    chain = phase_chain(material)
     errors, alone = (
         np.sqrt(np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True))
         for covariance in (uncertainty.covariance, uncertainty.images_alone)

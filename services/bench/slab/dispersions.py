@@ -1,0 +1,142 @@
+"""``dentine bench slab-mie``: nano-dispersions of known size through the whole measurement (Gkioulekas et al. 2013, 6.3).
+
+Polystyrene spheres in water: Lorenz-Mie theory gives phase function and scattering cross-section, so the truth is physics. Each
+dispersion is diluted to sigma_t w near 2, where a cell tells most; three are also measured as they are, at 1 % by weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.bench.slab.recovery import Truth, photographed, recovered
+from services.core.errors import InputError
+from services.core.slab_folder import SlabFolder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+DIAMETERS_NM = (200.0, 500.0, 800.0)
+COLOURS = {
+    "R": (635.0, 1.58782, 1.33170),
+    "G": (533.0, 1.59807, 1.33499),
+    "B": (488.0, 1.60515, 1.33704),
+}
+"""Wavelength in nm and the indices of polystyrene and water there."""
+VOLUME_FRACTION = 0.01 / 1.05
+"""Of 1 % by weight, at polystyrene's density of 1.05 g/cm3."""
+BEST_THICKNESS = 2.0
+DILUTIONS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+"""Of the full strength, as a laboratory makes them."""
+THICK = (("R", 200.0), ("G", 200.0), ("B", 200.0))
+"""Also measured undiluted: sigma_t w is 5 to 12."""
+PHOTONS, QUICK_PHOTONS = 8_000_000, 400_000
+
+Keep = Callable[[list[dict[str, Any]]], None]
+
+
+def mie_truth(diameter_nm: float, colour: str, dilution: float, folder: SlabFolder) -> Truth:
+    """Spheres of one size in water."""
+    import miepython
+
+    wavelength_nm, sphere, water = COLOURS[colour]
+    size = math.pi * diameter_nm * water / wavelength_nm
+    relative = complex(sphere / water, 0.0)
+    efficiency = float(np.ravel(miepython.efficiencies_mx(relative, size)[1])[0])
+    # Cross-section of a sphere times spheres per volume: 3/2 of the fraction, over the diameter.
+    full_per_mm = 1.5 * efficiency * VOLUME_FRACTION / (diameter_nm * 1e-6)
+
+    def phase(angles_rad: Array) -> Array:
+        return np.asarray(miepython.i_unpolarized(relative, size, np.cos(angles_rad), norm="one"), dtype=np.float64)
+
+    name = f"{diameter_nm:g} nm {colour}, {100 * dilution:g} % strength"
+    return Truth(name, folder, full_per_mm * dilution, 0.0, phase)
+
+
+def truths() -> list[Truth]:
+    """All nine at the dilution nearest to the best thickness, and the thick ones."""
+    folder = near_beam_folder()
+    every = []
+    for diameter_nm in DIAMETERS_NM:
+        for colour in COLOURS:
+            options = [mie_truth(diameter_nm, colour, dilution, folder) for dilution in DILUTIONS]
+            every.append(min(options, key=lambda one: abs(math.log(one.thickness / BEST_THICKNESS))))
+    return every + [mie_truth(diameter_nm, colour, 1.0, folder) for colour, diameter_nm in THICK]
+
+
+def near_beam_folder() -> SlabFolder:
+    """A cell of 1 mm without glass: three lights, three cameras a side, one of which looks 3 degrees beside the beam of the first."""
+    angles = {"f": (-5, -15, -25), "b": (8, 18, -15)}
+    sides = {"f": "front", "b": "back"}
+    lights = [{"name": f"l{k}", "side": "front", "angle_deg": float(angle)} for k, angle in enumerate((5, 15, 25))]
+    cameras = [
+        {"name": f"{letter}{k}", "side": sides[letter], "angle_deg": float(angle)}
+        for letter, own in angles.items()
+        for k, angle in enumerate(own)
+    ]
+    return SlabFolder.model_validate(
+        {
+            "kind": "slab",
+            "units": "mm",
+            "wavelengths_nm": [532.0],
+            "cell": {"width_mm": 1.0, "index": 1.33},
+            "beam": {"profile": "gaussian", "sigma_mm": 0.25},
+            "pixels": {"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 16, "rows": 16},
+            "lights": lights,
+            "cameras": cameras,
+            "images": [
+                {
+                    "camera": camera["name"],
+                    "light": light["name"],
+                    "file": f"{camera['name']}_{light['name']}.npy",
+                    "variance_file": f"{camera['name']}_{light['name']}_var.npy",
+                }
+                for light in lights
+                for camera in cameras
+            ],
+        }
+    )
+
+
+def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
+    """One row per dispersion; ``case`` is the beginning of its name, such as "500 nm G"."""
+    chosen = [one for one in truths() if case is None or one.name.startswith(case)]
+    if not chosen:
+        raise InputError(f"No dispersion is named {case}; known are {', '.join(one.name for one in truths())}.")
+    rows: list[dict[str, Any]] = []
+    for number, truth in enumerate(chosen[:1] if quick else chosen):
+        images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=101 + number)
+        rows.append(recovered(truth, images, variances, seed=11 + number).model_dump())
+        keep(rows)
+    return rows
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Errors of sigma_s and of the phase function beside their bounds."""
+    from services.bench.plots import grid
+
+    figure, (scattering, phase) = grid(2)
+    names = [row["benchmark"] for row in rows]
+    places = np.arange(len(rows))
+    of_scattering = [row["numbers"]["sigma_s"] for row in rows]
+    errors = [100 * abs(one["value"] / one["truth"] - 1) for one in of_scattering]
+    bounds = [100 * one["bound"] / one["truth"] for one in of_scattering]
+    for axes, found, allowed, title in (
+        (scattering, errors, bounds, "σs"),
+        (phase, [100 * row["error"] for row in rows], [100 * row["phase_bound"] for row in rows], "phase function, L2"),
+    ):
+        axes.plot(found, places, "o", label="error")
+        axes.plot(allowed, places, "|", markersize=14, color="C1", label="bound")
+        axes.set(
+            xscale="log", xlabel="per cent", title=title, yticks=places, yticklabels=names if axes is scattering else []
+        )
+        axes.invert_yaxis()
+        axes.grid(visible=True, alpha=0.25)
+        axes.legend(fontsize=8)
+    return figure

@@ -1,0 +1,161 @@
+"""A known material through noisy images and the fit: what came out beside what is true and what the images allow."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.bench import Row
+from services.bench.slab.plain_photons import plain_images
+from services.core.geometry import Record
+from services.core.slab_folder import SlabFolder
+from services.fit.slab.bound import Bound, bound_of
+from services.fit.slab.fit import SlabOptions, fit_slab
+from services.fit.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.fit.slab.model.rig import rig_of
+from services.fit.slab.results.result import SlabFit
+from services.fit.slab.solve.uncertainty import slopes
+
+Array = NDArray[np.float64]
+
+NOISE = 0.01
+"""Poisson noise of a pixel that has its image's mean."""
+FINE_RAD: Array = np.radians(np.arange(0, 180.25, 0.5))
+"""Angles at which phase functions are compared."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A medium in a cell."""
+
+    name: str
+    folder: SlabFolder
+    scattering_per_mm: float
+    absorption_per_mm: float
+    phase: Callable[[Array], Array]
+    """Of the scattering angle in rad; its scale is free."""
+
+    @property
+    def thickness(self) -> float:
+        """sigma_t w."""
+        return (self.scattering_per_mm + self.absorption_per_mm) * self.folder.cell.width_mm
+
+    def material(self) -> Material:
+        """In the span of the dictionary."""
+        shape = self.phase(ANGLES_RAD)
+        return Material(self.scattering_per_mm * shape / float(shape @ tent_solid_angles()), self.absorption_per_mm)
+
+    def phase_per_sr(self) -> Array:
+        """At the fine angles, normalised there."""
+        values = self.phase(FINE_RAD)
+        total = 2 * math.pi * float(np.trapezoid(values * np.sin(FINE_RAD), FINE_RAD))
+        return np.asarray(values / total)
+
+
+class Recovered(Record):
+    """One number of a fit."""
+
+    truth: float
+    value: float
+    se: float
+    bound: float
+    determined: bool
+
+
+class Recovery(Row):
+    """One truth, one seed. ``error`` is that of the phase function, in L2 over equal steps of the angle."""
+
+    thickness: float
+    albedo: float
+    seed: int
+    numbers: dict[str, Recovered]
+    phase_bound: float
+    phase_error_by_sine: float
+    """The same weighted by the sine of the angle."""
+    phase_flagged: float
+    """Share of the phase function's values that the fit calls not determined."""
+    fit_error: float
+    converged: bool
+
+
+def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
+    """Images by plain photons with shot noise, and their variances (images, rows, columns)."""
+    extinction = truth.scattering_per_mm + truth.absorption_per_mm
+    images, variances = plain_images(
+        truth.folder, extinction, truth.scattering_per_mm / extinction, truth.phase, photons, seed
+    )
+    # A pixel's own variance is drawn with its value, so the walk's noise is told as one that is proportional to the image.
+    shares = variances.sum(axis=(1, 2)) / images.sum(axis=(1, 2))
+    means = images.mean(axis=(1, 2), keepdims=True)
+    total = (NOISE**2 * means + shares[:, None, None]) * np.maximum(images, 0.01 * means)
+    shot = NOISE * np.sqrt(np.maximum(images, 0) * means)
+    return images + shot * np.random.default_rng(seed).normal(size=images.shape), total
+
+
+def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recovery:
+    """Fit the images and compare."""
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
+        (root / "slab.json").write_text(truth.folder.model_dump_json())
+        for entry, image, variance in zip(truth.folder.images, images, variances, strict=True):
+            np.save(root / entry.file, image)
+            assert entry.variance_file is not None
+            np.save(root / entry.variance_file, variance)
+        (fit,) = fit_slab(root, SlabOptions(seed=seed))
+    rig = rig_of(truth.folder, fit.wavelength_nm)
+    # What the walk's noise adds to the shot noise of a measured value.
+    beside = variances - NOISE**2 * np.maximum(images, 0) * images.mean(axis=(1, 2), keepdims=True)
+    if rig.grid.folded:
+        beside = 0.25 * (beside[:, : rig.grid.rows][:, ::-1] + beside[:, rig.grid.rows :])
+    bound = bound_of(
+        rig, truth.material(), noise=NOISE, variances=np.maximum(beside.reshape(len(beside), -1), 0), seed=seed
+    )
+    return compared(truth, fit, bound, seed)
+
+
+def compared(truth: Truth, fit: SlabFit, bound: Bound, seed: int) -> Recovery:
+    """The row of one fit."""
+    material = truth.material()
+    g = material.mean_cosine
+    true = {
+        "sigma_t": truth.scattering_per_mm + truth.absorption_per_mm,
+        "sigma_s": truth.scattering_per_mm,
+        "sigma_a": truth.absorption_per_mm,
+        "sigma_s_reduced": truth.scattering_per_mm * (1 - g),
+        "g": g,
+    }
+    numbers = {}
+    for name, slope in slopes(material).items():
+        told = getattr(fit.parameters, name)
+        numbers[name] = Recovered(
+            truth=true[name], value=told.value, se=told.se, bound=bound.of(slope), determined=told.determined
+        )
+    phase = truth.phase_per_sr()
+    difference = np.interp(FINE_RAD, ANGLES_RAD, np.array(fit.phase.value_per_sr)) - phase
+    sines = np.sin(FINE_RAD)
+    allowed = np.interp(FINE_RAD, ANGLES_RAD, bound.of_phase(material))
+    return Recovery(
+        benchmark=truth.name,
+        peer="dentine",
+        seconds=fit.core_seconds,
+        error=_share(difference, phase),
+        thickness=truth.thickness,
+        albedo=true["sigma_s"] / true["sigma_t"],
+        seed=seed,
+        numbers=numbers,
+        phase_bound=_share(allowed, phase),
+        phase_error_by_sine=_share(difference * np.sqrt(sines), phase * np.sqrt(sines)),
+        phase_flagged=float(np.mean([not one for one in fit.phase.determined])),
+        fit_error=fit.errors.fit_error,
+        converged=fit.converged,
+    )
+
+
+def _share(difference: Array, of: Array) -> float:
+    return float(np.sqrt((difference**2).sum() / (of**2).sum()))

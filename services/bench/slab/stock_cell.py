@@ -1,0 +1,184 @@
+"""Images of an index-matched cell by stock Mitsuba: truths for the slab's fit that share no code with its kernel.
+
+Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black plate
+whose opacity is one minus the beam's profile is one: ``volpath`` multiplies what a plate lets through into every connection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.slab_folder import Light, SlabCamera, SlabFolder
+
+Array = NDArray[np.float64]
+
+WAVELENGTH_NM = 532.0
+"""Only a name here: the medium is given."""
+HALF_CELL_MM = 12.0
+"""The cell's lateral half edge, twice that of the pixels: what leaves there comes back to no pixel."""
+HALF_PLATE_MM, PLATE_NODES, PLATE_AWAY_MM = 14.0, 2048, 60.0
+"""The plate shades the whole cell, its nodes are a 70th of the beam's size, and it stands behind all cameras."""
+COSINES = 20_001
+"""Nodes of the phase function's table."""
+MAX_ORDER = 256
+RENDERS = 8
+"""Independent renders of an image, whose spread gives its variance."""
+
+
+def cell_folder(**changes: Any) -> SlabFolder:
+    """A matched cell of 1 mm under a beam of 1 mm, 3 lights and 6 cameras, of which one looks 3 degrees beside a beam.
+
+    The beam is as broad as stock Mitsuba can light well: a connection from anywhere outside of it brings nothing.
+    """
+    lights = [{"name": f"l{angle}", "side": "front", "angle_deg": float(angle)} for angle in (5, 15, 25)]
+    cameras = [
+        {"name": f"{side[0]}{number}", "side": side, "angle_deg": float(angle)}
+        for side, angles in (("front", (-5, -15, -25)), ("back", (8, 18, -15)))
+        for number, angle in enumerate(angles)
+    ]
+    told: dict[str, Any] = {
+        "kind": "slab",
+        "units": "mm",
+        "wavelengths_nm": [WAVELENGTH_NM],
+        "cell": {"width_mm": 1.0, "index": None, "boundary": "matched"},
+        "beam": {"profile": "gaussian", "sigma_mm": 1.0, "power": 1.0},
+        "pixels": {"x_mm": [-6.0, 6.0], "y_mm": [-6.0, 6.0], "columns": 12, "rows": 12},
+        "lights": lights,
+        "cameras": cameras,
+    }
+    told.update(changes)
+    told["images"] = [
+        {
+            "camera": camera["name"],
+            "light": light["name"],
+            "file": f"{camera['name']}_{light['name']}.npy",
+            "variance_file": f"{camera['name']}_{light['name']}_var.npy",
+        }
+        for light in told["lights"]
+        for camera in told["cameras"]
+    ]
+    return SlabFolder.model_validate(told)
+
+
+def stock_images(
+    folder: SlabFolder, medium: dict[str, Any], samples: int, seed: int, done: Callable[[int], None] | None = None
+) -> tuple[Array, Array]:
+    """Images in the folder's order and the variances of their means (images, rows, columns).
+
+    Args:
+        medium: as ``medium_of`` gives it.
+        samples: paths a pixel, in all.
+        done: told of each image's number.
+    """
+    from services.fit.transport.platform import prepare_device
+
+    prepare_device()
+    import mitsuba as mi
+
+    lights = {light.name: light for light in folder.lights}
+    cameras = {camera.name: camera for camera in folder.cameras}
+    plate = mi.Bitmap(_plate(folder).astype(np.float32)[..., None])
+    means, variances = [], []
+    for number, entry in enumerate(folder.images):
+        scene = _scene(folder, medium, lights[entry.light], cameras[entry.camera], plate)
+        renders = np.stack(
+            [
+                np.array(mi.render(scene, spp=max(1, samples // RENDERS), seed=seed + RENDERS * number + k))[..., 0]
+                for k in range(RENDERS)
+            ]
+        ).astype(np.float64)
+        # A film's rows go down, and those of a camera in front run against the world's x.
+        renders = renders[:, ::-1, ::-1] if cameras[entry.camera].side == "front" else renders[:, ::-1]
+        means.append(renders.mean(axis=0))
+        variances.append(renders.var(axis=0, ddof=1) / RENDERS)
+        if done is not None:
+            done(number)
+    return np.stack(means), np.stack(variances)
+
+
+def medium_of(extinction_per_mm: float, albedo: float, phase_per_sr: Callable[[Array], Array]) -> dict[str, Any]:
+    """A homogeneous medium with a tabulated phase function.
+
+    Args:
+        phase_per_sr: of the scattering angle in rad; its scale is free.
+    """
+    values = phase_per_sr(np.arccos(np.linspace(-1.0, 1.0, COSINES)))
+    return {
+        "type": "homogeneous",
+        "sigma_t": extinction_per_mm,
+        "albedo": albedo,
+        "phase": {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values)},
+    }
+
+
+def _plate(folder: SlabFolder) -> Array:
+    """Opacity of the plate (PLATE_NODES, PLATE_NODES)."""
+    across = (np.arange(PLATE_NODES) + 0.5) / PLATE_NODES * 2 * HALF_PLATE_MM - HALF_PLATE_MM
+    squared = across[:, None] ** 2 + across[None] ** 2
+    return 1 - np.exp(-squared / (2 * folder.beam.size_mm**2))
+
+
+def _direction(side: str, angle_deg: float, *, arriving: bool) -> Array:
+    """Travelling direction of a beam that arrives at a face, or of light that leaves it."""
+    forward = 1.0 if (side == "front") == arriving else -1.0
+    return np.array([math.sin(math.radians(angle_deg)), 0.0, forward * math.cos(math.radians(angle_deg))])
+
+
+def _scene(folder: SlabFolder, medium: dict[str, Any], light: Light, camera: SlabCamera, plate: Any) -> Any:
+    import mitsuba as mi
+
+    width = folder.cell.width_mm
+    transform = mi.ScalarTransform4f
+
+    def facing(side: str, away: Array) -> Any:
+        face = np.array([0.0, 0.0, 0.0 if side == "front" else width])
+        return transform().look_at(origin=(face + away).tolist(), target=face.tolist(), up=[0, 1, 0])
+
+    beam = _direction(light.side, light.angle_deg, arriving=True)
+    half_x, half_y = (0.5 * (high - low) for low, high in (folder.pixels.x_mm, folder.pixels.y_mm))
+    scale = [half_x * math.cos(math.radians(camera.angle_deg)), half_y, 1]
+    view = facing(camera.side, 10 * _direction(camera.side, camera.angle_deg, arriving=False))
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": MAX_ORDER, "rr_depth": 2 * MAX_ORDER},
+            "cell": {
+                "type": "cube",
+                "to_world": transform().translate([0, 0, width / 2]).scale([HALF_CELL_MM, HALF_CELL_MM, width / 2]),
+                "bsdf": {"type": "null"},
+                "interior": medium,
+            },
+            "light": {
+                "type": "directional",
+                "direction": beam.tolist(),
+                "irradiance": folder.beam.power / (2 * math.pi * folder.beam.size_mm**2),
+            },
+            "plate": {
+                "type": "rectangle",
+                "to_world": facing(light.side, -PLATE_AWAY_MM * beam)
+                @ transform().scale([HALF_PLATE_MM, HALF_PLATE_MM, 1]),
+                "bsdf": {
+                    "type": "mask",
+                    "opacity": {"type": "bitmap", "bitmap": plate, "raw": True, "wrap_mode": "clamp"},
+                    "nested": {"type": "diffuse", "reflectance": 0.0},
+                },
+            },
+            "sensor": {
+                "type": "orthographic",
+                "to_world": view @ transform().scale(scale),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": folder.pixels.columns,
+                    "height": folder.pixels.rows,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "luminance",
+                },
+            },
+        },
+        optimize=False,
+    )

@@ -1,0 +1,83 @@
+"""What images of a cell can tell at best: the Cramér-Rao bound of a material under a rig, before anything is measured.
+
+The curvature of the misfit comes from the forward model at a known material, and the smoothness prior adds its own. The bound
+of a number is the root of its posterior variance and the square of what the prior moves it by at that material.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.slab.images import shot_noise
+from services.fit.slab.model.dictionary import Material
+from services.fit.slab.model.forward import Blocks, render
+from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.gauss_newton import quadratic_at, unknowns
+from services.fit.slab.solve.normal import normal_equations
+from services.fit.slab.solve.prior import precision, scales_for
+from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, flag_scales, phase_chain
+
+Array = NDArray[np.float64]
+
+BATCHES, PATHS = 8, 8000
+"""Of the render that gives the curvature: as many as a step of the search takes."""
+FIRST_STEP = 2**33
+"""Numbers its random streams apart from a fit's."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Of one material under one rig."""
+
+    uncertainty: Uncertainty
+    bias: Array
+    """What the prior moves the unknowns by (UNKNOWNS,)."""
+
+    def of(self, slope: Array) -> float:
+        """Of a quantity, from its derivatives by ln f and sigma_a (UNKNOWNS,)."""
+        return float(np.hypot(self.uncertainty.standard_error(slope), slope @ self.bias))
+
+    def of_phase(self, material: Material) -> Array:
+        """Of the phase function at the knots, 1/sr (KNOTS,)."""
+        chain = phase_chain(material)
+        variance = np.einsum("ij,jk,ik->i", chain, self.uncertainty.covariance, chain, optimize=True)
+        return np.asarray(np.sqrt(variance + (chain @ self.bias) ** 2) * material.phase_per_sr)
+
+
+def bound_of(
+    rig: Rig,
+    material: Material,
+    *,
+    noise: float,
+    variances: Array | None = None,
+    seed: int = 1,
+    scale: float | None = None,
+    paths: int = PATHS,
+    blocks: Blocks = map,
+) -> Bound:
+    """The bound from images with shot noise.
+
+    Args:
+        noise: standard deviation of a pixel that has its image's mean, as a share of it.
+        variances: of the measurement beside its shot noise (images, values), such as a reference's own.
+        scale: of the smoothness prior, per rad2; the loosest for this optical thickness where it is not given.
+    """
+    batches = render(
+        rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths, scores=True, blocks=blocks
+    )
+    mean = batches.mean
+    halves = 2 if rig.grid.folded else 1
+    shot = np.stack([shot_noise(image, noise) for image in mean]) / halves
+    weights = 1 / (shot + (0 if variances is None else variances))
+    equations = normal_equations(batches, material, mean, weights)
+    quadratic, x = quadratic_at(material, equations), unknowns(material)
+    if scale is None:
+        scale = max(scales_for(material.extinction_per_mm * rig.width_mm))
+    uncertainty = Uncertainty(
+        covariance_of(quadratic, precision(scale)),
+        covariance_of(quadratic, precision(flag_scales())),
+    )
+    return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)

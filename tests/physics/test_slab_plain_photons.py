@@ -1,0 +1,80 @@
+"""The plain walk that gives truths to the slab's fit: against the fit's own kernel, with which it shares no code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, near_beam_folder, truths
+from services.bench.slab.plain_photons import BATCHES, plain_images
+from services.bench.slab.stock_cell import RENDERS, cell_folder, medium_of, stock_images
+from services.core.slab_folder import SlabFolder
+from services.fit.slab.model.dictionary import henyey_greenstein
+from services.fit.slab.model.forward import render
+from services.fit.slab.model.rig import rig_of
+from tests.support.slab_tables import rows_of
+from tests.support.small_slab import WAVELENGTH_NM, description
+from tests.support.z_scores import require_unbiased, student_to_normal
+
+G = 0.5
+KERNEL_BATCHES = 8
+
+
+def henyey_greenstein_shape(angles_rad: np.ndarray) -> np.ndarray:
+    return np.asarray((1 + G * G - 2 * G * np.cos(angles_rad)) ** -1.5)
+
+
+@pytest.mark.parametrize("index", [1.0, 1.5])
+def test_both_walks_give_the_same_images(index: float) -> None:
+    cell = {"width_mm": 1.0, "index": index, "boundary": "smooth" if index > 1 else "matched"}
+    # Two by two pixels hold all light, so that each collects enough photons for its noise to be normal.
+    pixels = {"x_mm": [-40.0, 40.0], "y_mm": [-40.0, 40.0], "columns": 2, "rows": 2}
+    folder = SlabFolder.model_validate(description(cell=cell, pixels=pixels))
+    images, variances = plain_images(folder, 2.2, 2.0 / 2.2, henyey_greenstein_shape, photons=160_000, seed=5)
+    rig = rig_of(folder, WAVELENGTH_NM)
+    ours = render(
+        rig, henyey_greenstein(2.0, G, 0.2), seed=3, step=0, batches=KERNEL_BATCHES, paths=20_000, scores=False
+    ).images
+    # The kernel's grid is folded at y = 0: both rows of the plain images have its expectation.
+    plain, of_plain = images.mean(axis=1), variances.sum(axis=1) / 4
+    error = np.sqrt(of_plain + ours.var(axis=0, ddof=1) / KERNEL_BATCHES)
+    assert (error < 0.02 * plain).all()
+    scores = student_to_normal((ours.mean(axis=0) - plain) / error, BATCHES - 1 + KERNEL_BATCHES - 1)
+    require_unbiased(scores, independent=4)
+
+
+def test_dispersions_are_those_of_the_reference() -> None:
+    folder = near_beam_folder()
+    for row in rows_of("mie_dispersions.csv"):
+        truth = mie_truth(float(row["diameter_nm"]), row["channel"], 1.0, folder)
+        # The table's digits, and the dictionary's knots for g.
+        assert truth.scattering_per_mm == pytest.approx(float(row["mu_s_per_mm"]), rel=1e-4)
+        assert truth.material().mean_cosine == pytest.approx(float(row["g"]), abs=2e-4)
+
+
+def test_every_dispersion_is_diluted_to_where_a_cell_tells_most() -> None:
+    every = truths()
+    assert len(every) == len(DIAMETERS_NM) * len(COLOURS) + 3
+    assert all(abs(math.log(one.thickness / 2)) < math.log(1.5) for one in every[:9])
+    assert [one.thickness > 5 for one in every[9:]] == [True] * 3
+
+
+@pytest.mark.slow
+def test_images_of_a_matched_cell_agree_with_stock_mitsuba() -> None:
+    told = cell_folder()
+    # Cameras on both faces, one of which looks 3 degrees beside the beam.
+    folder = told.model_copy(update={"images": tuple(told.images[k] for k in (1, 3, 4))})
+    plain, of_plain = plain_images(folder, 1.02, 1 / 1.02, henyey_greenstein_shape, photons=1_000_000, seed=5)
+    stock, of_stock = stock_images(folder, medium_of(1.02, 1 / 1.02, henyey_greenstein_shape), 2**16, seed=1)
+    # Whole images and the row through the beam's middle, seen from each end, tell of scale, place and orientation.
+    middle = slice(5, 7)
+    parts = [(slice(None), slice(None)), (middle, slice(0, 4)), (middle, slice(4, 8)), (middle, slice(8, 12))]
+    scores = []
+    for rows, columns in parts:
+        difference, variance = plain - stock, of_plain + of_stock
+        part, spread = difference[:, rows, columns].sum(axis=(1, 2)), variance[:, rows, columns].sum(axis=(1, 2))
+        assert (np.sqrt(spread) < 0.03 * plain[:, rows, columns].sum(axis=(1, 2))).all()
+        scores.append(student_to_normal(part / np.sqrt(spread), RENDERS - 1))
+    require_unbiased(np.ravel(scores), independent=3)
