@@ -13,6 +13,9 @@ import pytest
 
 from services.api.auth.scopes import LIVENESS, SETUP, guarded_routes
 from services.api.auth.tokens import Scope
+from services.api.dome.dome import Dome
+from services.api.jobs.jobs import Jobs
+from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec
 from services.core.settings import RateSettings
@@ -316,3 +319,28 @@ def test_a_report_is_shown_inside_no_other_page(house: House) -> None:
     answer = house.ask("GET", f"/v1/jobs/{house.ids['job_id']}/artifacts/report.html", "other", Scope.ADMIN)
     assert answer.status_code in {200, 404}  # the table above may have deleted the job
     assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.attack("routes × scopes", "the ids of others' jobs in the dome's answers")
+def test_the_dome_names_jobs_to_those_alone_who_may_see_them(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    job, status = (
+        house.ids["job_id"],
+        dict.fromkeys(("interlock_closed", "emergency_stop", "supply_on", "stopped"), False),
+    )
+    told = {"firmware": "1", "light_count": 1, "faults": (), "lit": (), "temperature_degc": (), "current_ma": ()}
+    answer = DomeAnswer(number=1, status=DomeStatus.model_validate(told | status))
+    monkeypatch.setattr(Dome, "_process_ask", lambda *_, **__: answer)
+    for name in ("capturing", "cancel_captures"):
+        monkeypatch.setattr(Jobs, name, lambda self: [self.repository.get(job)])
+    for whose, scope, shown in (
+        ("own", Scope.OPERATE_DOME, [job]),
+        ("other", Scope.ADMIN, [job]),
+        ("other", Scope.OPERATE_DOME, []),
+        ("alone", Scope.OPERATE_DOME, []),
+    ):
+        state = house.ask("GET", "/v1/dome", whose, scope).json()
+        off = house.ask("POST", "/v1/dome/off", whose, scope).json()
+        busy = house.ask("PUT", "/v1/dome/light", whose, scope, json={"light": 0}).json()["detail"]
+        assert (state["capturing"], state["others_capturing"]) == (shown, 1 - len(shown))
+        assert (off["stopped"], off["others_stopped"]) == (shown, 1 - len(shown))
+        assert ("captures with a dome" in busy, job in busy) == (True, bool(shown))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 
@@ -14,10 +14,12 @@ from pydantic import Field
 from services.api.dome.process import DomeProcess
 from services.api.jobs.jobs import Jobs
 from services.api.jobs.light_limits import LightLimits
+from services.api.jobs.records import Job
 from services.client.errors import UnknownDomeError
 from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError
 from services.core.geometry import Record
+from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import Number, RigSpec, Unit, Whole
 from services.core.settings import DomeSettings
 
@@ -47,14 +49,18 @@ class DomeState(Record):
 
     address: str
     status: DomeStatus
-    capturing: tuple[str, ...] = Field(description="jobs whose capture is under way")
+    capturing: tuple[str, ...] = Field(description="jobs whose capture is under way, of those that the caller may see")
+    others_capturing: int = Field(description="how many jobs of others capture as well")
 
 
 class AllOff(Record):
     """What ALL OFF did."""
 
     status: DomeStatus = Field(description="of the dome, confirmed dark")
-    stopped: tuple[str, ...] = Field(description="jobs that captured, or waited for it, and were cancelled")
+    stopped: tuple[str, ...] = Field(
+        description="jobs that captured, or waited for it, and were cancelled, of those that the caller may see"
+    )
+    others_stopped: int = Field(description="how many jobs of others were cancelled as well")
 
 
 class PreflightResult(Record):
@@ -83,18 +89,17 @@ class Dome:
         """Leave the dome dark."""
         self._process.close()
 
-    def state(self) -> DomeState:
+    def state(self, viewer: Viewer = LOCAL_VIEWER) -> DomeState:
         """What the controller says; nothing waits for it and it disturbs no capture.
 
         Raises:
             UnknownDomeError: this server has none. RigError: it does not answer.
         """
         status = _status(self._ask(ANSWER_S, do="status"))
-        return DomeState(
-            address=self._address or "", status=status, capturing=tuple(job.id for job in self._jobs.capturing())
-        )
+        shown, others = _shown(self._jobs.capturing(), viewer)
+        return DomeState(address=self._address or "", status=status, capturing=shown, others_capturing=others)
 
-    def all_off(self) -> AllOff:
+    def all_off(self, viewer: Viewer = LOCAL_VIEWER) -> AllOff:
         """Switch every light off and stop every capture; waits for nobody who has the dome.
 
         The dome refuses light from then on. Captures are cancelled as well, queued ones too, as whichever begins next would arm the dome anew; then the
@@ -108,9 +113,11 @@ class Dome:
             stopped = stopping.submit(self._stop_captures)
             with suppress(DentineError):
                 self._switch_off()
-        return AllOff(status=self._switch_off(), stopped=stopped.result())
+        status = self._switch_off()
+        shown, others = _shown(stopped.result(), viewer)
+        return AllOff(status=status, stopped=shown, others_stopped=others)
 
-    def light(self, wanted: LightRequest) -> DomeStatus:
+    def light(self, wanted: LightRequest, viewer: Viewer = LOCAL_VIEWER) -> DomeStatus:
         """Switch one light on for a while.
 
         Raises:
@@ -120,7 +127,7 @@ class Dome:
             raise SettingsError(
                 f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g} (DENTINE__SERVER__DOME__MAX_LEVEL); lower it."
             )
-        with self._driven_by_hand():
+        with self._driven_by_hand(viewer):
             return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
 
     def dark(self) -> DomeStatus:
@@ -131,7 +138,7 @@ class Dome:
         """
         return _status(self._ask(ANSWER_S, do="dark"))
 
-    def preflight(self, rig: RigSpec) -> PreflightResult:
+    def preflight(self, rig: RigSpec, viewer: Viewer = LOCAL_VIEWER) -> PreflightResult:
         """Light every light for a moment and look through the cameras.
 
         Raises:
@@ -142,7 +149,7 @@ class Dome:
         if self._address is not None:
             self._limits.require(rig.model_copy(update={"dome": self._address}))
         self._jobs.server_paths.require("mouth", rig.mouth)
-        with self._driven_by_hand():
+        with self._driven_by_hand(viewer):
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)
 
     def make_way(self) -> None:
@@ -153,14 +160,17 @@ class Dome:
                     self._ask(ANSWER_S, do="dark")
 
     @contextmanager
-    def _driven_by_hand(self) -> Iterator[None]:
+    def _driven_by_hand(self, viewer: Viewer) -> Iterator[None]:
         # Held while the question is asked whether a capture runs: one that begins afterwards makes its way after us.
         if not self._driving.acquire(timeout=BUSY_S):
             raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
         try:
             if capturing := self._jobs.capturing():
+                shown, _ = _shown(capturing, viewer)
                 raise DomeBusyError(
-                    f"Job {capturing[0].id} captures with a dome; wait for it, cancel it, or press ALL OFF."
+                    f"Job {shown[0]} captures with a dome; wait for it, cancel it, or press ALL OFF."
+                    if shown
+                    else "A job of others captures with a dome; wait for it, or press ALL OFF."
                 )
             yield
         finally:
@@ -173,9 +183,9 @@ class Dome:
             self._process.kill()
         return _status(self._ask(ANSWER_S, do="off"))
 
-    def _stop_captures(self) -> tuple[str, ...]:
+    def _stop_captures(self) -> Sequence[Job]:
         try:
-            return tuple(self._jobs.cancel_captures())
+            return self._jobs.cancel_captures()
         except sql.exc.SQLAlchemyError:
             logging.getLogger(__name__).exception("captures could not be told of ALL OFF; the dome refuses them light")
             return ()
@@ -194,6 +204,12 @@ class Dome:
                 "This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS to its controller's host:port."
             )
         return self._process.ask(timeout_s, **command)
+
+
+def _shown(jobs: Sequence[Job], viewer: Viewer) -> tuple[tuple[str, ...], int]:
+    """Ids of those jobs that somebody may see, and how many others there are."""
+    shown = tuple(job.id for job in jobs if viewer.may_see(job.owner))
+    return shown, len(jobs) - len(shown)
 
 
 def _status(answer: DomeAnswer) -> DomeStatus:

@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter
 
-from services.api.auth.scopes import needs
+from services.api.auth.scopes import Asker, needs
 from services.api.dome.dome import AllOff, Dome, DomeState, LightRequest, PreflightResult
 from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.problems import refusals
@@ -17,21 +17,21 @@ def build_dome_router(dome: Dome, darkeners: ThreadPool, operators: ThreadPool) 
 
     @router.get("", dependencies=[needs("operate-dome")])
     @operators.answering
-    def state() -> DomeState:
+    def state(asker: Asker) -> DomeState:
         """What the dome's controller says, and which jobs capture."""
-        return dome.state()
+        return dome.state(asker)
 
     @router.post("/off", dependencies=[needs("operate-dome", darkens=True)])
     @darkeners.answering
-    def off() -> AllOff:
+    def off(asker: Asker) -> AllOff:
         """ALL OFF: every light dark at once and every capture stopped. The dome refuses light until somebody starts anew."""
-        return dome.all_off()
+        return dome.all_off(asker)
 
     @router.put("/light", dependencies=[needs("operate-dome")])
     @operators.answering
-    def light(wanted: Sent[LightRequest]) -> DomeStatus:
+    def light(wanted: Sent[LightRequest], asker: Asker) -> DomeStatus:
         """Switch one light on, for alignment. It goes dark by itself after 'on_s'; repeat the request to keep it on."""
-        return dome.light(wanted)
+        return dome.light(wanted, asker)
 
     @router.delete("/light", dependencies=[needs("operate-dome", darkens=True)])
     @operators.answering
@@ -41,8 +41,8 @@ def build_dome_router(dome: Dome, darkeners: ThreadPool, operators: ThreadPool) 
 
     @router.post("/preflight", dependencies=[needs("operate-dome")])
     @operators.answering
-    def preflight(rig: Sent[RigSpec]) -> PreflightResult:
+    def preflight(rig: Sent[RigSpec], asker: Asker) -> PreflightResult:
         """Look at every light, the black level and clipping, with the dome of this server; takes seconds."""
-        return dome.preflight(rig)
+        return dome.preflight(rig, asker)
 
     return router

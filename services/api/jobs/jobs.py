@@ -228,15 +228,15 @@ class Jobs:
             for job in self._to_capture([self.repository.get(job_id)])
         )
 
-    def cancel_captures(self) -> list[str]:
-        """Cancel every job that captures or will capture next; returns their ids."""
+    def cancel_captures(self) -> list[Job]:
+        """Cancel every job that captures or will capture next; returns them as they were."""
         cancelled, capturing = [], self.capturing()
         for job in capturing:  # all of them before the first is recorded, as each may have a dome of its own
             self._tell_to_stop(job.id)
         for job in self._to_capture(self.repository.queued()) + capturing:
             with suppress(JobStateError):
                 self.cancel(job.id)
-                cancelled.append(job.id)
+                cancelled.append(job)
         return cancelled
 
     def waits_for(self, job: Job) -> str | None:

@@ -184,8 +184,16 @@ export interface DomeStatus {
 export interface DomeState {
   address: string;
   status: DomeStatus;
-  /** Jobs whose capture is under way. */
+  /** Jobs whose capture is under way, of those that this page may show. */
   capturing: string[];
+  others_capturing: number;
+}
+
+export interface AllOff {
+  status: DomeStatus;
+  /** Jobs that were cancelled, of those that this page may show. */
+  stopped: string[];
+  others_stopped: number;
 }
 
 /** The server answers, but not with what was asked for; the message is its sentence. */
@@ -250,7 +258,7 @@ export const getDome = (): Promise<DomeState> => inLane(() => request("/dome", {
  * no cookie either: browsers keep connections with and without cookies apart, so that this one is free whatever else is
  * under way, downloads too.
  */
-export function allOff(isOpen: boolean): Promise<{ status: DomeStatus; stopped: string[] }> {
+export function allOff(isOpen: boolean): Promise<AllOff> {
   clearTheWay();
   return request("/dome/off", { method: "POST", priority: "high", credentials: isOpen ? "omit" : "same-origin" });
 }

@@ -93,9 +93,10 @@ export class DomeView {
     }, OFF_PATIENCE_MS);
     try {
       await this.act(async () => {
-        const { status, stopped } = await allOff(this.isOpen());
+        const { status, stopped, others_stopped: others } = await allOff(this.isOpen());
         this.hear(status);
-        this.done.textContent = `All is dark. ${stopped.length ? `Stopped: ${stopped.join(", ")}.` : "No job was capturing."}`;
+        const names = [...stopped, ...(others ? [ofOthers(others)] : [])];
+        this.done.textContent = `All is dark. ${names.length ? `Stopped: ${names.join(", ")}.` : "No job was capturing."}`;
       });
       if (!this.refusal.hidden) this.refusal.textContent = `ALL OFF was not carried out: ${this.refusal.textContent} ${EMERGENCY}`;
     } finally {
@@ -192,11 +193,13 @@ export class DomeView {
     this.silence.hidden = true;
     this.hear(dome.status);
     this.address.textContent = dome.address;
-    this.capturing.hidden = dome.capturing.length === 0;
-    if (this.capturers === dome.capturing.join()) return;
-    this.capturers = dome.capturing.join();
-    const jobs = dome.capturing.flatMap((id) => [" ", element("a", { href: `#/${id}` }, id)]);
-    this.capturing.replaceChildren("The dome captures, so no light goes on by hand. Job", ...jobs);
+    const capturers = [...dome.capturing, dome.others_capturing].join();
+    this.capturing.hidden = dome.capturing.length + dome.others_capturing === 0;
+    if (this.capturers === capturers) return;
+    this.capturers = capturers;
+    const links = dome.capturing.map((id) => element("a", { href: `#/${id}` }, id));
+    const jobs = [...(links.length ? ["Job", ...links] : []), ...(dome.others_capturing ? [ofOthers(dome.others_capturing)] : [])];
+    this.capturing.replaceChildren("The dome captures, so no light goes on by hand.", ...jobs.flatMap((job) => [" ", job]));
   }
 
   private show(status: DomeStatus): void {
@@ -235,4 +238,8 @@ function labelled(text: string, input: HTMLInputElement): HTMLElement {
 
 function numberInput(id: string, value: number, least: number, most: number): HTMLInputElement {
   return element("input", { id, type: "number", min: `${least}`, max: `${most}`, step: "1", value: `${value}`, required: "" });
+}
+
+function ofOthers(count: number): string {
+  return count === 1 ? "1 job of others" : `${count} jobs of others`;
 }
