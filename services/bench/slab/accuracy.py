@@ -153,4 +153,4 @@ def _error(row: dict[str, Any], name: str) -> float:
     if name == "error":
         return float(row["error"])
     number = row["numbers"]["g" if name == "g" else "sigma_s_reduced"]
-    return abs(number["value"] - number["truth"]) / (1 if name == "g" else number["truth"])
+    return float(abs(number["value"] - number["truth"]) / (1 if name == "g" else number["truth"]))

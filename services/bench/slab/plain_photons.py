@@ -104,7 +104,7 @@ def _leaving(camera: Any, index: float) -> tuple[float, float]:
     return math.sin(math.radians(camera.angle_deg)) / index, -1.0 if camera.side == "front" else 1.0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _reflectance(cosine: float, index: float) -> float:
     """Of unpolarised light from inside a medium of relative index ``index``, at the cosine inside."""
     if index == 1.0:
@@ -118,7 +118,7 @@ def _reflectance(cosine: float, index: float) -> float:
     return 0.5 * (s * s + p * p)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _send(
     image: Array, sine: float, sign: float, odd: int, x: float, y: float, z: float, power_per_sr: float,
     sigma_t: float, width: float, index: float, grid: tuple[float, float, float, float, int, int],
@@ -147,7 +147,7 @@ def _send(
         share *= reflectance * reflectance
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _trace(
     random: np.random.Generator, photons: int, beam: tuple[float, float, float, float, float, float], views: Array, sigma_t: float,
     albedo: float, phase: Array, cosines: Array, width: float, index: float,
