@@ -100,7 +100,7 @@ def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
 # Queries are built once: building one takes longer than asking it.
 _LATEST = Query(latest_of_stages(sql.select(sql.bindparam("of").label("id"))))
 _NEWEST_ID = Query(sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == sql.bindparam("of")))
-_TOLD = Query(
+_TIMED_DATA = Query(
     sql.select(event_table.c.id, event_table.c.time_s, event_table.c.data)
     .where(
         event_table.c.job == sql.bindparam("of"),
@@ -139,7 +139,7 @@ class Begun(NamedTuple):
     """With which the newest stage was started."""
 
 
-class Told(NamedTuple):
+class TimedData(NamedTuple):
     """When an event was told, and its data."""
 
     time_s: float
@@ -239,13 +239,13 @@ class EventLog:
             for row in _page_of(tuple(asked)).rows(self._engine, of=self.job, after=after, most=limit, **values)
         ]
 
-    def told(self, kind: str) -> Iterator[Told]:
+    def data_of(self, kind: str) -> Iterator[TimedData]:
         """All events of one kind, oldest first, as little of them as a curve of hundreds needs."""
         after: int | None = 0
         while after is not None:
-            rows = _TOLD.rows(self._engine, of=self.job, of_kind=kind, after=after)
+            rows = _TIMED_DATA.rows(self._engine, of=self.job, of_kind=kind, after=after)
             data = from_json("[" + ",".join(data for _, _, data in rows) + "]")
-            yield from map(Told, (time_s for _, time_s, _ in rows), data)
+            yield from map(TimedData, (time_s for _, time_s, _ in rows), data)
             after = rows[-1][0] if len(rows) == PAGE else None
 
     def every(self, **only: str | int | None) -> Iterator[JobEvent]:

@@ -15,7 +15,7 @@ import pytest
 import sqlalchemy as sql
 
 from services.api.jobs import event_stream as feed
-from services.api.jobs.event_stream import EventFeed, Turn
+from services.api.jobs.event_stream import Epoch, EventFeed
 from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.records import Lease
 from services.api.jobs.repository import Repository
@@ -184,15 +184,15 @@ def test_a_stalled_stream_keeps_little_and_is_told_everything_later(
     repository: Repository, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "PERIOD_S", 0.0)
-    monkeypatch.setattr(feed, "MAX_TURNS", 4)
+    monkeypatch.setattr(feed, "MAX_EPOCHS", 4)
     lease = start(repository)
     log = repository.events_of(lease.job.id)
 
-    def count_turns() -> int:
+    def count_epochs() -> int:
         gc.collect()
-        return sum(isinstance(thing, Turn) for thing in gc.get_objects())
+        return sum(isinstance(thing, Epoch) for thing in gc.get_objects())
 
-    before = count_turns()
+    before = count_epochs()
 
     async def stall() -> str:
         async with running(repository) as one:
@@ -202,7 +202,7 @@ def test_a_stalled_stream_keeps_little_and_is_told_everything_later(
                 log.append(1, StageEvent(stage="fit", kind="step", message=f"Step {step}."))
                 while one._newest < repository.newest_event():
                     await asyncio.sleep(0.001)
-            assert count_turns() - before <= 4 + 1
+            assert count_epochs() - before <= 4 + 1
             repository.settle(lease, Trigger.SUCCEED)
             return told.decode() + await listen(stalled, 0.0)
 
@@ -215,7 +215,7 @@ def test_a_stream_outlasts_a_database_that_is_away_for_a_while(
     monkeypatch.setattr(feed, "PING_S", 0.01)
     lease, read, answers = start(repository), feed._read, iter([True, False, False])
 
-    def read_or_fail(*arguments: Any) -> feed.Chapter:
+    def read_or_fail(*arguments: Any) -> feed.EventBatch:
         if not next(answers, True):
             raise sql.exc.OperationalError("SELECT", None, OSError("away"))
         return read(*arguments)

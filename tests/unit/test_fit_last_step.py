@@ -21,7 +21,7 @@ class FakeModel:
 
     promised: float = -1000.0
 
-    def step(self, _things: int) -> np.ndarray:
+    def step(self, _part_count: int) -> np.ndarray:
         return np.array([WHOLE])
 
     def promise(self, step: np.ndarray) -> tuple[float, float]:
@@ -47,40 +47,40 @@ class FakeProblem:
         return LossChange(self.slope * share + (self.change - self.slope) * share**2, (share * 359.0) ** 2)
 
 
-def taken(problem: Any, things: int, **model: float) -> float:
+def taken(problem: Any, part_count: int, **model: float) -> float:
     """The step that is taken as a share of the whole."""
     fake: Any = FakeModel(**model)
-    return float(last_step(problem, np.zeros(1), fake, things, 64)[0]) / WHOLE
+    return float(last_step(problem, np.zeros(1), fake, part_count, 64)[0]) / WHOLE
 
 
 def test_many_teeth_are_wrong_independently() -> None:
     # By hand: of one tooth the promise is -1000 ± 500, with the comparison 100 ± 359 that makes -274 ± 292; of fourteen -1000 ± 134, together -866 ± 125.
-    assert taken(FakeProblem(100.0), things=1) == 0
-    assert taken(FakeProblem(100.0), things=14) == pytest.approx(1)
+    assert taken(FakeProblem(100.0), part_count=1) == 0
+    assert taken(FakeProblem(100.0), part_count=14) == pytest.approx(1)
 
 
 def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
     # 1300 is 3.4 of its standard errors. With slope -2000 and 300 at the whole the parabola is least at 2000 / 4600, -435 ± 156 for -681 ± 91 promised.
     problem = FakeProblem(300.0)
-    assert taken(problem, things=14) == pytest.approx(2000 / 4600)
+    assert taken(problem, part_count=14) == pytest.approx(2000 / 4600)
     assert len(problem.asked) == CLOSING_TRIALS
 
 
 def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
     # With a slope of its own upwards the shorter step, 2000 / 6200 of the whole, is worse by 639, 5.5 standard errors.
     problem = FakeProblem(1100.0, slope=2400.0)
-    assert taken(problem, things=14) == 0
+    assert taken(problem, part_count=14) == 0
     assert len(problem.asked) == CLOSING_TRIALS
 
 
 @pytest.mark.parametrize("change", [50_000.0, 1e12])
 def test_a_step_is_shortened_to_a_tenth_at_most(change: float) -> None:
     problem = FakeProblem(change)
-    taken(problem, things=1)
+    taken(problem, part_count=1)
     assert problem.asked == pytest.approx([1, CLOSING_MIN_SHARE])
 
 
 def test_a_step_that_promises_nothing_is_not_compared() -> None:
     problem = FakeProblem(-1000.0)
-    assert taken(problem, things=14, promised=20.0) == 0
+    assert taken(problem, part_count=14, promised=20.0) == 0
     assert not problem.asked

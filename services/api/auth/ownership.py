@@ -20,7 +20,7 @@ def _owner_by(name: sql.Column[str], owner: sql.Column[str]) -> Query:
     return Query(sql.select(owner).where(name == sql.bindparam("of")))
 
 
-class Thing:
+class OwnedKind:
     """A kind of thing that has an owner and that paths name."""
 
     def __init__(self, name: sql.Column[str], owner: sql.Column[str], absent: Callable[[str], DentineError]) -> None:
@@ -49,11 +49,11 @@ class Ownership:
 
     def __init__(self, engine: sql.Engine) -> None:
         self.engine = engine
-        self._jobs = Thing(job_table.c.id, job_table.c.owner, unknown_job)
-        self._captures = Thing(capture_table.c.id, capture_table.c.owner, unknown_capture)
-        self._deletions = Thing(deletion_table.c.job, deletion_table.c.owner, unknown_deletion)
+        self._jobs = OwnedKind(job_table.c.id, job_table.c.owner, unknown_job)
+        self._captures = OwnedKind(capture_table.c.id, capture_table.c.owner, unknown_capture)
+        self._deletions = OwnedKind(deletion_table.c.job, deletion_table.c.owner, unknown_deletion)
 
-    def named_in(self, template: str, ids: Mapping[str, str]) -> tuple[Thing, str] | None:
+    def named_in(self, template: str, ids: Mapping[str, str]) -> tuple[OwnedKind, str] | None:
         """What of an owner a route's path names; None if nothing."""
         if "job_id" in ids:
             return (self._deletions if template.startswith(_DELETIONS) else self._jobs), ids["job_id"]

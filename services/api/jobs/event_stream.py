@@ -25,7 +25,7 @@ PING_S = 15.0
 """A silent stream says that it lives this often, and looks whether its job still does."""
 MAX_EVENTS = 1000
 """Read and sent at once."""
-MAX_TURNS = 64
+MAX_EPOCHS = 64
 """Remembered; a stream that was stalled for longer reads again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
@@ -52,7 +52,7 @@ class EventStream(StreamingResponse):
 
 
 @dataclass(frozen=True)
-class Chapter:
+class EventBatch:
     """Events of a job after some id, as they are sent."""
 
     text: bytes
@@ -63,7 +63,7 @@ class Chapter:
     """Whether more may have happened already."""
 
     @property
-    def told(self) -> bytes:
+    def text_with_end(self) -> bytes:
         """As a stream of this job alone sends it."""
         if self.ended is None:
             return self.text
@@ -71,14 +71,14 @@ class Chapter:
 
 
 @dataclass
-class Turn:
-    """From one growth of the event table to the next. Streams walk from turn to turn, so that they miss none while they send."""
+class Epoch:
+    """From one growth of the event table to the next. Streams walk from epoch to epoch, so that they miss none while they send."""
 
     number: int
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     jobs: frozenset[str] = frozenset()
     """Those that have new events, once it has ended."""
-    reads: dict[tuple[str, int], asyncio.Task[Chapter]] = field(default_factory=dict)
+    reads: dict[tuple[str, int], asyncio.Task[EventBatch]] = field(default_factory=dict)
     """Under way, by job and the id after which they read."""
 
 
@@ -93,7 +93,7 @@ class EventFeed:
         self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread
     ) -> None:
         self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
-        self._turns = deque([Turn(0)], MAX_TURNS)
+        self._epochs = deque([Epoch(0)], MAX_EPOCHS)
 
     async def run(self) -> None:
         """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
@@ -103,8 +103,8 @@ class EventFeed:
                 newest = await self._ask(partial(self._repository.newest_events, self._newest))
             if newest:
                 self._newest = max(newest.values())
-                ended = self._turns[-1]
-                self._turns.append(Turn(ended.number + 1))
+                ended = self._epochs[-1]
+                self._epochs.append(Epoch(ended.number + 1))
                 ended.jobs = frozenset(newest)
                 ended.ended.set()
             await asyncio.sleep(PERIOD_S)
@@ -115,14 +115,14 @@ class EventFeed:
         Raises:
             UnknownJobError: there is no such job.
         """
-        turn = self._turns[-1]
-        chapter = await self._read(turn, job_id, after)
-        if chapter.ended is not None:
-            return Response(chapter.told, headers=UNBUFFERED, media_type=EventStream.media_type)
-        return EventStream(self.follow(job_id, after, (turn, chapter)), headers=UNBUFFERED)
+        epoch = self._epochs[-1]
+        batch = await self._read(epoch, job_id, after)
+        if batch.ended is not None:
+            return Response(batch.text_with_end, headers=UNBUFFERED, media_type=EventStream.media_type)
+        return EventStream(self.follow(job_id, after, (epoch, batch)), headers=UNBUFFERED)
 
     async def follow(
-        self, job_id: str, after: int, opening: tuple[Turn, Chapter] | None = None
+        self, job_id: str, after: int, opening: tuple[Epoch, EventBatch] | None = None
     ) -> AsyncIterator[bytes]:
         """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or the job's deletion.
 
@@ -130,30 +130,30 @@ class EventFeed:
             opening: was read already.
         """
         while True:
-            turn = self._turns[-1] if opening is None else opening[0]
+            epoch = self._epochs[-1] if opening is None else opening[0]
             try:
-                chapter = await self._read(turn, job_id, after) if opening is None else opening[1]
+                batch = await self._read(epoch, job_id, after) if opening is None else opening[1]
             except UnknownJobError:
                 return
             except sql.exc.SQLAlchemyError:
-                chapter = Chapter(b"", after, ended=None, is_full=False)  # the next ping's look makes up for it
+                batch = EventBatch(b"", after, ended=None, is_full=False)  # the next ping's look makes up for it
             opening = None
-            if told := chapter.told:
+            if told := batch.text_with_end:
                 yield told
-            if chapter.ended is not None:
+            if batch.ended is not None:
                 return
-            after = chapter.last_id
-            while not chapter.is_full:
+            after = batch.last_id
+            while not batch.is_full:
                 try:
                     async with asyncio.timeout(PING_S):
-                        await turn.ended.wait()
+                        await epoch.ended.wait()
                 except TimeoutError:
                     yield KEEPALIVE_COMMENT
                     break
-                following = self._after(turn)
-                if job_id in turn.jobs or following is None:
+                following = self._after(epoch)
+                if job_id in epoch.jobs or following is None:
                     break
-                turn = following
+                epoch = following
 
     async def follow_several(self, after: Mapping[str, int]) -> AsyncIterator[bytes]:
         """Events of several jobs in one stream, each after an id, replayed and then live.
@@ -162,62 +162,62 @@ class EventFeed:
         for each job that it shows would leave none for anything else. Each job ends with event 'end', whose data names
         it and its final state, null for a job that is not there.
         """
-        reached, due, turn = dict(after), set(after), self._turns[-1]
+        reached, due, epoch = dict(after), set(after), self._epochs[-1]
         while reached:
             for job_id in sorted(due):
                 try:
-                    chapter = await self._read(turn, job_id, reached[job_id])
+                    batch = await self._read(epoch, job_id, reached[job_id])
                 except UnknownJobError:
                     yield end_of(job_id, None)
                     del reached[job_id]
                     continue
                 except sql.exc.SQLAlchemyError:
                     continue  # the next ping's look makes up for it
-                if chapter.text:
-                    yield chapter.text
-                if chapter.ended is not None:
-                    yield end_of(job_id, chapter.ended)
+                if batch.text:
+                    yield batch.text
+                if batch.ended is not None:
+                    yield end_of(job_id, batch.ended)
                     del reached[job_id]
                     continue
-                reached[job_id] = chapter.last_id
-                if chapter.is_full:
+                reached[job_id] = batch.last_id
+                if batch.is_full:
                     break
             else:
                 due = set()
             while reached and not due:
                 try:
                     async with asyncio.timeout(PING_S):
-                        await turn.ended.wait()
+                        await epoch.ended.wait()
                 except TimeoutError:
                     yield KEEPALIVE_COMMENT
                     due = set(reached)
                     break
-                following = self._after(turn)
-                due = reached.keys() & turn.jobs if following is not None else set(reached)
-                turn = following or self._turns[-1]
+                following = self._after(epoch)
+                due = reached.keys() & epoch.jobs if following is not None else set(reached)
+                epoch = following or self._epochs[-1]
             due &= reached.keys()
 
-    def _after(self, turn: Turn) -> Turn | None:
-        """The turn after one that has ended; None if it is not remembered. Turns do not know it, or a stalled stream would keep all that came after."""
-        back = self._turns[-1].number - turn.number
-        return self._turns[-back] if back <= len(self._turns) else None
+    def _after(self, epoch: Epoch) -> Epoch | None:
+        """The epoch after one that has ended; None if it is not remembered. Epochs do not know it, or a stalled stream would keep all that came after."""
+        back = self._epochs[-1].number - epoch.number
+        return self._epochs[-back] if back <= len(self._epochs) else None
 
-    async def _read(self, turn: Turn, job_id: str, after: int) -> Chapter:
-        """Read what happened up to this turn at least; whoever asks the same in the same turn shares the read."""
+    async def _read(self, epoch: Epoch, job_id: str, after: int) -> EventBatch:
+        """Read what happened up to this epoch at least; whoever asks the same in the same epoch shares the read."""
         key = (job_id, after)
-        if key not in turn.reads:
-            turn.reads[key] = asyncio.create_task(self._ask(partial(_read, self._repository, job_id, after)))
-            turn.reads[key].add_done_callback(lambda _: turn.reads.pop(key))
-        return await asyncio.shield(turn.reads[key])
+        if key not in epoch.reads:
+            epoch.reads[key] = asyncio.create_task(self._ask(partial(_read, self._repository, job_id, after)))
+            epoch.reads[key].add_done_callback(lambda _: epoch.reads.pop(key))
+        return await asyncio.shield(epoch.reads[key])
 
 
-def _read(repository: Repository, job_id: str, after: int) -> Chapter:
+def _read(repository: Repository, job_id: str, after: int) -> EventBatch:
     state = repository.get(job_id).state  # before its events: those of a final state are then among them
     events = repository.events_of(job_id).read(after, MAX_EVENTS)
     told = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
     is_full = len(events) == MAX_EVENTS
     has_ended = (state.is_final or state is JobState.DELETING) and not is_full
-    return Chapter(told, events[-1].id if events else after, state if has_ended else None, is_full)
+    return EventBatch(told, events[-1].id if events else after, state if has_ended else None, is_full)
 
 
 def end_of(job_id: str, state: JobState | None) -> bytes:

@@ -11,7 +11,7 @@ from pydantic import Field
 from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.stage import StageName
-from services.pipeline.event_log import EventLog, Told
+from services.pipeline.event_log import EventLog, TimedData
 
 PICTURES = ("render", "photo", "residual")
 ENTRY_BYTES = 512
@@ -99,7 +99,7 @@ def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> Preview
 def read_history(log: EventLog, points: int, channel: str | None = None) -> History:
     """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later attempt repeats replaces the earlier one."""
     thinned: dict[str, _Thinned] = {}
-    for told in log.told("step"):
+    for told in log.data_of("step"):
         name = str(told.data.get("channel", ""))
         if isinstance(told.data.get("step"), int) and channel in {None, name}:
             thinned.setdefault(name, _Thinned(points)).add(told)
@@ -148,11 +148,11 @@ class _Thinned:
 
     def __init__(self, points: int) -> None:
         self._points, self._stride = points, 1
-        self._kept: dict[int, Told] = {}
-        self._first: Told | None = None
-        self._last: Told | None = None
+        self._kept: dict[int, TimedData] = {}
+        self._first: TimedData | None = None
+        self._last: TimedData | None = None
 
-    def add(self, event: Told) -> None:
+    def add(self, event: TimedData) -> None:
         """Take in a step."""
         if self._first is None or event.data["step"] <= self._first.data["step"]:
             self._first = event
@@ -164,7 +164,7 @@ class _Thinned:
             self._stride *= 2
             self._kept = {step: kept for step, kept in self._kept.items() if step % self._stride == 0}
 
-    def events(self) -> list[Told]:
+    def events(self) -> list[TimedData]:
         """What is left, in the order of steps."""
         ends = {event.data["step"]: event for event in (self._first, self._last) if event is not None}
         return [event for _, event in sorted((self._kept | ends).items())]

@@ -225,8 +225,8 @@ def build_router(
         async def follow() -> AsyncIterator[bytes]:
             for job_id in sorted(set(places) - seen):
                 yield end_of(job_id, None)
-            async for chapter in feed.follow_several({job_id: places[job_id] for job_id in seen}):
-                yield chapter
+            async for batch in feed.follow_several({job_id: places[job_id] for job_id in seen}):
+                yield batch
 
         return EventStream(follow(), headers=UNBUFFERED)
 

@@ -69,15 +69,15 @@ def history_key(channel: str, step: int) -> str:
     return f"{channel}/history/{step}"
 
 
-def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, things: int, samples: int) -> Array:
+def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
     """The step from x (F,) by the closing measurement, or a shorter one; zeros where it promises no more than noise does, or is not better.
 
     Args:
-        things: how many things the fit is about that images tell apart; what one of them promises is wrong independently of the others.
+        part_count: how many things the fit is about that images tell apart; what one of them promises is wrong independently of the others.
         samples: paths per pixel of a comparison.
     """
     mean, precision = problem.domain.prior
-    step, slope_error = model.step(things), SLOPE_ERROR / math.sqrt(things)
+    step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
     for trial in range(CLOSING_TRIALS):
         promised, promised_se = model.promise(step)
         if promised >= 0:
@@ -149,7 +149,7 @@ class Stages(ABC, Generic[Optics]):
         """Mean cosines that this domain holds, as the closing measurement takes them."""
 
     @property
-    def things(self) -> int:
+    def part_count(self) -> int:
         """How many things the fit is about that images tell apart, such as teeth."""
         return 1
 
@@ -171,7 +171,7 @@ class Stages(ABC, Generic[Optics]):
             max_steps=self.spec.max_steps,
             max_samples=samples,
             tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
-            parts=self.things,
+            parts=self.part_count,
         )
 
     def short(self, steps: int) -> Options:
@@ -270,7 +270,9 @@ class Stages(ABC, Generic[Optics]):
             sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
             return {
                 "sums": sums.record(),
-                "step": last_step(problem, x, closing_model(domain, x, equations, sums), self.things, samples).tolist(),
+                "step": last_step(
+                    problem, x, closing_model(domain, x, equations, sums), self.part_count, samples
+                ).tolist(),
             }
 
         self.pause()

@@ -118,7 +118,7 @@ class JawSchedule(Stages[Mouth]):
         return (*teeth, *(() if self.start.gums is None else ("gums",)))
 
     @property
-    def things(self) -> int:
+    def part_count(self) -> int:
         """See Stages."""
         return len(self.teeth)
 

@@ -87,7 +87,7 @@ class Flight:
 
 
 @dataclass
-class Turn:
+class OnwardChoice:
     """Choice of the onward direction at a vertex."""
 
     direction: mi.Vector3f
@@ -169,8 +169,8 @@ class ScenePaths:
 
         vertex = self._vertex(path, flight)
         ends = flight.turns & (path.depth + 1 >= self.max_depth)
-        turn = self._join_and_turn(path, flight, vertex, (flight.turns | flight.shines) & ~ends)
-        self._go_on(path, flight, vertex, turn)
+        choice = self._join_and_turn(path, flight, vertex, (flight.turns | flight.shines) & ~ends)
+        self._go_on(path, flight, vertex, choice)
 
         # Paths that faded survive in proportion to what they carry.
         left = dr.max(path.throughput * self.media.share(path.likely)) / ROULETTE_WEIGHT
@@ -246,7 +246,7 @@ class ScenePaths:
         vertex.time, vertex.wavelengths = path.ray.time, path.ray.wavelengths
         return vertex
 
-    def _join_and_turn(self, path: Path, flight: Flight, vertex: mi.Interaction3f, joins: mi.Bool) -> Turn:
+    def _join_and_turn(self, path: Path, flight: Flight, vertex: mi.Interaction3f, joins: mi.Bool) -> OnwardChoice:
         """Join the vertex to one emitter, and choose where the path goes; stock surfaces do both in one call."""
         sampler, si, scatters, ordinary = path.sampler, flight.si, flight.scatters, flight.ordinary
         light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(joins), False, joins)
@@ -263,7 +263,7 @@ class ScenePaths:
         )
         value = dr.select(scatters, to_light, value)
         density = dr.select(scatters, self.media.mean(path.likely, to_light), density)
-        turn = Turn(
+        choice = OnwardChoice(
             dr.select(scatters, onward, si.to_world(bounce.wo)),
             dr.select(scatters, self.media.mean(path.likely, to_onward), bounce.pdf),
             dr.select(scatters, 1, weight),
@@ -279,15 +279,15 @@ class ScenePaths:
             )
             image = self.gloss.sample(si, sampler.next_2d(flight.glossy))
             shine, chance = self.gloss.evaluate(si, image)
-            turn.direction = dr.select(flight.glossy, image, turn.direction)
-            turn.density = dr.select(flight.glossy, flight.reflected * chance, turn.density)
-            turn.weight = dr.select(
-                flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), turn.weight
+            choice.direction = dr.select(flight.glossy, image, choice.direction)
+            choice.density = dr.select(flight.glossy, flight.reflected * chance, choice.density)
+            choice.weight = dr.select(
+                flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), choice.weight
             )
 
         self._join(path, flight, vertex, light, value * brought, density, joins)
         path.likely = self.media.rival(path.likely, to_onward, scatters)
-        return turn
+        return choice
 
     def _join(
         self,
@@ -310,19 +310,19 @@ class ScenePaths:
         share = dr.select(light.delta, 1, power(light.pdf, density)) / chance
         path.radiance += dr.select(joins, value * share * self._transmittance(line, path.place, joins), 0)
 
-    def _go_on(self, path: Path, flight: Flight, vertex: mi.Interaction3f, turn: Turn) -> None:
+    def _go_on(self, path: Path, flight: Flight, vertex: mi.Interaction3f, choice: OnwardChoice) -> None:
         turns, mirrors = flight.turns, flight.mirrors
         crosses = flight.meets & ~turns & ~mirrors
         path.place = dr.select(crosses, self.teeth.beyond(path.place, flight.part, flight.cosine), path.place)
         mirrored = path.ray.d - mi.Vector3f(flight.si.n) * (2 * flight.cosine)
-        direction = dr.select(turns, turn.direction, dr.select(mirrors, mirrored, path.ray.d))
+        direction = dr.select(turns, choice.direction, dr.select(mirrors, mirrored, path.ray.d))
         onward = flight.si.spawn_ray(direction)
         onward.o = dr.select(flight.scatters, vertex.p, onward.o)
         path.ray = onward
-        path.throughput *= dr.select(turns, turn.weight, 1)
+        path.throughput *= dr.select(turns, choice.weight, 1)
         path.last = dr.select(turns, vertex, path.last)
-        path.density = dr.select(turns, turn.density, path.density)
-        path.certain = dr.select(turns, turn.certain, path.certain | mirrors)
+        path.density = dr.select(turns, choice.density, path.density)
+        path.certain = dr.select(turns, choice.certain, path.certain | mirrors)
         path.from_tooth = dr.select(turns, flight.scatters, path.from_tooth)
         path.depth += dr.select(turns, mi.UInt32(1), 0)
 

@@ -163,7 +163,7 @@ class ClosingModel:
     gradient: Array
     noise: Array
 
-    def step(self, things: int = 1) -> Array:
+    def step(self, part_count: int = 1) -> Array:
         """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things, inside the bounds."""
         domain, open_directions = self.domain, self.known.open_directions
         scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
@@ -171,7 +171,9 @@ class ClosingModel:
         low, high = domain.bounds
         return np.asarray(
             np.clip(
-                self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(things)), low, high
+                self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(part_count)),
+                low,
+                high,
             )
             - self.x
         )

@@ -123,11 +123,11 @@ export class DomeView {
   }
 
   /** Do something by hand; what is refused is told, and so is nothing else than the newest. */
-  private async act(deed: () => Promise<void>): Promise<void> {
+  private async act(action: () => Promise<void>): Promise<void> {
     this.refusal.hidden = true;
     this.done.textContent = "";
     try {
-      await deed();
+      await action();
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
       tell(this.refusal, problem);

@@ -76,23 +76,23 @@ export class JobActions {
   }
 
   /** A question with one way on and one way back; Escape goes back as well. */
-  private ask(title: string, content: HTMLElement[], go: HTMLButtonElement, deed: () => Promise<void>): void {
+  private ask(title: string, content: HTMLElement[], go: HTMLButtonElement, action: () => Promise<void>): void {
     const back = element("button", { type: "button" }, "Back");
     const form = element("form", {}, element("h3", { id: "question" }, title), ...content, element("p", { class: "fields" }, go, back));
     back.addEventListener("click", () => this.dialog.close());
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.dialog.close();
-      void this.attempt(deed);
+      void this.attempt(action);
     });
     this.dialog.setAttribute("aria-labelledby", "question");
     this.dialog.replaceChildren(form);
     this.dialog.showModal();
   }
 
-  private async attempt(deed: () => Promise<void>): Promise<void> {
+  private async attempt(action: () => Promise<void>): Promise<void> {
     try {
-      await deed();
+      await action();
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
       this.then.refused(problem);
