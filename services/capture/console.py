@@ -20,7 +20,8 @@ from contextlib import ExitStack, suppress
 from functools import partial
 
 from services.capture.dome.address import dome_address
-from services.capture.dome.controller import DomeObserver, all_off
+from services.capture.dome.all_off import all_off
+from services.capture.dome.controller import DomeObserver
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
 from services.core.dome import DomeAnswer, DomeCommand, DomeStatus

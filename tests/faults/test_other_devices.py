@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from services.capture.dome import registers as reg
-from services.capture.dome.controller import all_off
+from services.capture.dome.all_off import all_off
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
 from services.core.errors import RigError, RigUnreachableError

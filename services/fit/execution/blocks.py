@@ -29,6 +29,10 @@ BLOCK_BYTES = 4 * 2**20
 """Largest residual block that travels between tasks: mean and variance, float64."""
 BLOCK_PIXELS = 4096
 """Largest block: long enough to fill a kernel, short enough that a lost worker costs little."""
+MIN_BLOCKS = 4
+"""Blocks of all views at least, so that two workers have enough to do, where there are pixels enough."""
+MIN_BLOCK_PIXELS = 128
+"""No block is made smaller to have more of them: it would not fill a kernel."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,16 @@ class BlockTask:
 def pixels_per_block(lights: int) -> int:
     """Pixels whose residuals under all lights stay within BLOCK_BYTES."""
     return max(1, min(BLOCK_PIXELS, BLOCK_BYTES // (16 * lights)))
+
+
+def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
+    """Pixels of a view parted into blocks, each of which one worker renders at a time.
+
+    Enough of them for two workers, none too small to fill a kernel, none too large to travel; the same however many workers
+    there are.
+    """
+    wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
+    return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
 
 
 def write_block(folder: Path, block: Block) -> StoredFile:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from distributed import WorkerPlugin
 
 from services.fit.execution.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
-from services.fit.execution.shares import Board, Share
+from services.fit.execution.fair_shares import Board, Share
 
 Task = Callable[..., Any]
 TASKS_AHEAD = 2

@@ -15,7 +15,7 @@ from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import StoredArray, open_stage
-from services.fit.execution.blocks import Block, PixelParts, StoredFile, pixels_per_block, write_block, write_recipe
+from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
 from services.fit.solve.losses import first_weights
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
@@ -25,8 +25,6 @@ CELL_EDGE = 4
 """Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and noise is not."""
 MIN_CELLS = 24
 """Squares are smaller where a view would have about fewer, so that they still tell the comparison's error."""
-MIN_BLOCKS = 4
-MIN_BLOCK_PIXELS = 128
 COARSE_PIXELS = 600
 """Most pixels of a view, for each of its teeth, in all stages but the last, and while the fit is watched."""
 SEARCH_PIXELS = 210
@@ -312,12 +310,14 @@ def write_channel(
             relevant = np.flatnonzero(counted & kept)
             pixels, signal = pixels + len(relevant), signal + float((weight * view.reference**2)[:, kept].sum())
             fits += [
-                block(view, weight, used, part) for part in _split(relevant, int(used.sum()), len(views)) if len(part)
+                block(view, weight, used, part)
+                for part in split_pixels(relevant, int(used.sum()), len(views))
+                if len(part)
             ]
             seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
             compares += [
                 block(view, weight, seen, part)
-                for part in _split(seen_pixels, int(seen.sum()), len(views))
+                for part in split_pixels(seen_pixels, int(seen.sum()), len(views))
                 if len(part)
             ]
         return Level(tuple(fits), tuple(compares), pixels, signal)
@@ -358,12 +358,6 @@ def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
     part = np.zeros(len(view.pixels), dtype=np.int64) if view.parts is None else view.parts.shown.astype(np.int64)
     place = np.column_stack([view.pixels // edge, part])
     return np.unique(place, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
-
-
-def _split(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
-    # Enough blocks for two workers, none too small to fill a kernel, none too large to travel; independent of how many workers there are.
-    wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
-    return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
 
 
 def _spread(pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -147,8 +147,8 @@ def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(
     shared_dome: Address, observer: DomeObserver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late_s = 3.0
-    for module in ("services.capture.dome.controller", "services.capture.dome.driver"):
-        monkeypatch.setattr(f"{module}.REPLY_TIMEOUT_S", 4 * late_s)
+    for module in ("all_off", "controller", "driver"):
+        monkeypatch.setattr(f"services.capture.dome.{module}.REPLY_TIMEOUT_S", 4 * late_s)
     # As the process does it, each command in a thread of its own.
     with console(shared_dome) as answer, ThreadPoolExecutor(2) as threads:
         assert threads.submit(answer, do="light", light=0, level=0.1, on_s=20).result().code is None

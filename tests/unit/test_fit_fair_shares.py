@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.fit.execution.shares import BOARD, FADING_S, TELL_S, Board, Share
+from services.fit.execution.fair_shares import BOARD, FADING_S, TELL_S, Board, Share
 
 WORKERS, AHEAD, BLOCKS, PAUSE_S = 2, 4, 12, 0.5
 
