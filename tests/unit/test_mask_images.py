@@ -5,11 +5,16 @@ from __future__ import annotations
 import struct
 import tracemalloc
 import zlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from services.api.masks import masks
 from services.api.masks.images import require_mask
+from services.api.masks.masks import Masks
 from services.client.errors import MaskError
 from services.core.files.image_headers import PNG_SIGNATURE
 from services.core.geometry import Camera
@@ -63,3 +68,14 @@ def test_every_byte_is_counted_however_a_mask_is_cut_into_parts(side: int, step:
         else:
             with pytest.raises(MaskError, match=told):
                 require_mask(content, camera(side))
+
+
+@pytest.mark.attack("exhaustion", "the prepared mask of a camera of 10¹² pixels")
+def test_a_prepared_mask_of_too_many_pixels_is_refused_before_any_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = SimpleNamespace(cameras=[camera(10**6)], lights=[SimpleNamespace(name="l0")])
+    monkeypatch.setattr(masks, "is_published", lambda *_: True)
+    monkeypatch.setattr(masks, "open_stage", lambda *_, **__: (Path(), manifest))
+    monkeypatch.setattr(masks, "StoredArray", lambda _: pytest.fail("it was opened"))
+    jobs, job = SimpleNamespace(folder=lambda _: Path()), SimpleNamespace(id="0123456789ab")
+    with pytest.raises(MaskError, match=r"Camera c0 has 1000000 x 1000000 pixels, and .* bin its images\."):
+        Masks(cast("Any", jobs)).prepared(cast("Any", job), "c0", "l0")

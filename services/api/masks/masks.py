@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from services.api.jobs.jobs import Jobs
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Job
 from services.api.masks.images import picture_of, require_mask
-from services.client.errors import JobStateError, UnknownMaskError
+from services.client.errors import JobStateError, MaskError, UnknownMaskError
 from services.core.calibration import Calibration
 from services.core.files.image_metadata import plain_png
 from services.core.geometry import Camera, Record
@@ -20,6 +21,8 @@ from services.core.masks import ALL_LIGHTS, LONGEST_NAME, is_stale, mask_path, r
 from services.core.records import PreparedManifest
 from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
+MAX_PREPARED_PX = 2**26
+"""Of a camera whose prepared mask is shown: 67 million, more than any camera of a dome has. Some 5 bytes a pixel are in memory meanwhile."""
 _AT_WORK = frozenset({JobState.RUNNING, JobState.CANCELLING, JobState.DELETING})
 
 
@@ -46,6 +49,7 @@ class Masks:
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
+        self._drawing = threading.Lock()  # one picture in memory at a time
 
     def list(self, job: Job) -> MaskList:
         """A job's masks by hand."""
@@ -94,7 +98,7 @@ class Masks:
         """A PNG of the bits of ``MaskBit`` that the preparation has set, 0 where the fit may look.
 
         Raises:
-            UnknownMaskError: nothing is prepared, or no such camera or light.
+            UnknownMaskError: nothing is prepared, or no such camera or light. MaskError: the camera has too many pixels.
         """
         root = self._jobs.folder(job.id)
         if not is_published(root, "prepared"):
@@ -106,8 +110,14 @@ class Masks:
                 f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and {', '.join(lights)}."
             )
         width, height = manifest.cameras[cameras.index(camera)].size
-        valid = StoredArray(folder / "prepared.zarr" / "valid")
-        return picture_of(valid[cameras.index(camera), lights.index(light), :height, :width].astype(np.uint8))
+        if width * height > MAX_PREPARED_PX:
+            raise MaskError(
+                f"Camera {camera} has {width} x {height} pixels, and prepared masks of up to {MAX_PREPARED_PX} are shown;"
+                " bin its images."
+            )
+        with self._drawing:
+            valid = StoredArray(folder / "prepared.zarr" / "valid")
+            return picture_of(valid[cameras.index(camera), lights.index(light), :height, :width].astype(np.uint8))
 
     def _camera(self, job: Job, camera: str, light: str) -> Camera:
         description = self._calibration(job)
