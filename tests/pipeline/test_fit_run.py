@@ -222,6 +222,7 @@ def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
     assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
     page = (tmp_path / "report.html").read_text()
     assert page.index("did not converge") < page.index("Error on held-out images")
+    assert "max_steps = 1; " in page  # the options that it was made with
 
 
 def test_what_the_preparation_noted_leads_the_report(tmp_path: Path) -> None:
