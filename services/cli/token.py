@@ -30,7 +30,9 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
         name: Annotated[str, typer.Argument(help="Who or what uses it.")],
         scope: Annotated[
             list[str],
-            typer.Option(help="What it may do: read, submit, operate-dome or admin; may be given several times."),
+            typer.Option(
+                help="What it may do: read, submit, operate-dome, metrics or admin; may be given several times."
+            ),
         ],
         expires_days: Annotated[float | None, typer.Option(min=0, help="Days until it ends; default: never.")] = None,
         group: Annotated[

@@ -36,7 +36,7 @@ def measure(work: Path, rounds: int, round_s: float, jobs: int, fitted: int, see
     library = fill(work / "open", work / "capture", jobs, fitted)
     fill_guarded = fill(work / "guarded", work / "capture", jobs, fitted)
     with ExitStack() as stack:
-        token = make_token(work / "guarded", "load", Scope.SUBMIT)
+        token = make_token(work / "guarded", "load", Scope.SUBMIT, Scope.METRICS)
         peers = {
             OURS: (stack.enter_context(serving(work / "open")), library),
             BARE: (stack.enter_context(serving_bare(work / "bare", work / "open" / "dentine.sqlite")), library),

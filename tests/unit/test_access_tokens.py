@@ -129,6 +129,7 @@ def test_the_decision_is_compare_digest_of_two_hashes(
         ({Scope.SUBMIT}, {Scope.READ, Scope.SUBMIT}),
         ({Scope.OPERATE_DOME}, {Scope.OPERATE_DOME}),
         ({Scope.SUBMIT, Scope.OPERATE_DOME}, {Scope.READ, Scope.SUBMIT, Scope.OPERATE_DOME}),
+        ({Scope.METRICS}, {Scope.METRICS}),
         ({Scope.ADMIN}, set(Scope)),
     ],
 )

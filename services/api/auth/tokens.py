@@ -67,6 +67,7 @@ class Scope(StrEnum):
     READ = "read"
     SUBMIT = "submit"
     OPERATE_DOME = "operate-dome"
+    METRICS = "metrics"
     ADMIN = "admin"
 
     @property

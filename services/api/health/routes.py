@@ -54,7 +54,7 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
         "/metrics",
         response_class=Response,
         responses={200: {"content": {"text/plain": {}}}},
-        dependencies=[needs("read")],
+        dependencies=[needs("metrics")],
     )
     def metrics() -> Response:
         """Metrics for Prometheus, in its text format."""

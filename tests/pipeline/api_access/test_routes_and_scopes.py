@@ -35,6 +35,7 @@ KNOWN_SCOPES = {
     "GET /v1/jobs/{job_id}/masks/{camera}/{light}": Scope.READ,
     "PUT /v1/calibrations/{name}": Scope.SUBMIT,
     "GET /v1/calibrations": Scope.READ,
+    "GET /v1/metrics": Scope.METRICS,
     "GET /v1/dome": Scope.OPERATE_DOME,
     "POST /v1/dome/off": Scope.OPERATE_DOME,
     "PUT /v1/dome/light": Scope.OPERATE_DOME,
