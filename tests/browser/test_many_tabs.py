@@ -5,18 +5,21 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
 
 from services.api.app import STATIC, create_app
+from services.api.auth.tokens import Scope
 from services.capture.dome.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings
 from tests.browser.chromium import PATIENCE_MS
 from tests.browser.contrast import contrast_failures
 from tests.browser.pages import looked_at
 from tests.browser.scripted_job import STEPS, ScriptedJob, submit
+from tests.support.guarded_server import guarded
 from tests.support.live_server import serving
 
 pytestmark = pytest.mark.browser
@@ -25,6 +28,9 @@ LIGHTS = 155
 TABS = 8
 CONNECTIONS, LANES = 6, 3
 """That Chromium opens to one server, and that are for what pages ask (lanes.ts)."""
+DOWNLOADS = (
+    "job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }"
+)
 HIDE = """hidden => {
   Object.defineProperty(document, "hidden", {value: hidden, configurable: true});
   document.dispatchEvent(new Event("visibilitychange"));
@@ -164,16 +170,47 @@ def test_all_off_is_answered_while_every_connection_is_held(
 
     monkeypatch.setattr("services.api.jobs.history_routes.list_artifacts", hang)
     job = submit(dome)
-    dome.evaluate(
-        "job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }",
-        job,
-    )
+    dome.evaluate(DOWNLOADS, job)
     until(dome, lambda: len(asked) == CONNECTIONS)
     dome.locator(".all-off").click()
     expect(dome.locator(".done")).to_have_text("All is dark. No job was capturing.")
     assert len(asked) == CONNECTIONS, "a connection was free after all"
     assert dome.request.get("/v1/dome").json()["status"]["stopped"]
     bench.go_on.set()
+
+
+def test_all_off_of_a_session_is_answered_while_every_connection_is_held(
+    chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the page asks with its cookie shares the six connections with downloads; ALL OFF goes without it."""
+    asked, go_on = [], threading.Event()
+
+    def hang(*_: object) -> list[object]:
+        asked.append("")
+        go_on.wait(60)
+        return []
+
+    if not (STATIC / "app.js").exists():
+        pytest.skip("the dashboard is not built; run make dashboard")
+    monkeypatch.setattr("services.api.jobs.history_routes.list_artifacts", hang)
+    with simulated_dome(LIGHTS, 10.0) as (host, port):
+        dome = DomeSettings(address=f"{host}:{port}", watchdog_s=10.0)
+        with guarded(tmp_path, dome=dome) as server:
+            context = chromium.new_context(base_url=str(server.client.base_url))
+            page = context.new_page()
+            page.goto("/#/dome")
+            page.get_by_label("Token").fill(server.tokens[Scope.ADMIN])
+            page.keyboard.press("Enter")
+            expect(page.locator(".dome .badge")).to_contain_text("dark")
+            light_up(page)
+            job = server.ask("POST", "/v1/jobs", Scope.ADMIN, json={"capture": "/"}).json()["id"]
+            page.evaluate(DOWNLOADS, job)
+            until(page, lambda: len(asked) == CONNECTIONS)
+            page.locator(".all-off").click()
+            expect(page.locator(".done")).to_have_text("All is dark. No job was capturing.")
+            assert len(asked) == CONNECTIONS, "a connection was free after all"
+            go_on.set()
+            context.close()
 
 
 def test_an_all_off_without_an_answer_is_told_in_red_after_a_second(context: BrowserContext) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from services.api.auth.sessions import COOKIE, Sessions
+from services.api.auth.sessions import COOKIE, DARK, Session, Sessions
 from services.api.auth.tokens import LOCAL, Caller, Tokens
 from services.api.http.thread_pools import ThreadPool
 from services.client.errors import UnauthenticatedError
@@ -40,17 +40,21 @@ class Access:
                     "This server knows no such kind of authorization; send 'Authorization: Bearer' and a token."
                 )
             presented = presented.strip()
+            if presented.startswith(DARK):
+                return await self._of_session(self.sessions.read_dark_key(presented), only_darkens=True)
             if (token := self.tokens.trusted(presented=presented)) is None:
                 token = await self.lookers.ask(self.tokens.authenticate, presented)
             return Caller.of(token)
         if (cookie := request.cookies.get(COOKIE)) is not None:
-            session = self.sessions.read(cookie)
-            if (token := self.tokens.trusted(session_of=session.sha256)) is None:
-                token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
-            return Caller.of(token, by_session=True)
+            return await self._of_session(self.sessions.read(cookie))
         raise UnauthenticatedError(
             "This needs a token; send it as 'Authorization: Bearer …', or sign in on the dashboard."
         )
+
+    async def _of_session(self, session: Session, *, only_darkens: bool = False) -> Caller:
+        if (token := self.tokens.trusted(session_of=session.sha256)) is None:
+            token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
+        return Caller.of(token, by_session=True, only_darkens=only_darkens)
 
     @staticmethod
     def credential(request: HTTPConnection) -> str | None:

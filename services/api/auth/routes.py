@@ -45,6 +45,11 @@ class Session(Record):
     name: str
     scopes: tuple[Scope, ...] = Field(description="included ones too")
     is_open: bool = Field(description="whether this server asks nobody for a token")
+    dark_key: str | None = Field(
+        default=None,
+        description="of a browser session whose token may operate the dome: sent as 'Authorization: Bearer …' and without"
+        " the cookie, it opens ALL OFF and nothing else",
+    )
 
 
 class AuditPage(Record):
@@ -77,11 +82,12 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         """End a token now, with the sessions and streams that it has opened."""
         return access.tokens.revoke(token_id, request.scope["audited"])
 
-    def open_session(sessions: Sessions, token: Token, response: Response) -> None:
+    def open_session(sessions: Sessions, token: Token, response: Response) -> str:
         value, lifetime_s = sessions.issue(token)
         response.set_cookie(
             COOKIE, value, max_age=lifetime_s, path="/v1", httponly=True, samesite="strict", secure=secure
         )
+        return value
 
     @router.post("/setup", status_code=201, tags=["access"])
     def set_up(link: Sent[SetupRequest], request: Request, response: Response) -> IssuedToken:
@@ -96,19 +102,21 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     @router.get("/session", tags=["access"], dependencies=[needs("read")])
     def whoami(request: Request) -> Session:
         """Whom the server takes the caller for."""
-        return _session(request.scope["caller"], access)
+        caller: Caller = request.scope["caller"]
+        return _session(caller, access, request.cookies.get(COOKIE) if caller.by_session else None)
 
     @router.post("/session", tags=["access"], dependencies=[needs("read")])
     def sign_in(request: Request, response: Response) -> Session:
         """Open a browser session for the token in the Authorization header; the answer sets a cookie that scripts cannot read."""
         caller: Caller = request.scope["caller"]
+        cookie = None
         if access.sessions is not None:
             if caller.token is None or caller.by_session:
                 raise UnauthenticatedError(
                     "A session does not open another one; send the token itself as 'Authorization: Bearer …'."
                 )
-            open_session(access.sessions, caller.token, response)
-        return _session(caller, access)
+            cookie = open_session(access.sessions, caller.token, response)
+        return _session(caller, access, cookie)
 
     @router.delete("/session", status_code=204, tags=["access"], dependencies=[needs("read")])
     def sign_out(request: Request, response: Response) -> None:
@@ -132,5 +140,8 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     return router
 
 
-def _session(caller: Caller, access: Access) -> Session:
-    return Session(name=caller.name, scopes=tuple(sorted(caller.scopes)), is_open=access.sessions is None)
+def _session(caller: Caller, access: Access, cookie: str | None) -> Session:
+    sessions, key = access.sessions, None
+    if sessions is not None and cookie is not None and Scope.OPERATE_DOME in caller.scopes:
+        key = sessions.dark_key(sessions.read(cookie))
+    return Session(name=caller.name, scopes=tuple(sorted(caller.scopes)), is_open=sessions is None, dark_key=key)

@@ -88,11 +88,15 @@ class GuardedRoute:
         """Let a caller with the route's scope pass.
 
         Raises:
-            ScopeError: the caller lacks the scope, or the route declares none or several.
+            ScopeError: the caller lacks the scope, or its dark key opens no such route, or the route declares none or several.
         """
         if self.needs is None:
             raise ScopeError(
                 f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route."
+            )
+        if caller.only_darkens and not self.needs.darkens:
+            raise ScopeError(
+                "A session's dark key opens ALL OFF and nothing else; send the session's cookie, or a token."
             )
         require(caller, self.needs.scope)
 

@@ -4,6 +4,11 @@
 
     dentine_<token id>_<expiry, Unix s>_<random>.<HMAC-SHA256>     version 0.1 had no random part
 
+    dark_<token id>_<expiry, Unix s>_<SHA-256 of the cookie's claim>.<HMAC-SHA256>     a session's dark key
+
+A page cannot read its cookie, and what is sent with a cookie waits for one of the browser's six connections, which long downloads
+may all hold. A dark key, which opens what darkens a dome and nothing else, is sent without the cookie, over a connection of its own.
+
 The signing key lies beside the database and not in it, so that a copy of the database opens no session.
 """
 
@@ -24,6 +29,8 @@ from services.core.files.private import write_private
 
 COOKIE = "dentine-session"
 KEY_FILE = "session.key"
+DARK = "dark_"
+"""What a dark key begins with; no token does."""
 _KEY_BYTES = 32
 
 
@@ -58,10 +65,30 @@ class Sessions:
         """
         claim, _, signature = cookie.rpartition(".")
         match = re.fullmatch(r"dentine_([0-9a-f]{12})_([0-9]{1,12})(_[0-9a-f]{16})?", claim)
+        return self._signed(
+            claim, signature, match, hashlib.sha256(claim.encode("utf-8", "surrogateescape")).hexdigest()
+        )
+
+    def dark_key(self, session: Session) -> str:
+        """What opens ALL OFF for as long as a session lasts."""
+        claim = f"{DARK}{session.token_id}_{session.expires_s:.0f}_{session.sha256}"
+        return f"{claim}.{self._sign(claim)}"
+
+    def read_dark_key(self, key: str) -> Session:
+        """The session that a dark key belongs to.
+
+        Raises:
+            UnauthenticatedError: not signed by this server, or over.
+        """
+        claim, _, signature = key.rpartition(".")
+        match = re.fullmatch(rf"{DARK}([0-9a-f]{{12}})_([0-9]{{1,12}})_([0-9a-f]{{64}})", claim)
+        return self._signed(claim, signature, match, match[3] if match else "")
+
+    def _signed(self, claim: str, signature: str, match: re.Match[str] | None, sha256: str) -> Session:
         is_ours = hmac.compare_digest(self._sign(claim).encode(), signature.encode("utf-8", "surrogateescape"))
         if match is None or not is_ours or self._clock() >= int(match[2]):
             raise UnauthenticatedError("This session is over; sign in again with a token.")
-        return Session(match[1], float(match[2]), hashlib.sha256(claim.encode()).hexdigest())
+        return Session(match[1], float(match[2]), sha256)
 
     def _sign(self, claim: str) -> str:
         return hmac.new(self._key, claim.encode("utf-8", "surrogateescape"), hashlib.sha256).hexdigest()

@@ -113,6 +113,8 @@ class Caller:
     scopes: frozenset[Scope]
     token: Token | None = None
     by_session: bool = False
+    only_darkens: bool = False
+    """Whether it has shown a session's dark key."""
 
     @cached_property
     def viewer(self) -> Viewer:
@@ -126,9 +128,10 @@ class Caller:
         )
 
     @classmethod
-    def of(cls, token: Token, *, by_session: bool = False) -> Caller:
+    def of(cls, token: Token, *, by_session: bool = False, only_darkens: bool = False) -> Caller:
         """The caller that a valid token stands for."""
-        return cls(token.name, frozenset().union(*(scope.included for scope in token.scopes)), token, by_session)
+        scopes = frozenset[Scope]().union(*(scope.included for scope in token.scopes))
+        return cls(token.name, scopes, token, by_session, only_darkens)
 
 
 LOCAL = Caller("local", frozenset(Scope))
@@ -339,7 +342,7 @@ def insert_token(
 
 def public_id(credential: str) -> str | None:
     """The public part of a token or session, whether valid or not."""
-    match = re.match(r"dentine_([0-9a-f]{12})_", credential)
+    match = re.match(r"(?:dentine|dark)_([0-9a-f]{12})_", credential)
     return match[1] if match else None
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from services.api.app import create_app
 from services.api.auth import authentication as gate
-from services.api.auth.scopes import LIVENESS
+from services.api.auth.scopes import LIVENESS, guarded_routes
 from services.api.auth.sessions import COOKIE
 from services.api.auth.tokens import Scope
 from services.core.settings import RateSettings, ServerSettings
@@ -62,6 +62,7 @@ def test_a_session_carries_the_rights_of_its_token(server: Guarded) -> None:
         "name": "of-submit",
         "scopes": ["read", "submit"],
         "is_open": False,
+        "dark_key": None,
     }
     assert server.client.get("/v1/tokens", headers=cookie).status_code == 403
     here = cookie | {"Origin": str(server.client.base_url).rstrip("/")}
@@ -74,6 +75,32 @@ def test_a_session_carries_the_rights_of_its_token(server: Guarded) -> None:
         server.client.get("/v1/session", headers={"Cookie": f"{COOKIE}=dentine_0123456789ab_9999999999.00"}).status_code
         == 401
     )
+
+
+@pytest.mark.attack("tokens", "a session's dark key for anything but darkness")
+def test_a_sessions_dark_key_opens_all_off_and_nothing_else(server: Guarded) -> None:
+    signed_in = server.ask("POST", "/v1/session", Scope.ADMIN)
+    cookie = {"Cookie": signed_in.headers["set-cookie"].split(";")[0], "Sec-Fetch-Site": "same-origin"}
+    server.client.cookies.clear()
+    key = signed_in.json()["dark_key"]
+    assert server.client.get("/v1/session", headers=cookie).json()["dark_key"] == key
+    shown = {"Authorization": f"Bearer {key}"}
+    for method, path in (("POST", "/v1/dome/off"), ("DELETE", "/v1/dome/light")):
+        assert server.client.request(method, path, headers=shown).json()["code"] == "dome-unknown", "it was let in"
+    for route in guarded_routes(server.app.routes):
+        if route.needs is not None and not route.needs.darkens:
+            path = route.template.replace("{", "").replace("}", "")
+            answer = server.client.request(min(route.methods or {"GET"}), path, headers=shown)
+            assert answer.status_code == 403, route.template
+    assert server.client.put("/v1/dome/light", json={"light": 0}, headers=shown).status_code == 403
+    forged = key.replace(key.split("_")[1], server.tokens[Scope.OPERATE_DOME].split("_")[1])
+    for wrong in (
+        {"Authorization": f"Bearer {forged}"},
+        {"Cookie": f"{COOKIE}={key}", "Sec-Fetch-Site": "same-origin"},
+    ):
+        assert server.client.post("/v1/dome/off", headers=wrong).status_code == 401
+    assert server.client.delete("/v1/session", headers=cookie).status_code == 204
+    assert server.client.post("/v1/dome/off", headers=shown).status_code == 401, "the session is over"
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,8 @@ export interface Session {
   name: string;
   scopes: string[];
   is_open: boolean;
+  /** Opens ALL OFF and nothing else; null where the server asks nobody for a token, or the token may not work the dome. */
+  dark_key: string | null;
 }
 
 /** A token on the one occasion when its secret is shown. */
@@ -254,13 +256,21 @@ export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "
 export const getDome = (): Promise<DomeState> => inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
 
 /**
- * ALL OFF waits for no lane, and the stream of events makes room for it. A server that asks nobody for a token is sent
- * no cookie either: browsers keep connections with and without cookies apart, so that this one is free whatever else is
- * under way, downloads too.
+ * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the session's
+ * dark key where the server asks for tokens: browsers keep connections with and without cookies apart, so that this one
+ * is free whatever else is under way, downloads too. A key whose session is over gives way to the cookie of a newer one.
  */
-export function allOff(isOpen: boolean): Promise<AllOff> {
+export async function allOff(session: Session | null): Promise<AllOff> {
   clearTheWay();
-  return request("/dome/off", { method: "POST", priority: "high", credentials: isOpen ? "omit" : "same-origin" });
+  const off = (how: RequestInit): Promise<AllOff> => request("/dome/off", { method: "POST", priority: "high", ...how });
+  if (session?.is_open) return off({ credentials: "omit" });
+  if (!session?.dark_key) return off({});
+  try {
+    return await off({ credentials: "omit", headers: { Authorization: `Bearer ${session.dark_key}` } });
+  } catch (problem) {
+    if (problem instanceof Unauthenticated) return off({});
+    throw problem;
+  }
 }
 
 export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> => ask("/dome/light", "PUT", {}, { light, level, on_s });

@@ -47,8 +47,6 @@ let accountShown: Promise<void> = Promise.resolve();
 let openings = 0;
 /** Null until the server has told. */
 let session: Session | null = null;
-/** Whether the server asks nobody for a token. */
-let isOpenServer = false;
 let unkept: HTMLElement | null = null;
 
 function showConnection(): void {
@@ -129,7 +127,7 @@ function lackingFor(hash: string): string {
 
 /** What an address names; null if nothing. */
 function viewOf(hash: string, id: string): View | null {
-  if (hash === DOME) return new DomeView(showViewConnection, () => isOpenServer);
+  if (hash === DOME) return new DomeView(showViewConnection, () => session);
   if (hash === NEW) return newJob;
   if (hash === RIG) return new RigView();
   const source = hash.match(/^#\/submit(?:\/(\w+))?$/);
@@ -190,7 +188,6 @@ async function showAccount(): Promise<void> {
     isAccountDue = mayPass(problem);
     return;
   }
-  isOpenServer = session.is_open;
   domeLink.hidden = !may("operate-dome");
   newLink.hidden = !may("submit");
   if (session.is_open) return;

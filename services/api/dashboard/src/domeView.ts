@@ -1,6 +1,6 @@
 /** The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again every second. */
 
-import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, sentenceOf, Unauthenticated } from "./api";
+import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, sentenceOf, type Session, Unauthenticated } from "./api";
 import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
@@ -42,7 +42,7 @@ export class DomeView {
 
   constructor(
     private readonly onConnection: (open: boolean) => void,
-    private readonly isOpen: () => boolean,
+    private readonly session: () => Session | null,
   ) {
     this.offTrouble.hidden = true;
     this.refusal.hidden = true;
@@ -93,7 +93,7 @@ export class DomeView {
     }, OFF_PATIENCE_MS);
     try {
       await this.act(async () => {
-        const { status, stopped, others_stopped: others } = await allOff(this.isOpen());
+        const { status, stopped, others_stopped: others } = await allOff(this.session());
         this.hear(status);
         const names = [...stopped, ...(others ? [ofOthers(others)] : [])];
         this.done.textContent = `All is dark. ${names.length ? `Stopped: ${names.join(", ")}.` : "No job was capturing."}`;

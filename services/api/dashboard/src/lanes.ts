@@ -1,7 +1,7 @@
 /**
  * How many requests all pages of a browser have under way at once. A browser opens six connections to a server by
- * HTTP/1.1: one is for the stream of events, one for an upload, three for all that is asked, and so one is left for ALL
- * OFF, which takes no lane.
+ * HTTP/1.1: one is for the stream of events, one for an upload, three for all that is asked, and so one is left for a
+ * download. ALL OFF takes no lane and none of them; see allOff.
  */
 
 const LANES = 3;
