@@ -13,6 +13,7 @@ from services.api.app import STATIC, create_app
 from services.capture.dome.simulator import simulated_dome
 from services.core.settings import DomeSettings, ServerSettings
 from tests.browser.contrast import contrast_failures
+from tests.browser.pages import looked_at
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth
 
@@ -172,7 +173,7 @@ def test_a_state_that_was_asked_for_before_all_off_is_not_shown_after_it(page: P
 def test_the_link_to_the_capturing_job_keeps_the_focus(page: Page) -> None:
     def capture(route: Route) -> None:
         state = route.fetch().json()
-        route.fulfill(json=state | {"capturing": ["0123456789ab"]})
+        route.fulfill(json=state | {"capturing": ["0123456789ab"], "others_capturing": 2})
 
     page.route("**/v1/dome", capture)
     link = page.get_by_role("link", name="0123456789ab")
@@ -182,6 +183,9 @@ def test_the_link_to_the_capturing_job_keeps_the_focus(page: Page) -> None:
             pass
     page.evaluate("new Promise(requestAnimationFrame)")
     expect(link).to_be_focused()
+    told = "The dome captures, so no light goes on by hand. Job 0123456789ab and 2 jobs of others."
+    expect(page.get_by_text(told)).to_be_visible()
+    looked_at(page, "dome-captures")
     page.unroute_all(behavior="ignoreErrors")
     expect(link).to_have_count(0)
 

@@ -197,9 +197,9 @@ export class DomeView {
     this.capturing.hidden = dome.capturing.length + dome.others_capturing === 0;
     if (this.capturers === capturers) return;
     this.capturers = capturers;
-    const links = dome.capturing.map((id) => element("a", { href: `#/${id}` }, id));
-    const jobs = [...(links.length ? ["Job", ...links] : []), ...(dome.others_capturing ? [ofOthers(dome.others_capturing)] : [])];
-    this.capturing.replaceChildren("The dome captures, so no light goes on by hand.", ...jobs.flatMap((job) => [" ", job]));
+    const links = dome.capturing.flatMap((id) => [" ", element("a", { href: `#/${id}` }, id)]);
+    const others = dome.others_capturing ? [links.length ? " and " : " ", ofOthers(dome.others_capturing)] : [];
+    this.capturing.replaceChildren("The dome captures, so no light goes on by hand.", ...(links.length ? [" Job", ...links] : []), ...others, ".");
   }
 
   private show(status: DomeStatus): void {
