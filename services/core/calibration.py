@@ -12,6 +12,7 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Record
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
+from services.core.uncertainty import CalibrationUncertainty, require_known_names
 
 MAX_LIGHTS = 1000
 """Six times the lights of the largest dome that is known here."""
@@ -32,6 +33,9 @@ class Calibration(Record):
     channels: tuple[str, ...] = Field(fail_fast=True)
     cameras: tuple[Camera, ...] = Field(fail_fast=True)
     lights: tuple[Light, ...] = Field(fail_fast=True)
+    uncertainty: CalibrationUncertainty | None = Field(
+        default=None, description="how wrong the calibration may be; null where that was not measured"
+    )
 
 
 def published_capture(capture: Path) -> tuple[Path, str] | None:
@@ -101,6 +105,7 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
             raise CaptureInputError(
                 f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm."
             )
+    require_known_names(description.uncertainty, description.channels, description.cameras, description.lights, origin)
 
 
 def _require_possible(camera: Camera, origin: str) -> None:
@@ -158,5 +163,6 @@ def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:
     changed = {
         "cameras": tuple(cameras[one.name] for one in description.cameras),
         "lights": tuple(lights[one.name] for one in description.lights),
+        "uncertainty": calibration.uncertainty,
     }
     return description.model_copy(update=changed)

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
+from services.core.uncertainty import CalibrationUncertainty
 
 
 def _no_stand_in(value: Any) -> Any:
@@ -79,6 +80,9 @@ class FolderCapture(Record):
     cameras: tuple[Camera, ...] = Field(fail_fast=True)
     lights: tuple[Light, ...] = Field(fail_fast=True)
     images: tuple[ImageEntry, ...] = Field(default=(), fail_fast=True)
+    uncertainty: CalibrationUncertainty | None = Field(
+        default=None, description="how wrong the calibration may be; null where that was not measured"
+    )
 
 
 class SimulatedCameraSpec(Record):
@@ -171,6 +175,10 @@ class JobSpec(Record):
         default={},
         max_length=MAX_HELD,
         description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}",
+    )
+    instrument: Literal["on", "off"] = Field(
+        default="on",
+        description="of kind tooth: fit the instrument's errors too (gain, lights, flare), within the calibration's ±",
     )
     loss: Loss = Field(
         default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders"
@@ -310,6 +318,9 @@ class PreparedManifest(Record):
         default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth"
     )
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
+    uncertainty: CalibrationUncertainty | None = Field(
+        default=None, description="how wrong the calibration may be; null where the capture does not say"
+    )
     masks: str = Field(
         default="", description="digest of the masks by hand that it was prepared with; empty without any"
     )

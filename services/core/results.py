@@ -16,6 +16,12 @@ class Estimate(Record):
     se: float | None = Field(description="one standard error; null where the parameter was not fitted")
     unit: str = Field(description="'1' for dimensionless")
     determined: bool = Field(description="whether the data fixes this number")
+    se_parts: dict[str, float] = Field(
+        default={},
+        description="what the standard error is made of, largest first; the squares add up to its square. photographs: "
+        "their noise; rendering: that of renders; gain, light_gain, flare: the calibration's; prior: that of media and "
+        "shapes; mean_cosine: one that is held; unfinished: the step that was left",
+    )
 
 
 class ToothReport(Record):
@@ -76,6 +82,20 @@ class FitReport(Record):
     )
     correlations: dict[str, Correlation] = Field(
         default={}, description="per channel: correlation of the fitted coordinates"
+    )
+    instrument: dict[str, dict[str, Estimate]] = Field(
+        default={},
+        description="per channel: the instrument's errors by name, as the images tell them; empty where it counts as perfect",
+    )
+    instrument_prior: dict[str, dict[str, float]] = Field(
+        default={}, description="per channel: one standard error of each by the calibration, before the fit"
+    )
+    assumed: tuple[str, ...] = Field(
+        default=(), description="kinds of the instrument's errors whose size no calibration states"
+    )
+    instrument_told: tuple[str, ...] = Field(
+        default=(),
+        description="what to know of the instrument, one sentence each: what was assumed, what seems at fault",
     )
     told: str = Field(default="", description="in plain words, what the capture tells of the tooth and what it cannot")
     notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")

@@ -160,6 +160,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         cavity=subject.whole and subject.cavity is not None,
         tooth_pixels=tuple(seen.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
+        uncertainty=source.description.uncertainty,
         masks=masks.digest,
         notes=tuple(notes),
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),

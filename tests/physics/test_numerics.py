@@ -44,9 +44,10 @@ def test_the_engine_renders_what_it_rendered(golden: dict[str, NDArray[np.float6
         assert alike.mean() >= ALIKE, f"{1 - alike.mean():.0%} of {key} differ; {REMEDY}"
 
 
-def test_a_fit_records_what_it_recorded(golden: dict[str, NDArray[np.float64]]) -> None:
-    found = fit_results()
-    keys = {key for key in golden if key.startswith("fit/")}
+@pytest.mark.parametrize("instrument", ["on", "off"])
+def test_a_fit_records_what_it_recorded(golden: dict[str, NDArray[np.float64]], instrument: str) -> None:
+    found = fit_results(instrument)
+    keys = {key for key in golden if key.startswith(f"fit-{instrument}/")}
     assert found.keys() == keys, f"other results: {sorted(found.keys() ^ keys)}; {REMEDY}"
     for key, value in found.items():
         assert value.shape == golden[key].shape, f"{key} has another shape; {REMEDY}"

@@ -24,6 +24,8 @@ from tests.support.prepared import FAKE, TRUTH, write_prepared
 def spec_for(root: Path, **options: Any) -> JobSpec:
     defaults: dict[str, Any] = {
         "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 15, "search_candidates": 2000,
+        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell; test_fit_instrument.py fits those.
+        "instrument": "off",
     }  # fmt: skip
     return JobSpec(capture=root, **(defaults | options))
 

@@ -35,6 +35,7 @@ class FakeEngine:
 
     directness = 0.0
     """By how much the mean cosine adds to what enamel seems to scatter: media of equal reduced quantities then differ."""
+    path_noise = NOISE
     shared_noise = 0.0
     """Part of the noise's variance that all lights of a pixel share, as those of one walk do."""
 
@@ -43,7 +44,7 @@ class FakeEngine:
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
         truth = self._formula(tissue, view)
-        sigma = NOISE / np.sqrt(samples) * truth
+        sigma = self.path_noise / np.sqrt(samples) * truth
         return StackEstimate(truth + sigma * self._normal(view, seed, 0), sigma**2)
 
     def jacobian(
@@ -55,7 +56,7 @@ class FakeEngine:
             step = 1e-5 * max(abs(tissue.value(name)), 1e-3)
             high, low = (self._formula(tissue.with_values({name: tissue.value(name) + s}), view) for s in (step, -step))
             exact = (high - low) / (2 * step)
-            scale = SCORE_NOISE * np.abs(exact).mean() / np.sqrt(samples)
+            scale = SCORE_NOISE * self.path_noise * np.abs(exact).mean() / np.sqrt(samples)
             rows.append((exact + scale * self._normal(view, seed, k + 1), np.full(exact.shape, scale**2)))
         return JacobianEstimate(
             names, image.mean, image.variance, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
@@ -161,6 +162,12 @@ class DirectFakeEngine(FakeEngine):
 
     directness = 0.5
     shared_noise = 0.3
+
+
+class QuietFakeEngine(FakeEngine):
+    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that counts."""
+
+    path_noise = 0.1 * NOISE
 
 
 class Slowly(FakeEngine):

@@ -52,19 +52,28 @@ def renders() -> dict[str, NDArray[np.float32]]:
     return found
 
 
-def fit_results() -> dict[str, NDArray[np.float64]]:
-    """Every number that a short fit records, by the key of its result."""
+def fit_results(instrument: str) -> dict[str, NDArray[np.float64]]:
+    """Every number that a short fit records, by the key of its result.
+
+    Args:
+        instrument: the option; without the instrument's errors the numbers are those of the first numerics.
+    """
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         write_prepared(root)
-        run(JobSpec.model_validate({"capture": root, **FIT_OPTIONS}), LocalContext(root), engine=FAKE)
+        options = {"capture": root, "instrument": instrument, **FIT_OPTIONS}
+        run(JobSpec.model_validate(options), LocalContext(root), engine=FAKE)
         entries = read_entries(root / "fit-checkpoint" / "journal.jsonl")
-    return {f"fit/{key}": np.array(list(_numbers(value))) for key, value in entries.items() if key not in PASSING}
+    return {
+        f"fit-{instrument}/{key}": np.array(list(_numbers(value)))
+        for key, value in entries.items()
+        if key not in PASSING
+    }
 
 
 def measure() -> dict[str, NDArray[Any]]:
     """All of them."""
-    return {**renders(), **fit_results()}
+    return {**renders(), **fit_results("on"), **fit_results("off")}
 
 
 def _numbers(value: Any) -> Iterator[float]:

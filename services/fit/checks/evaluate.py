@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import Passes, TraceRow, trace_row
+from services.fit.instrument.columns import taken
 from services.fit.optics.parameters import Mouth, Tissue
 
 Array = NDArray[np.float64]
@@ -135,14 +136,15 @@ class BlockErrors:
 
 
 def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown) -> BlockErrors:
-    """Errors of one block."""
+    """Errors of one block, of renders as the instrument sees them."""
     start, block = time.time(), read_block(task.block)
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
-    first, second = (
-        host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed).mean
+    stacks = [
+        host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed)
         for seed in seeds
-    )
+    ]
+    first, second = (taken(stack.mean, block, dict(task.errors)) for stack in stacks)
 
     def sums(pixels: NDArray[np.bool_]) -> tuple[ErrorSums, ErrorSums]:
         fitted, held_out = (

@@ -21,13 +21,14 @@ EXCHANGEABLE = 0.9
 
 
 def correlation(known: Uncertainty) -> Correlation:
-    """Correlation of the fitted coordinates' errors, but for what is left of the step to the minimum; one without any error has none with others."""
-    covariance = known.covariance if known.sandwich is None else known.sandwich.covariance
+    """Correlation of the tissue's coordinates' errors, but for what is left of the step to the minimum; one without any error has none with others."""
+    count = known.domain.tissue_count
+    covariance = (known.covariance if known.sandwich is None else known.sandwich.covariance)[:count, :count]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(errors > 0, errors, np.inf)
     matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    return Correlation(names=known.domain.names, matrix=tuple(tuple(float(v) for v in row) for row in matrix))
+    return Correlation(names=known.domain.names[:count], matrix=tuple(tuple(float(v) for v in row) for row in matrix))
 
 
 def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:

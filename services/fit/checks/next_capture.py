@@ -15,6 +15,7 @@ from services.core.results import Estimate
 from services.fit.checks.identifiability import QUANTITIES, in_words
 from services.fit.execution.blocks import (
     Block,
+    BlockInstrument,
     BlockTask,
     StoredFile,
     read_block,
@@ -25,6 +26,7 @@ from services.fit.execution.blocks import (
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
+from services.fit.instrument.columns import columns
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_with
@@ -185,16 +187,26 @@ def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) 
     probes = []
     for name, camera in cameras.items():
         pixels = np.concatenate([block.view.pixels for block in blocks if block.view.camera.name == name])
-        probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words))
+        probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words, blocks[0].instrument))
     for words, axis in VIEWS.items():
         camera = turned(first, centre, np.asarray(axis, dtype=float) @ axes)
         pixels = seen_pixels(camera, more, pixel_step)
         if len(pixels):
-            probes.append(_probe(folder, camera, pixels, (f"A camera {words}",) * lights + ("",) * len(added)))
+            probes.append(
+                _probe(
+                    folder, camera, pixels, (f"A camera {words}",) * lights + ("",) * len(added), blocks[0].instrument
+                )
+            )
     return write_recipe(folder, more), tuple(probes)
 
 
-def _probe(folder: Path, camera: Camera, pixels: NDArray[np.int32], words: tuple[str, ...]) -> Probe:
+def _probe(
+    folder: Path,
+    camera: Camera,
+    pixels: NDArray[np.int32],
+    words: tuple[str, ...],
+    known: BlockInstrument | None,
+) -> Probe:
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
     shape = (len(words), len(chosen))
     counted = np.array([word != "" for word in words])
@@ -204,8 +216,14 @@ def _probe(folder: Path, camera: Camera, pixels: NDArray[np.int32], words: tuple
         np.ones(shape),
         np.where(counted[:, None], np.ones(shape), 0.0),
         np.zeros(shape, dtype=bool),
+        instrument=None if known is None else _of_new_images(known, len(words)),
     )
     return Probe(write_block(folder, block), words, len(pixels) / len(chosen))
+
+
+def _of_new_images(known: BlockInstrument, lights: int) -> BlockInstrument:
+    # Gains that the fit knows act on them too; what a new light or camera has wrong of its own counts as nothing.
+    return replace(known, lights=known.lights + ("",) * (lights - len(known.lights)), flare="")
 
 
 def turned(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
@@ -250,8 +268,13 @@ def advice_task(
         np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64)
         for seed in image_seeds
     ]
-    slopes = [flat.reshape(len(flat), *images[0].shape) for flat in how.render(host, task, view, seeds, block.parts)]
-    variance = sensor.variance(0.5 * (images[0] + images[1]))
+    expected = 0.5 * (images[0] + images[1])
+    seen = columns(expected, block, how.errors)
+    slopes = [
+        np.concatenate([rows, seen]).reshape(-1, *expected.shape)
+        for rows in how.render(host, task, view, seeds, block.parts)
+    ]
+    variance = sensor.variance(expected)
     out = {}
     for words in dict.fromkeys(word for word in probe.words if word):
         lights = np.array([word == words for word in probe.words])

@@ -177,6 +177,7 @@ def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> st
         parts += [
             channel.channel,
             *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks)),
+            *(json.dumps(row) for row in channel.errors.covariance),
         ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

@@ -76,6 +76,18 @@ class PixelParts:
 
 
 @dataclass(frozen=True)
+class BlockInstrument:
+    """Which errors of the instrument act on a block's photographs, by name."""
+
+    gain: str
+    lights: tuple[str, ...]
+    """Of each of its lights."""
+    flare: str
+    brightest: float
+    """Greatest radiance among the camera's valid pixels in this channel, which a flare is a share of."""
+
+
+@dataclass(frozen=True)
 class Block:
     """Measurements of some pixels of one view; arrays over (light, pixel) are (L, N)."""
 
@@ -90,6 +102,8 @@ class Block:
     """None where the scene is one tooth."""
     cell: NDArray[np.int32] | None = None
     """Number (N,) of the cell that each pixel lies in, within which losses are compared as means; None where pixels stand alone."""
+    instrument: BlockInstrument | None = None
+    """None where the instrument counts as perfect."""
 
     @property
     def fitted_view(self) -> View:
@@ -115,6 +129,8 @@ class BlockTask:
     step: str
     tissue: Tissue | Mouth
     samples: int
+    errors: tuple[tuple[str, float], ...] = ()
+    """Errors of the instrument, by name, through which renders are seen before they are compared."""
 
 
 def pixels_per_block(lights: int) -> int:
@@ -135,6 +151,12 @@ def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDA
 def write_block(folder: Path, block: Block) -> StoredFile:
     """Store a block in ``folder``."""
     parts = {} if block.parts is None else {"shown": block.parts.shown, "tooth": block.parts.tooth}
+    instrument: dict[str, NDArray[Any]] = {}
+    if (errors := block.instrument) is not None:
+        instrument = {
+            "error_names": np.array([errors.gain, errors.flare, *errors.lights]),
+            "brightest": np.array(errors.brightest),
+        }
     return _write(
         folder,
         "block",
@@ -146,6 +168,7 @@ def write_block(folder: Path, block: Block) -> StoredFile:
         held_out=block.held_out,
         **parts,
         **({} if block.cell is None else {"cell": block.cell}),
+        **instrument,
     )
 
 
@@ -156,6 +179,10 @@ def read_block(stored: StoredFile) -> Block:
     view = View(camera, a["pixels"].astype(np.int32))
     parts = PixelParts(a["shown"].astype(np.int16), a["tooth"].astype(np.int16)) if "shown" in a else None
     cell = a["cell"].astype(np.int32) if "cell" in a else None
+    instrument = None
+    if "error_names" in a:
+        gain, flare, *lights = map(str, a["error_names"])
+        instrument = BlockInstrument(gain, tuple(lights), flare, float(np.asarray(a["brightest"], dtype=float)))
     return Block(
         view,
         a["reference"].astype(float),
@@ -164,6 +191,7 @@ def read_block(stored: StoredFile) -> Block:
         a["held_out"].astype(bool),
         parts,
         cell,
+        instrument,
     )
 
 

@@ -76,14 +76,13 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
         part_count: how many things the fit is about that images tell apart; what one of them promises is wrong independently of the others.
         samples: paths per pixel of a comparison.
     """
-    mean, precision = problem.domain.prior
     step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
     for trial in range(CLOSING_TRIALS):
         promised, promised_se = model.promise(step)
         if promised >= 0:
             break
         compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
-        change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+        change = compared.change + problem.domain.prior_change(x, x + step)
         judged = Judged(change, compared.se, promised, math.hypot(promised_se, slope_error * promised))
         if judged.is_better(LAST_STEP_Z):
             return step
@@ -204,8 +203,17 @@ class Stages(ABC, Generic[Optics]):
             solver,
             gauss_newton,
             problem,
-            solver.init(problem.domain.x_of(problem.base), min(samples, options.max_samples), before),
+            solver.init(self._start_of(problem), min(samples, options.max_samples), before),
         )
+
+    def _start_of(self, problem: StackProblem[Optics]) -> Array:
+        # Where a stage begins: its tissue, and the instrument's errors as the last stage left them.
+        return problem.domain.x_of(problem.base, dict(self.passes.errors))
+
+    def _see(self, domain: Domain, x: Array) -> None:
+        # Later passes see photographs freed of the instrument's errors in x.
+        if domain.errors.names:
+            self.passes = replace(self.passes, errors=domain.errors_at(x))
 
     def _run(
         self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1
@@ -222,6 +230,7 @@ class Stages(ABC, Generic[Optics]):
             self.steps -= state.step
             state = kind.state_from(entry)
             self.steps += state.step
+            self._see(problem.domain, state.x)
             if not self.is_told:
                 self._tell(problem, state)
         solution = solver.finish(state)
@@ -240,6 +249,7 @@ class Stages(ABC, Generic[Optics]):
             )
             equations = NormalEquations.of(stored)
         problem, solution, known = self._close(problem, solution, equations, samples)
+        self._see(problem.domain, solution.x)
         evaluation = self._evaluate("final", problem.base, self.fewer(self.spec.max_samples_per_pixel), self.files.full)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
         return ChannelFit(

@@ -13,7 +13,8 @@ from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
-from services.fit.optics.domain import similar_medium, to_natural
+from services.fit.instrument.columns import columns, taken
+from services.fit.optics.domain import Domain, similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, closing_sums
 
@@ -37,13 +38,13 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
     tissue, similar, how = problem.jacobian_media(x)
     first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
-    slopes, borrowed = problem.slopes(x), np.array([c.kind == "shape" for c in problem.domain.coordinates])
+    slopes, borrowed = problem.slopes(x), _borrowed(problem.domain)
     ends = tuple(
         (_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd))
         for parts, (mean, sd) in held.items()
     )
     pending = []
-    for task in problem.passes.tasks(label, tissue, samples):
+    for task in problem.passes_at(x).tasks(label, tissue, samples):
         arguments = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
         pending.append(run.submit(f"{label}-{task.index}", closing_task, task, *arguments))
     parts: list[tuple[ClosingSums, TraceRow]] = run.gather(pending)
@@ -69,7 +70,7 @@ def closing_task(
 ) -> tuple[ClosingSums, TraceRow]:
     """One block's share. Rows of ``slopes`` that are ``borrowed`` are those of the similar media's Jacobian instead."""
     start, block = time.time(), read_block(task.block)
-    view = block.fitted_view
+    view, errors = block.fitted_view, dict(task.errors)
 
     def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:
         return np.asarray(
@@ -79,19 +80,35 @@ def closing_task(
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
     few = max(task.samples // SHIFT_SAMPLES, 1)
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
-    believed = how.render(host, replace(task, tissue=similar), view, similar_seeds, block.parts)
-    exact = believed if borrowed.all() else slopes.render(host, task, view, seeds, block.parts)
+
+    def derivatives(of: Differentiation, of_task: BlockTask, pair: tuple[int, int]) -> list[Array]:
+        rows = of.render(host, of_task, view, pair, block.parts)
+        seen = (columns(render.reshape(block.reference.shape), block, of.errors) for render in renders)
+        return [np.concatenate([own, more]) for own, more in zip(rows, seen, strict=True)]
+
+    def residual(render: Array) -> Array:
+        return (taken(render.reshape(block.reference.shape), block, errors) - block.reference).reshape(-1)
+
+    believed = derivatives(how, replace(task, tissue=similar), similar_seeds)
+    exact = believed if borrowed.all() else derivatives(slopes, task, seeds)
     sums = closing_sums(
         whiten,
         (believed[0], believed[1]),
         (exact[0], exact[1]),
         borrowed,
-        (renders[0] - block.reference.reshape(-1), renders[1] - block.reference.reshape(-1)),
+        (residual(renders[0]), residual(renders[1])),
         np.array(moved).reshape(len(ends), 2, renders[0].size),
         block.fit_weight.reshape(-1),
         len(block.reference),
+        len(slopes.errors),
     )
     return sums, trace_row("closing", task, start)
+
+
+def _borrowed(domain: Domain) -> NDArray[np.bool_]:
+    # Which derivatives (F,) exact images share with similar media: of the dentin's shape, as they are not rendered again, and of the instrument's errors.
+    shapes = [coordinate.kind == "shape" for coordinate in domain.coordinates]
+    return np.array(shapes + [True] * len(domain.errors.names))
 
 
 def _with_cosine(tissue: Optics, parts: tuple[str, ...], dual: float) -> Optics:

@@ -73,11 +73,15 @@ class Differentiation:
     """Of the task's paths that scores get, one part in so many."""
     neighbours: Neighbours | None = None
     """Of a jaw's teeth."""
+    errors: tuple[str, ...] = ()
+    """The instrument's errors: derivatives that follow these and are not rendered, see ``instrument.columns``."""
 
     def render(
         self, host: EngineHost, task: BlockTask, view: View, seeds: Sequence[int], parts: PixelParts | None = None
     ) -> tuple[Array, ...]:
-        """Derivatives (F, L N) by each of the seeds; scores are of the task's media. All seeds see a surface before it is moved again.
+        """Derivatives (F, L N) to the tissue's coordinates by each of the seeds; scores are of the task's media.
+
+        All seeds see a surface before it is moved again.
 
         Args:
             parts: what the view's pixels show, of a jaw.
@@ -138,7 +142,7 @@ def differentiation(
         jacobian_g: mean cosine of the similar media in which it is done; None for the images' own.
         neighbours: of a jaw's teeth.
     """
-    tissue = domain.tissue_at(x, base)
+    x, tissue = x[: domain.tissue_count], domain.tissue_at(x, base)
     # Scores of extinction are noisy, but in a jaw they are of all teeth at once; and the images' own media are the closing measurement's, which wants slopes.
     differing = WITHOUT_SCORES if jacobian_g is None or isinstance(base, Mouth) else WITHOUT_SCORES | {"sigma"}
     is_secant = [c.kind in differing for c in domain.coordinates]
@@ -152,17 +156,20 @@ def differentiation(
         for group in groups
     ]
     share = SCORES_SHARE if any(domain.coordinates[one.coordinates[0]].kind == "sigma" for one in secants) else 1
-    return Differentiation(names, _chain(domain, x, base, names, jacobian_g), tuple(secants), share, neighbours)
+    chain = _chain(domain, x, base, names, jacobian_g)
+    return Differentiation(names, chain, tuple(secants), share, neighbours, domain.errors.names)
 
 
 def slopes(domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None = None) -> Differentiation:
     """How to differentiate the images' own media at x (F,), except to blend weights."""
+    x = x[: domain.tissue_count]
     tissue, cosines = domain.tissue_at(x, base), [k for k, c in enumerate(domain.coordinates) if c.kind == "cosine"]
     scored = _scored_parameters(domain)
     secants = tuple(
         _secant(domain, x, group, base, tissue, None, SLOPE_REACH) for group in _groups(domain, cosines, neighbours)
     )
-    return Differentiation(scored, _chain(domain, x, base, scored, None), secants, neighbours=neighbours)
+    chain = _chain(domain, x, base, scored, None)
+    return Differentiation(scored, chain, secants, neighbours=neighbours, errors=domain.errors.names)
 
 
 def _scored_parameters(domain: Domain) -> tuple[str, ...]:

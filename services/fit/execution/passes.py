@@ -25,6 +25,7 @@ from services.fit.execution.derivatives import Differentiation, differentiation,
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import Executor
 from services.fit.execution.seeds import Seeds
+from services.fit.instrument.columns import columns, taken
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
@@ -35,6 +36,8 @@ from services.fit.transport.scene.recipe import StackEstimate
 Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]
 """For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
+Errors = tuple[tuple[str, float], ...]
+"""The instrument's, by name."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Residual:
     first: Array
     second: Array
     trace: TraceRow
+    images: tuple[Array, Array] | None = None
+    """The renders themselves, for derivatives to the instrument's errors; None where these are not fitted."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     stacks: list[StackEstimate] = [
         host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds
     ]
-    return Residual(stacks[0].mean - block.reference, stacks[1].mean - block.reference, trace_row("image", task, start))
+    first, second = (taken(stack.mean, block, dict(task.errors)) - block.reference for stack in stacks)
+    images = (stacks[0].mean, stacks[1].mean) if task.errors else None
+    return Residual(first, second, trace_row("image", task, start), images)
 
 
 def jacobian_task(
@@ -88,12 +95,17 @@ def jacobian_task(
     """Render a block's derivatives with two seeds and multiply them by each other and by the residual."""
     start, block = time.time(), read_block(task.block)
     j1, j2 = how.render(host, task, block.fitted_view, seeds, block.parts)
+    if residual.images is not None:
+        j1, j2 = (
+            np.concatenate([own, columns(image, block, how.errors)])
+            for own, image in zip((j1, j2), residual.images, strict=True)
+        )
     rendered, start = trace_row("jacobian", task, start), time.time()
     r1, r2, variance, weight = (
         a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight)
     )
     regions = None if near is None else _regions(block, near)
-    equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions)
+    equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions, len(how.errors))
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 
@@ -118,22 +130,30 @@ def gradient_task(
 
 
 def compare_task(
-    host: EngineHost, task: BlockTask, new: Tissue | Mouth, seeds: tuple[int, int], by_cells: bool = True
+    host: EngineHost,
+    task: BlockTask,
+    new: Tissue | Mouth,
+    seeds: tuple[int, int],
+    by_cells: bool = True,
+    new_errors: Errors | None = None,
 ) -> tuple[LossChange, TraceRow]:
-    """Render a block at two points with the same two seeds and compare their losses, of cells' means or pixel by pixel."""
+    """Render a block at two points with the same two seeds and compare their losses, of cells' means or pixel by pixel.
+
+    Args:
+        new_errors: the instrument's at the second point; None for those of the task.
+    """
     start, block = time.time(), read_block(task.block)
 
-    def residuals(tissue: Tissue | Mouth) -> tuple[Array, Array]:
-        first, second = (
-            (
-                host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed).mean
-                - block.reference
-            ).reshape(-1)
+    def residuals(tissue: Tissue | Mouth, errors: Errors) -> tuple[Array, Array]:
+        stacks = [
+            host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed)
             for seed in seeds
-        )
+        ]
+        first, second = ((taken(one.mean, block, dict(errors)) - block.reference).reshape(-1) for one in stacks)
         return first, second
 
-    given = *residuals(task.tissue), *residuals(new), block.fit_weight.reshape(-1)
+    changed = task.errors if new_errors is None else new_errors
+    given = *residuals(task.tissue, task.errors), *residuals(new, changed), block.fit_weight.reshape(-1)
     return loss_change(*given, len(block.reference), block.cell if by_cells else None), trace_row(
         "compare", task, start
     )
@@ -158,6 +178,8 @@ class Passes:
     seeds: Seeds
     record: Callable[[Sequence[TraceRow]], None]
     """Takes the trace of finished tasks."""
+    errors: Errors = ()
+    """Of the instrument, as the fit sees them now: renders are seen through an instrument with them."""
 
     def run(self, label: str, tissue: Tissue | Mouth, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
         """One task per block, results in block order."""
@@ -171,7 +193,8 @@ class Passes:
 
     def tasks(self, label: str, tissue: Tissue | Mouth, samples: int) -> list[BlockTask]:
         """What the blocks' tasks are told, in block order."""
-        return [BlockTask(block, k, self.recipe, label, tissue, samples) for k, block in enumerate(self.blocks)]
+        given = self.recipe, label, tissue, samples, self.errors
+        return [BlockTask(block, k, *given) for k, block in enumerate(self.blocks)]
 
 
 @dataclass(frozen=True)
@@ -196,7 +219,7 @@ class StackProblem(Generic[Optics]):
         seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
         near = None if self.neighbours is None else self.neighbours.near(self.domain)
         pending = []
-        for task in self.passes.tasks(label, tissue, samples):
+        for task in self.passes_at(x).tasks(label, tissue, samples):
             image = run.submit(
                 f"{label}-image-{task.index}",
                 image_task,
@@ -237,12 +260,17 @@ class StackProblem(Generic[Optics]):
         label = f"{self._prefix}-{step}-trial-{trial}"
         old, new = self._image_media(x_old), self._image_media(x_new)
         seeds = self.seed(step, "compare-1", trial), self.seed(step, "compare-2", trial)
-        parts = self.passes.run(label, old, max(samples // 2, 1), compare_task, new, seeds)
+        given = new, seeds, True, self.domain.errors_at(x_new) or None
+        parts = self.passes_at(x_old).run(label, old, max(samples // 2, 1), compare_task, *given)
         self.passes.record([row for _, row in parts])
         total: LossChange = parts[0][0]
         for change, _ in parts[1:]:
             total = total + change
         return total
+
+    def passes_at(self, x: Array) -> Passes:
+        """The passes through an instrument with the errors in x."""
+        return replace(self.passes, errors=self.domain.errors_at(x)) if self.domain.errors.names else self.passes
 
     def _image_media(self, x: Array) -> Optics:
         tissue = self.domain.tissue_at(x, self.base)

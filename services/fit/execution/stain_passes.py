@@ -23,6 +23,7 @@ from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.inputs.stain_uv import StainLayout
+from services.fit.instrument.columns import taken
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.normal_equations import LossChange
@@ -54,8 +55,9 @@ def stain_task(
         assert texels is not None
         return texels
 
-    squares = float((weight * ((image.mean - block.reference) ** 2 - image.variance)).sum())
-    return gradient(weight * block.reference), gradient(weight * image.mean), squares, trace_row("stain", task, start)
+    seen = taken(image.mean, block, dict(task.errors))
+    squares = float((weight * ((seen - block.reference) ** 2 - image.variance)).sum())
+    return gradient(weight * block.reference), gradient(weight * seen), squares, trace_row("stain", task, start)
 
 
 @dataclass

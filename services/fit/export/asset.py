@@ -144,8 +144,8 @@ def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
 
 
 def parameters_json(report: FitReport) -> dict[str, Any]:
-    """Per channel and name: value, se, unit, determined."""
-    tables = {channel: dict(table) for channel, table in report.parameters.items()}
+    """Per channel and name: value, se, unit, determined, se_parts; the instrument's errors among them."""
+    tables = {channel: dict(table) | report.instrument.get(channel, {}) for channel, table in report.parameters.items()}
     for fdi, tooth in report.teeth.items():
         for channel, own in tooth.parameters.items():
             tables[channel] |= {f"{fdi}.{name}": estimate for name, estimate in own.items()}
@@ -172,6 +172,7 @@ def errors_json(report: FitReport) -> dict[str, Any]:
         VERDICT: verdict.model_dump(mode="json"),
         "advice": report.advice,
         "notes": report.notes,
+        "instrument": report.instrument_told,
         "told": report.told,
         "next_capture": report.next_capture,
         "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},

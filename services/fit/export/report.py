@@ -16,6 +16,7 @@ from services.core.store import write_atomic
 from services.core.verdict import mean_figure, percent, verdict_of
 from services.fit.checks.thickness import ThicknessMap
 from services.fit.export.curves import Series, log_chart
+from services.fit.export.instrument import instrument_tables, source_tables
 from services.fit.export.pictures import (
     DIVERGING,
     RESIDUAL_OF_WHITE,
@@ -100,6 +101,9 @@ def write_report(
         error=percent(verdict.error),
         advice=report.advice,
         notes=report.notes,
+        instrument_told=report.instrument_told,
+        instrument=instrument_tables(report),
+        sources=source_tables(report, _is_leading, lambda name: f"{_group(name)}, {_label(name)}"),
         told=report.told,
         next_capture=report.next_capture,
         correlations=_correlations(report.correlations),
@@ -249,6 +253,10 @@ def _parameter_rows(parameters: dict[str, dict[str, Estimate]]) -> list[dict[str
             }
         )
     return rows
+
+
+def _is_leading(name: str) -> bool:
+    return name.rpartition(".")[2] in LEADING or name.startswith("shape.")
 
 
 def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:

@@ -16,6 +16,8 @@ from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import StoredArray, open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
+from services.fit.instrument.capture import Instrument
+from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
 from services.fit.solve.losses import first_weights
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
@@ -110,6 +112,8 @@ class ChannelFiles:
     """Mean weight of a fitted measurement."""
     quality: float
     """Signal-to-noise power over fitted measurements."""
+    errors: InstrumentErrors = NO_ERRORS
+    """Of the instrument, those that act on what is fitted."""
 
     @property
     def blocks(self) -> tuple[StoredFile, ...]:
@@ -266,12 +270,18 @@ def channel_scene(
 
 
 def write_channel(
-    folder: Path, scene: SceneRecipe, channel: str, views: tuple[ViewStack, ...], loss: Loss = "l2"
+    folder: Path,
+    scene: SceneRecipe,
+    channel: str,
+    views: tuple[ViewStack, ...],
+    loss: Loss = "l2",
+    instrument: Instrument | None = None,
 ) -> ChannelFiles:
     """Write one channel's blocks and scenes; the same input gives the same files.
 
     Args:
         scene: under all lights, in the order of the views' images.
+        instrument: None for one without errors.
     """
     fitted = [v.fitted for v in views]
     used = np.any([f.any(axis=1) for f in fitted], axis=0)
@@ -286,6 +296,8 @@ def write_channel(
 
     coarse_pixels = COARSE_PIXELS * len(scene.teeth)
     cells = {v.camera.name: comparison_cells(v, coarse_pixels) for v in views}
+    brightest = {v.camera.name: float(np.where(v.valid, v.reference, 0.0).max(initial=0.0)) for v in views}
+    seeing = [v.camera.name for v, f in zip(views, fitted, strict=True) if f.any()]
 
     def recipe(lights: NDArray[np.bool_]) -> StoredFile:
         chosen = replace(
@@ -300,7 +312,13 @@ def write_channel(
         held = view.valid[cut] & view.held_out[lights][:, None]
         measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
         parts = None if view.parts is None else view.parts.of(pixels)
-        return write_block(folder, Block(*measured, weight[cut], held, parts, cells[view.camera.name][pixels]))
+        acting = (
+            None
+            if instrument is None
+            else instrument.acting(channel, view.camera.name, brightest[view.camera.name], lights)
+        )
+        block = Block(*measured, weight[cut], held, parts, cells[view.camera.name][pixels], acting)
+        return write_block(folder, block)
 
     def level(most: int | None) -> Level:
         fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
@@ -336,6 +354,7 @@ def write_channel(
         evaluation_recipe=recipe(seen),
         weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),
+        errors=NO_ERRORS if instrument is None else instrument.errors(channel, seeing, used),
     )
 
 

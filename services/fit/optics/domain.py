@@ -20,11 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import SettingsError
+from services.fit.instrument.errors import LINEAR_REACH, NO_ERRORS, InstrumentErrors
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Optics, Tissue
 
 LN10 = math.log(10.0)
@@ -146,14 +148,24 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Domain:
-    """The coordinates of one fit; parameters they do not name stay as in the tissue they are applied to."""
+    """The coordinates of one fit; parameters they do not name stay as in the tissue they are applied to.
+
+    A vector x (F,) holds the tissue's coordinates, then the instrument's errors.
+    """
 
     coordinates: tuple[Coordinate, ...]
+    """Of the tissue."""
+    errors: InstrumentErrors = NO_ERRORS
 
     @property
     def names(self) -> tuple[str, ...]:
         """Coordinate names, the order of every vector x."""
-        return tuple(c.name for c in self.coordinates)
+        return tuple(c.name for c in self.coordinates) + self.errors.names
+
+    @property
+    def tissue_count(self) -> int:
+        """How many coordinates are the tissue's."""
+        return len(self.coordinates)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -163,60 +175,99 @@ class Domain:
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bounds of x, both (F,)."""
-        low, high = zip(*(BOUNDS[c.kind] for c in self.coordinates), strict=True)
+        low, high = zip(*(BOUNDS[c.kind] for c in self.coordinates), *self.errors.bounds, strict=True)
         return np.array(low), np.array(high)
 
     @property
     def scale(self) -> NDArray[np.float64]:
         """Step scale of x, (F,)."""
-        return np.array([STEP_SCALE[c.kind] for c in self.coordinates])
+        return np.array([STEP_SCALE[c.kind] for c in self.coordinates] + [LINEAR_REACH] * len(self.errors.names))
 
     @property
     def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Prior mean and precision 1/sd^2, both (F,); precision 0 where the prior is flat."""
-        mean = np.array([0.0 if c.prior_mean is None else c.prior_mean for c in self.coordinates])
-        precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates])
+        """Prior mean and precision 1/sd^2 of the tissue's coordinates, both (F,); precision 0 where the prior is flat, and of errors."""
+        none = [0.0] * len(self.errors.names)
+        mean = np.array([0.0 if c.prior_mean is None else c.prior_mean for c in self.coordinates] + none)
+        precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates] + none)
         return mean, precision
 
     @property
+    def precision(self) -> NDArray[np.float64]:
+        """Precision of the prior of all of x, (F, F)."""
+        matrix = np.diag(self.prior[1])
+        matrix[self.tissue_count :, self.tissue_count :] = self.errors.precision
+        return matrix
+
+    def prior_slope(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Slope of 1/2 (x - mean)' precision (x - mean) at x, (F,)."""
+        mean, precision = self.prior
+        slope = precision * (x - mean)
+        slope[self.tissue_count :] = self.errors.precision @ x[self.tissue_count :]
+        return slope
+
+    def prior_change(self, x_old: NDArray[np.float64], x_new: NDArray[np.float64]) -> float:
+        """By how much that half square changes from one x to another."""
+        mean, precision = self.prior
+        change = 0.5 * float(precision @ ((x_new - mean) ** 2 - (x_old - mean) ** 2))
+        if self.errors.names:
+            old, new = x_old[self.tissue_count :], x_new[self.tissue_count :]
+            change += 0.5 * float((new + old) @ self.errors.precision @ (new - old))
+        return change
+
+    def errors_at(self, x: NDArray[np.float64]) -> tuple[tuple[str, float], ...]:
+        """The instrument's errors in x, by name."""
+        return tuple(zip(self.errors.names, x[self.tissue_count :].tolist(), strict=True))
+
+    @property
     def relation(self) -> NDArray[np.int_]:
-        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two teeth. All 0 for a tooth alone."""
+        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two teeth. All 0 for a tooth alone.
+
+        With the instrument's errors 3 (row the tissue's), 4 (row an error's) and 5 (both errors').
+        """
         tooth = np.array([-1 if c.tooth is None else c.tooth for c in self.coordinates])
-        if (tooth < 0).all():
-            return np.zeros((len(tooth), len(tooth)), dtype=int)
         shared = (tooth < 0)[:, None] | (tooth < 0)
-        return np.where(shared, 1, np.where(tooth[:, None] == tooth, 0, 2))
+        alone = bool((tooth < 0).all())
+        of_tissue = (
+            np.zeros(shared.shape, int) if alone else np.where(shared, 1, np.where(tooth[:, None] == tooth, 0, 2))
+        )
+        errors = len(self.errors.names)
+        across = np.full((len(tooth), errors), 3)
+        return np.block([[of_tissue, across], [across.T + 1, np.full((errors, errors), 5)]])
 
     @property
     def cosines(self) -> tuple[str, ...]:
         """Parts whose mean cosine is a coordinate. Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity."""
         return tuple(target.rpartition(".")[0] for c in self.coordinates if c.kind == "cosine" for target in c.targets)
 
-    def x_of(self, tissue: Optics) -> NDArray[np.float64]:
-        """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value."""
+    def x_of(self, tissue: Optics, errors: Mapping[str, float] = MappingProxyType({})) -> NDArray[np.float64]:
+        """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value, an error that is not given 0."""
         held = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
 
         def value(name: str) -> float:
             part, _, leaf = name.rpartition(".")
             return tissue.medium(part).mean_cosine if leaf == "cosine" else held.value(name)
 
-        return np.array([to_dual(c.kind, value(c.targets[0])) for c in self.coordinates])
+        own = [to_dual(c.kind, value(c.targets[0])) for c in self.coordinates]
+        return np.array(own + [errors.get(name, 0.0) for name in self.errors.names])
 
     def tissue_at(self, x: Sequence[float] | NDArray[np.float64], base: Optics) -> Optics:
         """``base`` with this domain's parameters at x."""
         values = {
             target: to_natural(c.kind, float(v))
-            for c, v in zip(self.coordinates, x, strict=True)
+            for c, v in zip(self.coordinates, x[: self.tissue_count], strict=True)
             for target in c.targets
         }
         cosines = {part: values.pop(f"{part}.cosine") for part in self.cosines}
         return _at_cosines(_at_cosines(base, dict.fromkeys(cosines, HELD_G)).with_values(values), cosines)
 
     def chain(self, x: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of each parameter to each coordinate, (P, F): maps derivatives to natural parameters onto coordinates. Not with ``cosines``."""
-        matrix = np.zeros((len(self.parameters), len(self.coordinates)))
+        """Derivative of each parameter to each of the tissue's coordinates, (P, F): maps derivatives to natural parameters onto coordinates.
+
+        Not with ``cosines``.
+        """
+        matrix = np.zeros((len(self.parameters), self.tissue_count))
         row = 0
-        for column, (c, v) in enumerate(zip(self.coordinates, x, strict=True)):
+        for column, (c, v) in enumerate(zip(self.coordinates, x[: self.tissue_count], strict=True)):
             for _ in c.targets:
                 matrix[row, column] = natural_derivative(c.kind, float(v))
                 row += 1

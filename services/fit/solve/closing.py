@@ -74,6 +74,7 @@ def closing_sums(
     moved: Array,
     weight: Array,
     lights: int,
+    errors: int = 0,
 ) -> ClosingSums:
     """Sum one block of measurements, M = lights x pixels.
 
@@ -85,6 +86,7 @@ def closing_sums(
         residuals: render minus reference (M,) from two more.
         moved: changes of the render (K, 2, M), by change and seed.
         weight: (M,)
+        errors: so many of the last derivatives are those to the instrument's errors, of the renders of the residuals, as in ``normal_equations``.
     """
     mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
     true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
@@ -92,13 +94,20 @@ def closing_sums(
     own = np.where(borrowed[:, None], spread, 0.0)
     m, d, e, f, o = (whiten.T @ rows for rows in (mean, spread, true, true_spread, own))
 
-    # Sums of J~ with something, and their noise by pixels, as in the normal equations.
-    def with_noise(pair: tuple[Array, Array]) -> tuple[Array, Array]:
-        value, half = weight * 0.5 * (pair[0] + pair[1]), weight * 0.5 * (pair[0] - pair[1])
-        first, second, both = (per_pixel(terms, lights) for terms in (m * half, d * value, d * half))
-        return m @ value, first @ first.T + second @ second.T - both @ both.T
+    # Derivatives to errors share the noise of the residuals' renders, all others have noise of their own.
+    is_error = np.arange(len(mean)) >= len(mean) - errors
+    apart, shared = (whiten.T @ np.where(chosen[:, None], spread, 0.0) for chosen in (~is_error, is_error))
 
-    gradient, gradient_noise = with_noise(residuals)
+    # Sums of J~ with something, and their noise by pixels, as in the normal equations.
+    def with_noise(pair: tuple[Array, Array], is_residual: bool = False) -> tuple[Array, Array]:
+        value, half = weight * 0.5 * (pair[0] + pair[1]), weight * 0.5 * (pair[0] - pair[1])
+        common = shared if is_residual else np.zeros_like(shared)
+        first, second, both = (
+            per_pixel(terms, lights) for terms in (m * half + common * value, apart * value, apart * half)
+        )
+        return m @ value - common @ half, first @ first.T + second @ second.T - both @ both.T
+
+    gradient, gradient_noise = with_noise(residuals, is_residual=True)
     shifts = [with_noise((change[0], change[1])) for change in moved]
 
     # Response; where J is borrowed both sides share their noise, which is taken off the value and makes their errors go together.
@@ -128,25 +137,35 @@ class Response:
     """E (F, F), shrunk."""
 
 
-def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_]) -> Response:
+def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
     """Shrink the measured response towards the believed curvature.
+
+    Derivatives J~ of the tissue have no part along those of the instrument's errors, from which y is freed, so M = [1 + E, 0; G, 1]: errors follow the
+    tissue by G, and the tissue's answer is what it would be without them.
 
     Args:
         prior: whitened precision T' Lambda T, which joins the measured data.
         relation: kind of each entry (F, F); entries of one kind are thought to scatter alike.
+        errors: so many of the last coordinates are the instrument's errors.
     """
-    excess = sums.response + prior - np.eye(len(prior))
+    size = len(prior)
+    tissue = size - errors
+    excess = sums.response + prior - np.eye(size)
+    excess[:, tissue:] = 0.0
     noise = np.maximum(sums.response_variance, 1e-30)
     between = np.zeros_like(excess)
-    for kind in np.unique(relation):
+    for kind in np.unique(relation[:, :tissue]):
         alike = relation == kind
         between[alike] = _between_variance(excess[alike], noise[alike])
     shrunk, left = excess * between / (between + noise), noise * between / (between + noise)
 
     # A singular value that noise could have made is not believed to be smaller than noise.
-    u, values, v = np.linalg.svd(np.eye(len(prior)) + shrunk)
-    floor = 2 * np.sqrt(len(prior) * float(left.mean()))
-    inverse = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
+    own = np.eye(tissue) + shrunk[:tissue, :tissue]
+    u, values, v = np.linalg.svd(own)
+    floor = 2 * np.sqrt(tissue * float(left[:tissue, :tissue].mean()))
+    inverse = np.eye(size)
+    inverse[:tissue, :tissue] = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
+    inverse[tissue:, :tissue] = -shrunk[tissue:, :tissue] @ inverse[:tissue, :tissue]
     return Response(np.asarray(inverse), left, shrunk)
 
 

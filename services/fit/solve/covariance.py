@@ -17,7 +17,7 @@ r        what is left of the step to the minimum, where the fit ended short of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from types import MappingProxyType
 
@@ -25,9 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.results import Estimate
+from services.fit.instrument.errors import kind_of_error
 from services.fit.optics.domain import UNITS, Domain, kind_of, natural_derivative
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, Response, response
+from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
@@ -78,10 +80,17 @@ class Uncertainty:
     """(J'WJ + Lambda)^-1, (F, F)."""
     sandwich: Sandwich | None = None
     """What the covariance is made of, but for r r'."""
+    parts: Mapping[str, Array] = field(default_factory=dict)
+    """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
 
     def standard_error(self, slope: Array) -> float:
         """One standard error of a quantity with gradient ``slope`` (F,) to x."""
         return float(np.sqrt(max(float(slope @ self.covariance @ slope), 0.0)))
+
+    def se_parts(self, slope: Array) -> dict[str, float]:
+        """That standard error by its sources, largest first; their squares add up to its square."""
+        found = {name: float(np.sqrt(max(float(slope @ part @ slope), 0.0))) for name, part in self.parts.items()}
+        return {name: se for name, se in sorted(found.items(), key=lambda one: -one[1]) if se > 0}
 
     def is_determined(self, slope: Array) -> bool:
         """Whether the data fix a quantity with gradient ``slope``: it avoids open directions and bounds, and the prior knows less than half."""
@@ -114,15 +123,28 @@ class Whitening:
 
 def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
     """Judge the curvature by its noise. Open directions keep only their noise level, so that they show a large error instead of a negative variance."""
-    _, precision = domain.prior
-    scale = domain.scale
-    eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
-    noise = equations.eigenvalue_noise(scale[:, None] * vectors)
+    count, errors = domain.tissue_count, len(domain.errors.names)
+    precision, scale = domain.prior[1][:count], domain.scale[:count]
+    left = eliminate(equations, _of_errors(domain), np.zeros(count + errors), count)
+    eigenvalues, vectors = np.linalg.eigh(left.hessian * np.outer(scale, scale))
+    noise = left.eigenvalue_noise(scale[:, None] * vectors)
     tiny = 1e-12 * float(abs(eigenvalues).max()) + 1e-300
     is_open = eigenvalues < np.maximum(NOISE_FACTOR * noise, tiny)
     believed = np.where(is_open, np.maximum(noise, tiny), eigenvalues)
     curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
-    return Whitening(scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T), vectors[:, is_open])
+    tissue = scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T)
+
+    # Errors follow the tissue, and have a unit of their own besides; no direction of theirs is open, as their prior is proper.
+    own = np.concatenate([np.zeros((count, errors)), left.root])
+    open_directions = np.concatenate([vectors[:, is_open], np.zeros((errors, int(is_open.sum())))])
+    return Whitening(np.concatenate([left.lift @ tissue, own], axis=1), open_directions)
+
+
+def _of_errors(domain: Domain) -> Array:
+    # The prior's precision with that of the tissue left out: it joins after the curvature was judged by its noise.
+    precision = domain.precision
+    precision[: domain.tissue_count, : domain.tissue_count] = 0.0
+    return precision
 
 
 @dataclass(frozen=True)
@@ -197,13 +219,12 @@ class ClosingModel:
 
 def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
     """All that is known at x, where the closing measurement was made."""
-    mean, precision = domain.prior
     known = whitening(domain, equations)
     t = known.transform
-    solved = response(sums, t.T @ np.diag(precision) @ t, domain.relation)
+    solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
     pooled = _pooled(t, equations, sums, solved)
     return ClosingModel(
-        domain, x, known, solved.inverse, pooled.gradient + t.T @ (precision * (x - mean)), _positive(pooled.noise)
+        domain, x, known, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), _positive(pooled.noise)
     )
 
 
@@ -216,36 +237,47 @@ def uncertainty(
         sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where Jacobians are the images' own.
         step: what the fit moved after it.
     """
-    mean, precision = domain.prior
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     known = whitening(domain, equations)
     t, count = known.transform, len(x)
-    prior = t.T @ np.diag(precision) @ t
-    meat = misfit * _positive(t.T @ equations.data_noise @ t) + prior
+    prior = t.T @ domain.precision @ t
+    parts = {"photographs": misfit * _positive(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
+    meat = parts["photographs"] + prior
     if sums is None:
         inverse = np.eye(count)
-        meat = meat + _positive(t.T @ equations.gradient_noise @ t)
-        left = t.T @ (equations.gradient + precision * (x - mean))
+        parts["rendering"] = _positive(t.T @ equations.gradient_noise @ t)
+        meat = meat + parts["rendering"]
+        left = t.T @ (equations.gradient + domain.prior_slope(x))
     else:
         solved, moved = (
-            response(sums, prior, domain.relation),
+            response(sums, prior, domain.relation, len(domain.errors.names)),
             np.linalg.solve(t, np.zeros(count) if step is None else step),
         )
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
-        meat = (
-            meat
-            + _positive(pooled.noise)
-            + sums.shift_covariance
-            + np.diag(solved.variance @ (moved + pooled.carried) ** 2)
-        )
-        left = pooled.gradient + t.T @ (precision * (x - mean)) + np.linalg.solve(inverse, moved) - prior @ moved
+        rendered, unsure = _positive(pooled.noise), np.diag(solved.variance @ (moved + pooled.carried) ** 2)
+        parts |= {"rendering": rendered + unsure, "mean_cosine": sums.shift_covariance}
+        meat = meat + rendered + sums.shift_covariance + unsure
+        left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, moved) - prior @ moved
 
     # What is left of the step counts as error along what is not open.
     rest = t @ inverse @ left / domain.scale
     rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
     sandwich = Sandwich(t, inverse, meat, misfit)
-    covariance = sandwich.covariance + np.outer(rest, rest)
-    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich)
+    unfinished = np.outer(rest, rest)
+    covariance = sandwich.covariance + unfinished
+    made_of = {name: replace(sandwich, meat=part).covariance for name, part in parts.items()}
+    made_of["unfinished"] = unfinished
+    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich, made_of)
+
+
+def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
+    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Kinds that go together share what they have in common.
+    kinds = np.array(["prior"] * domain.tissue_count + [kind_of_error(name) for name in domain.errors.names])
+    parts = {}
+    for kind in dict.fromkeys(kinds.tolist()):
+        half = np.where(kinds == kind, 0.5, 0.0)
+        parts[kind] = t.T @ (domain.precision * (half[:, None] + half)) @ t
+    return parts
 
 
 def estimates(
@@ -295,9 +327,12 @@ def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:
     for k, coordinate in enumerate(known.domain.coordinates):
         if name in coordinate.targets:
             slope[k] = natural_derivative(coordinate.kind, float(known.x[k]))
-    return Estimate(
-        value=tissue.value(name), se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope)
-    )
+    return _estimate(tissue.value(name), unit, known, slope)
+
+
+def _estimate(value: float, unit: str, known: Uncertainty, slope: Array) -> Estimate:
+    se, determined = known.standard_error(slope), known.is_determined(slope)
+    return Estimate(value=value, se=se, unit=unit, determined=determined, se_parts=known.se_parts(slope))
 
 
 def _derived(
@@ -318,7 +353,24 @@ def _derived(
             slope[k] = (high - low) / (2 * step)
     if not slope.any():
         return Estimate(value=value, se=None, unit=unit, determined=False)
-    return Estimate(value=value, se=known.standard_error(slope), unit=unit, determined=known.is_determined(slope))
+    return _estimate(value, unit, known, slope)
+
+
+def instrument_estimates(known: Uncertainty) -> dict[str, Estimate]:
+    """The instrument's errors by name; one is determined where the images tell it better than the calibration did."""
+    first, found = known.domain.tissue_count, {}
+    for k, (name, before) in enumerate(zip(known.domain.errors.names, known.domain.errors.se.tolist(), strict=True)):
+        slope = np.zeros(len(known.x))
+        slope[first + k] = 1.0
+        se = known.standard_error(slope)
+        found[name] = Estimate(
+            value=float(known.x[first + k]),
+            se=se,
+            unit="1",
+            determined=se < MIN_DATA_SHARE**0.5 * before,
+            se_parts=known.se_parts(slope),
+        )
+    return found
 
 
 def _positive(matrix: Array) -> Array:

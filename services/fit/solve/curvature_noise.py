@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,19 +17,43 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+def pairs_of(count: int, exact: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which entries H_ab are noisy, as indices a and b (P,): pairs of the noisy coordinates, then each of them with every exact one.
+
+    Args:
+        count: coordinates whose derivatives are noisy; they come first.
+        exact: coordinates whose derivatives are known exactly, such as a gain's; entries between two of them have no noise.
+    """
+    first, second = np.triu_indices(count)
+    noisy, known = np.divmod(np.arange(count * exact), max(exact, 1))
+    return np.concatenate([first, noisy]), np.concatenate([second, count + known])
+
+
 @dataclass(frozen=True)
 class NoisePart:
-    """Covariance of the entries H_ab, a <= b, of one set of measurements."""
+    """Covariance of the noisy entries H_ab of one set of measurements."""
 
     coordinates: tuple[int, ...]
+    """Whose derivatives are noisy."""
     moments: Array
-    """(P, P), P = n (n + 1) / 2 pairs of the n coordinates, in the order of ``numpy.triu_indices``."""
+    """(P, P), in the order of ``pairs_of``."""
+    exact: tuple[int, ...] = ()
+    """Coordinates whose derivatives are known exactly."""
+
+    @property
+    def own(self) -> list[int]:
+        """All its coordinates."""
+        return [*self.coordinates, *self.exact]
+
+    @property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Places of each entry's two coordinates among ``own``."""
+        return pairs_of(len(self.coordinates), len(self.exact))
 
     def product_with(self, vector: Array) -> Array:
         """The matrix (n, P) that gives H v from the entries of H, for the part's coordinates of v (n,)."""
-        n = len(vector)
-        first, second = np.triu_indices(n)
-        matrix, pairs = np.zeros((n, len(first))), np.arange(len(first))
+        first, second = self.pairs
+        matrix, pairs = np.zeros((len(vector), len(first))), np.arange(len(first))
         matrix[first, pairs] = vector[second]
         matrix[second, pairs] = vector[first]
         return matrix
@@ -43,24 +67,23 @@ class CurvatureNoise:
 
     def __add__(self, other: CurvatureNoise) -> CurvatureNoise:
         """Noise of the sum of two independent curvatures."""
-        sums = {part.coordinates: part for part in self.parts}
+        sums = {(part.coordinates, part.exact): part for part in self.parts}
         for part in other.parts:
-            known = sums.get(part.coordinates)
-            sums[part.coordinates] = (
-                part if known is None else NoisePart(part.coordinates, known.moments + part.moments)
+            known = sums.get((part.coordinates, part.exact))
+            sums[part.coordinates, part.exact] = (
+                part if known is None else replace(part, moments=known.moments + part.moments)
             )
         return CurvatureNoise(tuple(sums.values()))
 
     def scaled(self, factor: float) -> CurvatureNoise:
         """Noise of a curvature multiplied by sqrt(factor)."""
-        return CurvatureNoise(tuple(NoisePart(part.coordinates, factor * part.moments) for part in self.parts))
+        return CurvatureNoise(tuple(replace(part, moments=factor * part.moments) for part in self.parts))
 
     def variance(self, directions: Array) -> Array:
         """Variance of u'Hu for each column u of ``directions`` (F, K)."""
         total = np.zeros(directions.shape[1])
         for part in self.parts:
-            own = directions[list(part.coordinates)]
-            first, second = np.triu_indices(len(own))
+            own, (first, second) = directions[part.own], part.pairs
             entries = own[first] * own[second] * np.where(first == second, 1.0, 2.0)[:, None]
             total += np.einsum("pk,pk->k", entries, part.moments @ entries)
         return np.maximum(total, 0.0)
@@ -69,9 +92,24 @@ class CurvatureNoise:
         """Covariance (F, F) of H v for a vector v (F,)."""
         total = np.zeros((len(vector), len(vector)))
         for part in self.parts:
-            own = list(part.coordinates)
+            own = part.own
             product = part.product_with(vector[own])
             total[np.ix_(own, own)] += product @ part.moments @ product.T
+        return total
+
+    def of_eliminated(self, inverse: Array) -> Array:
+        """The bias (F, F) that noise gives A S^-1 A', for the last K coordinates, all exact: sum_kl S^-1_kl Cov(A_ak, A_bl).
+
+        Args:
+            inverse: S^-1 (K, K).
+        """
+        count = max(max(part.own) for part in self.parts) + 1 - len(inverse)
+        total = np.zeros((count, count))
+        for part in self.parts:
+            own, known = list(part.coordinates), [k - count for k in part.exact]
+            cross = part.moments[-len(own) * len(known) :, -len(own) * len(known) :]
+            by_entry = cross.reshape(len(own), len(known), len(own), len(known))
+            total[np.ix_(own, own)] += np.einsum("akbl,kl->ab", by_entry, inverse[np.ix_(known, known)])
         return total
 
     def record(self) -> list[dict[str, Any]]:
@@ -79,6 +117,7 @@ class CurvatureNoise:
         return [
             {
                 "coordinates": part.coordinates,
+                **({"exact": part.exact} if part.exact else {}),
                 "moments": base64.b64encode(np.ascontiguousarray(part.moments).tobytes()).decode(),
             }
             for part in self.parts
@@ -90,8 +129,9 @@ class CurvatureNoise:
         parts = []
         for entry in record:
             numbers = np.frombuffer(base64.b64decode(entry["moments"]), dtype=np.float64)
-            size = len(entry["coordinates"]) * (len(entry["coordinates"]) + 1) // 2
-            parts.append(NoisePart(tuple(entry["coordinates"]), numbers.reshape(size, size)))
+            coordinates, exact = tuple(entry["coordinates"]), tuple(entry.get("exact", ()))
+            size = len(pairs_of(len(coordinates), len(exact))[0])
+            parts.append(NoisePart(coordinates, numbers.reshape(size, size), exact))
         return CurvatureNoise(tuple(parts))
 
 
@@ -101,10 +141,23 @@ def per_pixel(terms: Array, lights: int) -> Array:
 
 
 def curvature_noise(
-    mean: Array, difference: Array, weight: Array, coordinates: Sequence[int], lights: int = 1
+    mean: Array,
+    difference: Array,
+    weight: Array,
+    coordinates: Sequence[int],
+    lights: int = 1,
+    exact: Sequence[int] = (),
 ) -> NoisePart:
-    """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded estimates of j."""
+    """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded estimates of j.
+
+    Args:
+        exact: further coordinates whose derivatives have no noise.
+    """
     m, d = mean[list(coordinates)], difference[list(coordinates)]
     first, second = np.triu_indices(len(m))
     entries = per_pixel(0.5 * (m[first] * d[second] + d[first] * m[second]) * weight, lights)
-    return NoisePart(tuple(coordinates), entries @ entries.T)
+    if len(exact):
+        # One by one, as a capture may have a light's gain for each of hundreds of lights.
+        cross = [per_pixel(0.5 * weight * own * mean[list(exact)], lights) for own in d]
+        entries = np.concatenate([entries, *cross])
+    return NoisePart(tuple(coordinates), entries @ entries.T, tuple(exact))

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
 from services.fit.optics.domain import Domain
+from services.fit.solve.elimination import Eliminated, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
 from services.fit.solve.trust_region import solve_box
 
@@ -188,16 +189,14 @@ class GaussNewton:
             fresh, known = pool(state.memory, state.memory_samples, fresh, known), state.memory_samples + known
         state = replace(state, step=state.step + 1, memory=fresh, memory_samples=known)
 
-        # The weak prior is exact: it joins curvature and gradient, never their noise.
-        mean, precision = self.domain.prior
-        equations = replace(
-            fresh, hessian=fresh.hessian + np.diag(precision), gradient=fresh.gradient + precision * (x - mean)
-        )
+        # The weak prior is exact: it joins curvature and gradient, never their noise. The instrument's errors follow the tissue.
+        equations = eliminate(fresh, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
+        best, settling = x + equations.settling, equations.settling
         noise_gain = gain_by_noise(equations)
 
         # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never looks like convergence.
         _, promised = self._propose(equations, x, max(state.radius, 1.0))
-        if promised <= noise_gain <= options.tolerance:
+        if promised <= noise_gain <= options.tolerance and not self._drowns(equations, state):
             return self._settled(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
 
         radius, at_fault = state.radius, False
@@ -205,9 +204,9 @@ class GaussNewton:
             step, promised = self._propose(equations, x, radius)
             if promised <= noise_gain:
                 break
-            new, length = x + step, self._length(step)
-            compared = problem.compare(x, new, samples=state.samples, step=state.step - 1, trial=trial)
-            change = compared.change + 0.5 * float(precision @ ((new - mean) ** 2 - (x - mean) ** 2))
+            new, length = best + equations.lift @ step, self._length(step)
+            compared = problem.compare(best, new, samples=state.samples, step=state.step - 1, trial=trial)
+            change = compared.change + self.domain.prior_change(best, new)
             if not np.isfinite([change, compared.variance]).all():
                 raise NonFiniteError(
                     f"The loss is not finite at step {state.step}; check the capture for invalid radiance."
@@ -228,7 +227,7 @@ class GaussNewton:
                     radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0),
                     verdict="accepted",
                 )
-                return self._limited(self._carry(state, step, length))
+                return self._limited(self._carry(state, settling + equations.lift @ step, length))
             at_fault = judged.is_worse or judged.contradicted
             if not at_fault:
                 break
@@ -247,16 +246,14 @@ class GaussNewton:
             problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations
         )
 
-    def _settled(self, problem: Problem, state: State, equations: NormalEquations) -> State:
+    def _settled(self, problem: Problem, state: State, equations: Eliminated) -> State:
         # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step below one scale.
-        scale, x = self.domain.scale, state.x
-        eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
+        count = self.domain.tissue_count
+        scale, x, settling = self.domain.scale[:count], state.x[:count], equations.settling
+        if state.memory is not None and settling.any():
+            state = replace(state, x=state.x + settling, memory=state.memory.moved(settling))
+        eigenvalues, vectors, spread = _spread(equations, scale)
         noise = equations.eigenvalue_noise(scale[:, None] * vectors)
-        spread = np.sqrt(
-            np.maximum(
-                np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors), 0.0
-            )
-        )
         sure = vectors[
             :,
             (eigenvalues > DETERMINED * noise)
@@ -268,14 +265,14 @@ class GaussNewton:
         length = self._length(step)
         if state.memory is None or length == 0:
             return state
-        low, high = self.domain.bounds
+        low, high = (bound[:count] for bound in self.domain.bounds)
         step = np.clip(x + step / max(length, 1.0), low, high) - x
 
+        new, whole = state.x + equations.lift @ step, equations.lift @ step
         compared = problem.compare(
-            x, x + step, samples=state.samples, step=state.step - 1, trial=self.options.max_trials
+            state.x, new, samples=state.samples, step=state.step - 1, trial=self.options.max_trials
         )
-        mean, precision = self.domain.prior
-        change = compared.change + 0.5 * float(precision @ ((x + step - mean) ** 2 - (x - mean) ** 2))
+        change = compared.change + self.domain.prior_change(state.x, new)
         options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
         model_se = math.hypot(
             equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model
@@ -287,24 +284,36 @@ class GaussNewton:
         if length > 1:
             # Too far for one linear model: look again from there.
             return self._limited(
-                self._carry(replace(state, x=x + step, result=Result.RUNNING, verdict="settling"), step, 1.0)
+                self._carry(replace(state, x=new, result=Result.RUNNING, verdict="settling"), whole, 1.0)
             )
-        return replace(state, x=x + step, memory=state.memory.moved(step), verdict=f"{state.verdict}, settled")
+        return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
+
+    def _drowns(self, equations: Eliminated, state: State) -> bool:
+        # Whether more samples are to tell a direction whose step noise is above one scale. What the instrument's errors leave to the tissue is small beside
+        # what images tell of both, and so are such directions beside the tolerance, which is one of images.
+        if not self.domain.errors.names or state.samples >= self.options.max_samples:
+            return False
+        scale = self.domain.scale[: self.domain.tissue_count]
+        eigenvalues, spread = _spread(equations, scale)[::2]
+        return bool((spread > np.maximum(eigenvalues, 0.0)).any())
 
     def _length(self, step: Array) -> float:
-        return float(np.linalg.norm(step / self.domain.scale)) / math.sqrt(self.options.parts)
+        # Of a step of the tissue.
+        scale = self.domain.scale[: self.domain.tissue_count]
+        return float(np.linalg.norm(step / scale)) / math.sqrt(self.options.parts)
 
-    def _propose(self, equations: NormalEquations, x: Array, radius: float) -> tuple[Array, float]:
-        # Step within the radius and the gain that the model promises for it.
-        reach = radius * math.sqrt(self.options.parts)
+    def _propose(self, equations: Eliminated, x: Array, radius: float) -> tuple[Array, float]:
+        # Step of the tissue within the radius and the gain that the model promises for it.
+        reach, count = radius * math.sqrt(self.options.parts), self.domain.tissue_count
+        low, high = (bound[:count] for bound in self.domain.bounds)
         step = solve_box(
             equations.hessian,
             equations.gradient,
-            x,
-            self.domain.bounds,
-            self.domain.scale,
+            x[:count],
+            (low, high),
+            self.domain.scale[:count],
             reach,
-            equations.hessian_noise,
+            equations.noise,
         )
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
@@ -319,7 +328,14 @@ class GaussNewton:
         return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state
 
 
-def gain_by_noise(equations: NormalEquations) -> float:
+def _spread(equations: Eliminated, scale: Array) -> tuple[Array, Array, Array]:
+    # Scaled curvature: eigenvalues, directions, and the noise of the gradient along each.
+    eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
+    variance = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors)
+    return eigenvalues, vectors, np.sqrt(np.maximum(variance, 0.0))
+
+
+def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
     """What a Newton step at the true optimum promises on average because the gradient is noisy: tr(H^-1 C) / 2, over directions that curve upwards."""
     eigenvalues, vectors = np.linalg.eigh(equations.hessian)
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))

@@ -101,6 +101,7 @@ def normal_equations(
     weight: Array,
     lights: int = 1,
     regions: Sequence[Region] | None = None,
+    exact: int = 0,
 ) -> NormalEquations:
     """Sum one block of measurements.
 
@@ -115,6 +116,8 @@ def normal_equations(
         weight: (M,), 0 where a measurement does not count.
         lights: M = lights x pixels, light by light.
         regions: which together hold all measurements; None for one of all coordinates.
+        exact: so many of the last derivatives, such as those to a gain, are of the very renders of r1 and r2. So each is multiplied with the residual of
+            the other, and what their own noise does to the curvature, far less than that of the other derivatives, counts as nothing.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
     residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
@@ -122,9 +125,11 @@ def normal_equations(
     # Curvature, and its noise from the products of mean and difference.
     weighted = weight * mean
     hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
-    regions = regions if regions is not None else ((range(len(mean)), np.ones(len(weight), dtype=bool)),)
+    noisy = len(mean) - exact
+    regions = regions if regions is not None else ((range(noisy), np.ones(len(weight), dtype=bool)),)
+    known = range(noisy, len(mean))
     noise = [
-        CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights),))
+        CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights, known),))
         for near, chosen in regions
     ]
 
@@ -133,10 +138,15 @@ def normal_equations(
         per_pixel(terms, lights)
         for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
     )
-    sensor = weight**2 * reference_variance
+    sensor, gradient = weight**2 * reference_variance, weighted @ residual
+    if exact:
+        own = weight * difference[noisy:]
+        gradient[noisy:] -= 0.5 * own @ spread
+        by_image[noisy:] += per_pixel(0.5 * own * residual, lights)
+        by_jacobian[noisy:], by_both[noisy:] = 0.0, 0.0
     return NormalEquations(
         hessian=hessian,
-        gradient=weighted @ residual,
+        gradient=gradient,
         hessian_noise=sum(noise[1:], start=noise[0]),
         gradient_noise=by_image @ by_image.T + by_jacobian @ by_jacobian.T - by_both @ by_both.T,
         data_noise=(sensor * mean) @ mean.T - 0.25 * (sensor * difference) @ difference.T,

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.solve.curvature_noise import CurvatureNoise
 
 Array = NDArray[np.float64]
+
+
+class Noise(Protocol):
+    """How noisy a curvature H (F, F) is."""
+
+    def variance(self, directions: Array) -> Array:
+        """Variance of u'Hu for each column u of ``directions`` (F, K)."""
 
 
 def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: Array | None = None) -> Array:
@@ -63,7 +71,7 @@ def solve_box(
     bounds: tuple[Array, Array],
     scale: Array,
     radius: float,
-    hessian_noise: CurvatureNoise | None = None,
+    hessian_noise: Noise | None = None,
 ) -> Array:
     """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on their bound and the rest solved again.
 

@@ -34,8 +34,10 @@ from services.fit.inputs.observations import (
     write_channel,
 )
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
+from services.fit.instrument.capture import instrument_of
+from services.fit.instrument.told import assumed_kinds, instrument_told
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Uncertainty, estimates
+from services.fit.solve.covariance import Uncertainty, estimates, instrument_estimates
 from services.fit.tooth.schedule import ChannelSchedule
 
 
@@ -66,8 +68,9 @@ class FitDriver:
             )
             for channel in channels
         }
+        instrument = instrument_of(observations.manifest, spec)
         files = {
-            channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss)
+            channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss, instrument)
             for channel in channels
         }
         journal = attempt.journal(files.values())
@@ -152,6 +155,9 @@ class FitDriver:
         )
         converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
+        errors = {c: known[c].domain.errors for c in fits}
+        instrument = {c: found for c in fits if (found := instrument_estimates(known[c]))}
+        values = {c: {name: one.value for name, one in found.items()} for c, found in instrument.items()}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
             observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance
@@ -169,6 +175,10 @@ class FitDriver:
             shape_covariance=covariance,
             enamel_thickness=None if thickness is None else thickness.mean,
             correlations=correlations,
+            instrument=instrument,
+            instrument_prior={c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in instrument},
+            assumed=assumed_kinds(errors),
+            instrument_told=instrument_told(self.attempt.spec, errors, values),
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )

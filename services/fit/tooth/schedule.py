@@ -19,7 +19,8 @@ residuals come from the exact media and only the Jacobian from similar ones: whe
 
 sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at constant reduced scattering and
 absorption, from the first exact stage on, under a weak prior: it decides how much light turns back after few scatterings. With two lobes g1, beta and g2
-are free under weak Gaussian priors. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
+are free under weak Gaussian priors. The instrument's errors join with the first exact stage: in similar media they would only hide what
+these have wrong. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
 """
 
 from __future__ import annotations
@@ -124,6 +125,7 @@ class ChannelSchedule(Stages[Tissue]):
         domain = self._domain(("sigma", "alpha"))
         tissue, reached = self._neighbourhood(domain, options) if domain.coordinates else (self._given(), 2 * samples)
         domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
+        domain = replace(domain, errors=self.files.errors)
         before: Solution | None = None
         if self.modes:
             problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
@@ -143,9 +145,8 @@ class ChannelSchedule(Stages[Tissue]):
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
             tissue, solution = self._iterate(problem, options, solution.samples)
         if spec.lobes == 2:
-            problem = StackProblem(
-                self.passes, self._with_shape(self._domain(ALL_LEAVES)), self._with_lobes(tissue), "phase"
-            )
+            domain = replace(self._with_shape(self._domain(ALL_LEAVES)), errors=self.files.errors)
+            problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return problem, tissue, solution
 

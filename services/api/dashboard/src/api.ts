@@ -114,6 +114,8 @@ export interface Estimate {
   se: number | null;
   unit: string;
   determined: boolean;
+  /** What the standard error is made of, largest first; absent where an earlier version fitted. */
+  se_parts?: Record<string, number>;
 }
 
 /** channel -> parameter name -> estimate */

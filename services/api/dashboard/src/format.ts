@@ -19,6 +19,19 @@ export function valueOf(estimate: Estimate): string {
   return `${estimate.value.toFixed(decimals)} ± ${estimate.se.toFixed(decimals)}`;
 }
 
+const SOURCES: Record<string, string> = { light_gain: "lights", mean_cosine: "mean cosine" };
+
+/** The sources that make up most of a ±, as shares of its square; empty where they are not known. */
+export function sourcesOf(estimate: Estimate): string {
+  const parts = Object.entries(estimate.se_parts ?? {});
+  const whole = parts.reduce((sum, [, se]) => sum + se * se, 0);
+  const shares = parts.map(([name, se]): [string, number] => [SOURCES[name] ?? name, (100 * se * se) / whole]);
+  return shares
+    .filter(([, share]) => share >= 5)
+    .map(([name, share]) => `${name} ${share.toFixed(0)} %`)
+    .join(", ");
+}
+
 export function significant(value: number): string {
   return Number(value.toPrecision(4)).toString();
 }

@@ -2,7 +2,7 @@
 
 import type { Parameters } from "./api";
 import { element } from "./element";
-import { significant, unitOf, unitOfName, valueOf } from "./format";
+import { significant, sourcesOf, unitOf, unitOfName, valueOf } from "./format";
 
 export class ParameterTable {
   readonly root = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" }, element("p", { class: "soft" }, "No value yet."));
@@ -34,11 +34,16 @@ export class ParameterTable {
       const first = channels.map((channel) => result[channel]?.[name]).find((estimate) => estimate);
       return first ? unitOf(first) : "";
     };
-    this.fill("Result: value ± one standard error.", channels, names, unit, (name, channel) => {
+    this.fill("Result: value ± one standard error, and what most of its square is made of.", channels, names, unit, (name, channel) => {
       const estimate = result[channel]?.[name];
       if (!estimate) return ["–"];
       const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";
-      return flag ? [valueOf(estimate), element("span", { class: "flag" }, flag)] : [valueOf(estimate)];
+      const sources = sourcesOf(estimate);
+      return [
+        valueOf(estimate),
+        ...(flag ? [element("span", { class: "flag" }, flag)] : []),
+        ...(sources ? [element("div", { class: "soft sources" }, sources)] : []),
+      ];
     }, heading);
   }
 

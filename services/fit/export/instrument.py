@@ -1,0 +1,72 @@
+"""The report's tables of the instrument: what the images make of its errors, and what each ± is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from services.core.results import Estimate, FitReport
+from services.fit.instrument.errors import kind_of_error
+from services.fit.instrument.told import FAULT
+
+SOURCES = {
+    "photographs": "photographs",
+    "rendering": "rendering",
+    "gain": "gain",
+    "light_gain": "lights",
+    "flare": "flare",
+    "prior": "prior",
+    "mean_cosine": "mean cosine",
+    "unfinished": "unfinished",
+}
+"""Sources of a ± as the report heads them."""
+LEAST_SHARE = 0.005
+"""Smaller shares of a squared ± are not shown."""
+
+
+def source_tables(
+    report: FitReport, leading: Callable[[str], bool], label: Callable[[str], str]
+) -> list[dict[str, Any]]:
+    """By channel, the shares of the squared ± of the quantities that lead the report.
+
+    Args:
+        leading: whether a parameter is shown, by its name.
+        label: what it is called.
+    """
+    tables = []
+    for channel, table in report.parameters.items():
+        shown = {name: one for name, one in table.items() if leading(name) and one.se and one.se_parts}
+        present = [name for name in SOURCES if any(_share(one, name) >= LEAST_SHARE for one in shown.values())]
+        rows = [(label(name), [_percent(_share(one, source)) for source in present]) for name, one in shown.items()]
+        if rows:
+            tables.append({"channel": channel, "labels": [SOURCES[name] for name in present], "rows": rows})
+    return tables
+
+
+def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
+    """By channel, each error of the instrument as the images tell it, and its ± before the fit, in percent."""
+    tables = []
+    for channel, found in report.instrument.items():
+        rows = []
+        for name, one in found.items():
+            before = report.instrument_prior[channel][name]
+            rows.append(
+                {
+                    "name": name,
+                    "found": f"{100 * one.value:+.2f}".replace("-", "−"),
+                    "se": f"{100 * (one.se or 0.0):.2f}",
+                    "before": f"{100 * before:.2g}",
+                    "assumed": kind_of_error(name) in report.assumed,
+                    "fault": abs(one.value) > FAULT * before,
+                }
+            )
+        tables.append({"channel": channel, "rows": rows})
+    return tables
+
+
+def _share(estimate: Estimate, source: str) -> float:
+    return (estimate.se_parts.get(source, 0.0) / estimate.se) ** 2 if estimate.se else 0.0
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= LEAST_SHARE else ""

@@ -1,0 +1,46 @@
+"""What the calibration of a capture says of its instrument, and which errors act on which photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.records import JobSpec, PreparedManifest
+from services.core.uncertainty import CalibrationUncertainty
+from services.fit.execution.blocks import BlockInstrument
+from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What a calibration says of the instrument that took a capture."""
+
+    lights: tuple[str, ...]
+    """Names, in the order of the views' images."""
+    stated: CalibrationUncertainty | None
+
+    def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
+        """Those of a channel that act on the fitted photographs of some cameras under the lights (L,) that are used."""
+        return errors_of(channel, self._chosen(used), cameras, self.stated)
+
+    def acting(self, channel: str, camera: str, brightest: float, chosen: NDArray[np.bool_]) -> BlockInstrument:
+        """Those that act on a camera's photographs under the chosen lights (L,).
+
+        Args:
+            brightest: greatest radiance among its valid pixels in this channel.
+        """
+        names = light_names(self._chosen(chosen), channel, self.stated)
+        return BlockInstrument(gain_name(channel), names, flare_name(camera, channel), brightest)
+
+    def _chosen(self, lights: NDArray[np.bool_]) -> list[str]:
+        return [name for name, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
+
+
+def instrument_of(manifest: PreparedManifest, spec: JobSpec) -> Instrument | None:
+    """What is known of the instrument; None where the job takes it for perfect, and for jaws and the solver adam, which do not know it."""
+    if spec.instrument == "off" or spec.kind != "tooth" or spec.solver == "adam":
+        return None
+    return Instrument(tuple(light.name for light in manifest.lights), manifest.uncertainty)

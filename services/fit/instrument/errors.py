@@ -1,0 +1,105 @@
+"""The errors of an instrument that a fit of one channel knows, with their covariance.
+
+Photographs follow (1 + gain + light_gain) C + flare, C the image that the media make. The derivatives to the errors are the image itself for the gain, one
+light's for a light's gain, and the brightest pixel's value for a flare; they come from the renders of the residual and cost nothing. (The photographs in
+their place would hold the sensor's noise, which residuals hold too: that pulls a gain by 1e-4, one of the ± that it has where the tissue is known.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.uncertainty import CalibrationUncertainty
+
+Array = NDArray[np.float64]
+
+DEFAULT_SE: Mapping[str, float] = MappingProxyType({"gain": 0.01, "light_gain": 0.01, "flare": 0.003})
+"""One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest valid pixel in that channel.
+A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens shade leaves about 0.3 % of veiling glare."""
+KINDS = tuple(DEFAULT_SE)
+LINEAR_REACH = 0.1
+"""Length over which images count as linear in an error, for step lengths; they are exactly linear."""
+
+MAX_ERROR = 10.0
+
+
+def kind_of_error(name: str) -> str:
+    """``gain``, ``light_gain`` or ``flare``."""
+    return name.partition(".")[0]
+
+
+@dataclass(frozen=True)
+class InstrumentErrors:
+    """Errors of one channel, the last coordinates of its fit; their prior is Gaussian about 0."""
+
+    names: tuple[str, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    assumed: frozenset[str] = frozenset()
+    """Those whose covariance is a default and not the calibration's."""
+
+    @property
+    def precision(self) -> Array:
+        """Inverse of the covariance, (K, K)."""
+        return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
+
+    @property
+    def matrix(self) -> Array:
+        """The covariance, (K, K)."""
+        return np.array(self.covariance, dtype=np.float64).reshape(len(self.names), len(self.names))
+
+    @property
+    def se(self) -> Array:
+        """One standard error of each before the fit, (K,)."""
+        return np.sqrt(np.diag(self.matrix))
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Between which each stays, which only keeps a wild step representable."""
+        return ((-MAX_ERROR, MAX_ERROR),) * len(self.names)
+
+
+NO_ERRORS = InstrumentErrors()
+
+
+def gain_name(channel: str) -> str:
+    """The name of a channel's gain."""
+    return f"gain.{channel}"
+
+
+def flare_name(camera: str, channel: str) -> str:
+    """The name of a camera's flare in a channel."""
+    return f"flare.{camera}.{channel}"
+
+
+def light_names(lights: Sequence[str], channel: str, stated: CalibrationUncertainty | None) -> tuple[str, ...]:
+    """The names of the lights' gains: those of the channel where the calibration tells channels apart."""
+    known = frozenset(() if stated is None else stated.names)
+    own = {light: f"light_gain.{light}.{channel}" for light in lights}
+    return tuple(own[light] if own[light] in known else f"light_gain.{light}" for light in lights)
+
+
+def errors_of(
+    channel: str, lights: Sequence[str], cameras: Sequence[str], stated: CalibrationUncertainty | None
+) -> InstrumentErrors:
+    """The errors of a channel under the lights and cameras of its fit.
+
+    Args:
+        stated: by the calibration; what it does not name takes a default, independent of all others.
+    """
+    names = (
+        gain_name(channel),
+        *light_names(lights, channel, stated),
+        *(flare_name(camera, channel) for camera in cameras),
+    )
+    covariance = np.diag([DEFAULT_SE[kind_of_error(name)] ** 2 for name in names])
+    if stated is not None:
+        own = [name for name in names if name in stated.names]
+        here, there = [names.index(name) for name in own], [stated.names.index(name) for name in own]
+        covariance[np.ix_(here, here)] = stated.matrix[np.ix_(there, there)]
+    assumed = frozenset(names) - frozenset(() if stated is None else stated.names)
+    return InstrumentErrors(names, tuple(map(tuple, covariance.tolist())), assumed)

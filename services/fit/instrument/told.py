@@ -1,0 +1,63 @@
+"""What to know of the instrument, in plain words: what was assumed of it, and which of its errors the images put down to a fault of the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from services.core.records import JobSpec
+from services.fit.instrument.errors import DEFAULT_SE, KINDS, InstrumentErrors, kind_of_error
+
+FAULT = 3.0
+"""An error that the images move by more than so many of its ± before the fit is told as a fault: 1 good one in 370 is."""
+WORDS = {"gain": "the gain", "light_gain": "each light", "flare": "flare"}
+REMEDY = {
+    "gain": "measure the gain again on the white sphere",
+    "light_gain": "check that light, its cable and its name, and measure it again",
+    "flare": "look for stray light and a dirty lens, and measure the flare again",
+}
+
+
+def assumed_kinds(errors: Mapping[str, InstrumentErrors]) -> tuple[str, ...]:
+    """Kinds of which some error took its default, over all channels."""
+    found = {kind_of_error(name) for own in errors.values() for name in own.assumed}
+    return tuple(kind for kind in KINDS if kind in found)
+
+
+def instrument_told(
+    spec: JobSpec, errors: Mapping[str, InstrumentErrors], found: Mapping[str, Mapping[str, float]]
+) -> tuple[str, ...]:
+    """One sentence each, what was assumed first.
+
+    Args:
+        errors: by channel, as they were known before the fit.
+        found: by channel and name, what the images make of them.
+    """
+    if spec.instrument == "off":
+        return (
+            "The ± take the instrument for perfect, as instrument = 'off' says: gain, lights and flare may be wrong.",
+        )
+    if not any(own.names for own in errors.values()):
+        whose = "a jaw" if spec.kind == "jaw" else f"the solver {spec.solver}"
+        return (f"The ± take the instrument for perfect: a fit of {whose} does not know its gain, lights and flare.",)
+    return (*_assumed(assumed_kinds(errors)), *_faults(errors, found))
+
+
+def _assumed(kinds: tuple[str, ...]) -> Iterator[str]:
+    if kinds:
+        sizes = [f"{100 * DEFAULT_SE[kind]:g} % for {WORDS[kind]}" for kind in kinds]
+        listed = sizes[0] if len(sizes) == 1 else f"{', '.join(sizes[:-1])} and {sizes[-1]}"
+        yield (
+            f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
+            "The ± depend on these; give uncertainty in capture.json."
+        )
+
+
+def _faults(errors: Mapping[str, InstrumentErrors], found: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    for channel, own in errors.items():
+        for name, before in zip(own.names, own.se.tolist(), strict=True):
+            value = found[channel][name]
+            if abs(value) > FAULT * before:
+                yield (
+                    f"In {channel} the images put {name} off by {100 * value:+.1f} %, {abs(value) / before:.1f} times "
+                    f"its ± of {100 * before:.2g} %: the calibration seems at fault; {REMEDY[kind_of_error(name)]}."
+                )

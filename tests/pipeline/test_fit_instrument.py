@@ -1,0 +1,118 @@
+"""Fits by a formula of photographs whose instrument was off: what the errors become, and what the ± say of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from services.core.records import JobSpec, PreparedManifest
+from services.core.results import Estimate, FitReport
+from services.core.stage import LocalContext
+from services.core.store import MANIFEST
+from services.fit.inputs.observations import Observations, ViewStack, read_channel
+from services.fit.stage import export, run
+from tests.support.prepared import TRUTH, write_prepared
+
+ENGINE = "tests.support.fake_engine:QuietFakeEngine"
+OPTIONS: dict[str, Any] = {
+    "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_steps": 15, "search_candidates": 2000, "advise": False,
+}  # fmt: skip
+TRUE = {
+    f"{part}.{leaf}": value
+    for part, medium in (("enamel", TRUTH.enamel), ("dentin", TRUTH.dentin))
+    for leaf, value in (
+        ("sigma_s_reduced", medium.sigma_s_reduced),
+        ("sigma_a", (1 - medium.alpha) * medium.sigma),
+    )
+}
+
+
+def fit(root: Path, gains: tuple[float, ...] = (1.0,) * 6, flare: float = 0.0, **options: Any) -> FitReport:
+    """A fit of photographs that are brighter by one gain a light, and by a share of the brightest pixel."""
+    write_prepared(root)
+
+    def photographed(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
+        views = read_channel(observations, channel, spec)
+        light = np.array(gains)[:, None]
+        return tuple(replace(v, reference=v.reference * light + flare * v.reference.max()) for v in views)
+
+    with patch("services.fit.tooth.driver.read_channel", photographed):
+        return run(JobSpec.model_validate(OPTIONS | {"capture": root} | options), LocalContext(root), engine=ENGINE)
+
+
+def off(report: FitReport) -> dict[str, float]:
+    """How many ± each quantity of the media is off the truth."""
+    table = report.parameters["green"]
+    return {name: (table[name].value - true) / (table[name].se or np.nan) for name, true in TRUE.items()}
+
+
+@pytest.fixture(scope="module")
+def brighter(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]:
+    root = tmp_path_factory.mktemp("brighter")
+    return root, fit(root, gains=(1.02,) * 6)
+
+
+def test_a_gain_that_is_off_is_in_the_errors(brighter: tuple[Path, FitReport], tmp_path: Path) -> None:
+    _, report = brighter
+    assert report.converged, report.advice
+    # The gain is off by two of its ±, so what it moves is off by at most two of theirs, and noise adds its own.
+    assert max(map(abs, off(report).values())) < 2.5
+    alone = fit(tmp_path, gains=(1.02,) * 6, instrument="off")
+    assert max(map(abs, off(alone).values())) > 4
+    assert not alone.instrument
+    assert alone.instrument_told[0].startswith("The ± take the instrument for perfect")
+
+
+def test_every_error_says_what_it_is_made_of(brighter: tuple[Path, FitReport]) -> None:
+    _, report = brighter
+    for one in (*report.parameters["green"].values(), *report.instrument["green"].values()):
+        if one.se:
+            assert sum(part**2 for part in one.se_parts.values()) == pytest.approx(one.se**2, rel=1e-6)
+    parts = report.parameters["green"]["enamel.sigma_a"].se_parts
+    assert parts["gain"] > 0
+    assert parts["photographs"] > 0
+    assert report.assumed == ("gain", "light_gain", "flare")
+    assert report.instrument_told[0].startswith("Assumed, as the calibration does not state")
+
+
+def test_a_light_that_is_far_off_is_named(tmp_path: Path) -> None:
+    report = fit(tmp_path, gains=(1.0, 0.9, 1.0, 1.0, 1.0, 1.0))
+    (fault,) = [told for told in report.instrument_told if "seems at fault" in told]
+    assert "light_gain.l1" in fault
+    found: Estimate = report.instrument["green"]["light_gain.l1"]
+    assert found.se is not None
+    assert abs(found.value + 0.1) < 4 * found.se
+
+
+def test_a_stated_calibration_takes_the_place_of_what_is_assumed(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    manifest = tmp_path / "prepared" / MANIFEST
+    stored = json.loads(manifest.read_text())
+    names = ["gain.green", *(f"light_gain.l{k}" for k in range(6)), "flare.c0.green", "flare.c1.green"]
+    stated = {"names": names, "covariance": np.diag([1e-6] * len(names)).tolist()}
+    stored["record"]["uncertainty"] = stated
+    assert PreparedManifest.model_validate(stored["record"]).uncertainty is not None
+    manifest.write_text(json.dumps(stored))
+    spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path})
+    report = run(spec, LocalContext(tmp_path), engine=ENGINE)
+    assert report.assumed == ()
+    assert report.instrument_told == ()
+    assert report.instrument_prior["green"]["gain.green"] == pytest.approx(1e-3)
+
+
+def test_results_and_report_show_the_instrument(brighter: tuple[Path, FitReport]) -> None:
+    root, report = brighter
+    export(JobSpec.model_validate(OPTIONS | {"capture": root}), LocalContext(root))
+    table = json.loads((root / "parameters.json").read_text())["green"]
+    assert table["gain.green"]["se"] == report.instrument["green"]["gain.green"].se
+    assert table["enamel.sigma_a"]["se_parts"] == report.parameters["green"]["enamel.sigma_a"].se_parts
+    page = (root / "report.html").read_text()
+    assert page.index("Assumed, as the calibration") < page.index("Error on held-out images")
+    assert "What each ± is made of" in page
+    assert "light_gain.l0" in page

@@ -1,0 +1,197 @@
+"""The instrument's errors as coordinates: what a calibration states of them, their columns, and the covariance that they leave to the tissue."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.core.calibration import require_consistent
+from services.core.errors import CaptureInputError
+from services.core.geometry import Light
+from services.core.records import FolderCapture, JobSpec
+from services.core.store import read_record
+from services.core.uncertainty import CalibrationUncertainty
+from services.fit.execution.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.instrument.columns import columns, taken
+from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, errors_of
+from services.fit.instrument.told import instrument_told
+from services.fit.optics.domain import Coordinate, Domain
+from services.fit.optics.parameters import Medium, Tissue
+from services.fit.solve.covariance import estimates, instrument_estimates, uncertainty
+from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
+from services.fit.solve.elimination import eliminate
+from services.fit.solve.normal_equations import normal_equations
+from services.fit.transport.scene.recipe import View
+from tests.support.prepared import camera
+
+NAMES = ("gain.green", "light_gain.a", "light_gain.b", "flare.c0.green")
+ERRORS = InstrumentErrors(NAMES, tuple(map(tuple, np.diag([1e-4, 1e-4, 4e-4, 9e-6]).tolist())))
+DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",), 3.0, 2.0)), ERRORS)
+TISSUE = Tissue(Medium(4.0, 0.999, g1=0.8), Medium(4.0, 0.999, g1=0.8))
+
+
+def block(random: np.random.Generator) -> Block:
+    shape = (2, 5)
+    image = random.uniform(0.2, 1.0, shape)
+    view = View(camera("c0"), np.stack([np.arange(5), np.arange(5)], axis=-1).astype(np.int32))
+    acting = BlockInstrument("gain.green", ("light_gain.a", "light_gain.b"), "flare.c0.green", 1.3)
+    return Block(view, image, np.full(shape, 1e-4), np.ones(shape), np.zeros(shape, dtype=bool), instrument=acting)
+
+
+def test_columns_are_the_derivatives_of_what_the_instrument_takes() -> None:
+    random = np.random.default_rng(1)
+    whole, image, at = (
+        block(random),
+        random.uniform(0.2, 1.0, (2, 5)),
+        dict(zip(NAMES, (0.01, -0.02, 0.03, 0.004), strict=True)),
+    )
+    for name, column in zip(NAMES, columns(image, whole, NAMES), strict=True):
+        high, low = (taken(image, whole, at | {name: at[name] + step}) for step in (1e-3, -1e-3))
+        # Exactly linear, so but for rounding.
+        np.testing.assert_allclose((high - low).reshape(-1) / 2e-3, column, rtol=1e-9, atol=1e-12)
+    gains = np.array([[1.0 + 0.01 - 0.02], [1.0 + 0.01 + 0.03]])
+    np.testing.assert_allclose(taken(image, whole, at), gains * image + 0.004 * 1.3, rtol=1e-12)
+    assert not columns(image, whole, ("gain.red", "flare.c1.green")).any()
+
+
+def test_a_gain_is_not_pulled_by_noise_of_photographs_or_renders() -> None:
+    # The slope to a gain at the truth, over many draws of both noises, in its own standard errors: each alone would pull it by sqrt(M) of the photographs'.
+    random, image, found = np.random.default_rng(2), np.full(400, 0.7), []
+    for _ in range(200):
+        photograph = image + 0.01 * random.standard_normal(400)
+        renders = [image + 0.05 * random.standard_normal(400) for _ in range(2)]
+        rows = [np.stack([random.standard_normal(400), render]) for render in renders]
+        residuals = [render - photograph for render in renders]
+        one = normal_equations(*rows, *residuals, np.full(400, 1e-4), np.full(400, 1e4), exact=1)
+        found.append((one.gradient[1], np.sqrt(one.gradient_noise[1, 1] + one.data_noise[1, 1])))
+    slopes, errors = np.array(found).T
+    # Means and spreads of 200: 4 standard errors.
+    assert abs(slopes.mean()) < 4 * slopes.std() / np.sqrt(200)
+    assert abs(slopes.std() / np.sqrt(np.mean(errors**2)) - 1) < 4 / np.sqrt(2 * 200)
+
+
+def test_a_block_keeps_which_errors_act_on_it(tmp_path: Path) -> None:
+    whole = block(np.random.default_rng(3))
+    assert read_block(write_block(tmp_path, whole)).instrument == whole.instrument
+
+
+def test_the_calibration_joins_with_the_defaults() -> None:
+    stated = CalibrationUncertainty(
+        names=("light_gain.b.green", "gain.green", "gain.red"),
+        covariance=((4e-4, 1e-5, 0.0), (1e-5, 1e-4, 0.0), (0.0, 0.0, 1e-4)),
+    )
+    found = errors_of("green", ("a", "b"), ("c0",), stated)
+    assert found.names == ("gain.green", "light_gain.a", "light_gain.b.green", "flare.c0.green")
+    gain, light, flare = (DEFAULT_SE[kind] ** 2 for kind in ("gain", "light_gain", "flare"))
+    expected = np.diag([gain, light, 4e-4, flare])
+    expected[0, 2] = expected[2, 0] = 1e-5
+    np.testing.assert_allclose(found.matrix, expected)
+    assert found.assumed == {"light_gain.a", "flare.c0.green"}
+
+
+@pytest.mark.parametrize(
+    ("names", "covariance", "told"),
+    [
+        (["gain.green"], [[0.0]], "variance of gain.green is not positive"),
+        (["gain.green", "flare.c0.green"], [[1e-4]], "1 rows of 1 numbers for 2 names"),
+        (["gain.green", "flare.c0.green"], [[1e-4, 0.0]], "1 rows of 2 numbers for 2 names"),
+        (["gain.green", "flare.c0.green"], [[1e-4, 2e-4], [2e-4, 1e-4]], "not positive definite"),
+        (["gain.green", "flare.c0.green"], [[1e-4, 1e-5], [0.0, 1e-4]], "not symmetric"),
+        (["gain.green", "gain.green"], [[1e-4, 0.0], [0.0, 1e-4]], "gain.green is named twice"),
+        (["teeth.rx"], [[1.0]], "in radians, not in degrees"),
+        (["gain.violet"], [[1e-4]], "uncertainty names gain.violet, which is no error"),
+        (["gain.green"], [[float("nan")]], "finite number"),
+    ],
+)
+def test_a_wrong_uncertainty_is_told_in_one_sentence(
+    tmp_path: Path, names: list[str], covariance: list[list[float]], told: str
+) -> None:
+    light = Light(name="a", position_mm=(0.0, 0.0, 500.0), intensity=(1e6,))
+    capture = FolderCapture(units="mm", channels=("green",), cameras=(camera("c0"),), lights=(light,))
+    content = capture.model_dump(mode="json") | {"uncertainty": {"names": names, "covariance": covariance}}
+    (tmp_path / "capture.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureInputError, match=told):
+        require_consistent(read_record(tmp_path / "capture.json", FolderCapture), "capture.json")
+
+
+def equations(random: np.random.Generator, noise: float = 0.0, count: int = 40) -> Any:
+    truth = random.standard_normal((2, count))
+    known = random.standard_normal((4, count))
+    pair = [np.concatenate([truth + noise * random.standard_normal(truth.shape), known]) for _ in range(2)]
+    return normal_equations(*pair, *np.zeros((2, count)), np.full(count, 1e-2), np.full(count, 1e2), exact=4)
+
+
+def test_what_is_left_to_the_tissue_is_the_marginal_of_the_whole() -> None:
+    found = equations(np.random.default_rng(4))
+    marginal = np.linalg.inv(found.hessian + DOMAIN.precision)[:2, :2]
+    left = eliminate(found, DOMAIN.precision, np.zeros(6), 2)
+    np.testing.assert_allclose(np.linalg.inv(left.hessian), marginal, rtol=1e-9)
+    # Weights are inverse variances, so the sandwich is the inverse of the curvature, and its parts add up.
+    known = uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), found)
+    np.testing.assert_allclose(known.covariance[:2, :2], marginal, rtol=1e-6)
+    np.testing.assert_allclose(sum(known.parts.values()), known.covariance, rtol=1e-6, atol=1e-12)
+    table = estimates(TISSUE, ("enamel",), known)
+    for one in (table["enamel.sigma"], table["enamel.sigma_a"], *instrument_estimates(known).values()):
+        assert one.se is not None
+        assert {"photographs", "gain", "light_gain", "flare"} <= one.se_parts.keys()
+        assert sum(part**2 for part in one.se_parts.values()) == pytest.approx(one.se**2, rel=1e-6)
+
+
+def test_exact_derivatives_have_the_noise_of_any_that_agree() -> None:
+    random = np.random.default_rng(5)
+    mean, difference, weight = (
+        random.standard_normal((5, 12)),
+        random.standard_normal((5, 12)),
+        random.uniform(1, 2, 12),
+    )
+    difference[3:] = 0.0
+    whole = CurvatureNoise((curvature_noise(mean, difference, weight, range(5), 2),))
+    parted = CurvatureNoise((curvature_noise(mean, difference, weight, range(3), 2, range(3, 5)),))
+    directions, vector = random.standard_normal((5, 7)), random.standard_normal(5)
+    np.testing.assert_allclose(parted.variance(directions), whole.variance(directions), rtol=1e-12)
+    np.testing.assert_allclose(parted.of_product(vector), whole.of_product(vector), rtol=1e-12, atol=1e-12)
+    again = CurvatureNoise.of(json.loads(json.dumps((parted + parted.scaled(2.0)).record())))
+    np.testing.assert_allclose(again.variance(directions), 3 * whole.variance(directions), rtol=1e-12)
+
+
+def test_what_noise_squares_to_in_the_elimination_is_known() -> None:
+    # The mean of two derivatives of unit noise has half its variance, so sum_kl S^-1_kl Cov(A_ak, A_al) is half of sum_kl S^-1_kl sum_i w^2 b_k b_l.
+    found = []
+    for seed in range(100):
+        one = equations(np.random.default_rng([6, seed]), noise=1.0)
+        known, inverse = one.hessian[2:, 2:], np.linalg.inv(one.hessian[2:, 2:] + ERRORS.precision)
+        expected = 0.5 * 1e2 * float((inverse * known).sum())
+        found.append(one.hessian_noise.of_eliminated(inverse) / expected)
+    # One such estimate rests on 40 squares of noise: 4 standard errors of the mean of 100.
+    error = np.std(found, axis=0) / np.sqrt(len(found))
+    assert (np.abs(np.mean(found, axis=0) - np.eye(2)) < 4 * error).all()
+    assert (error < 0.05).all()
+
+
+def test_the_prior_of_the_errors_joins_slope_and_change() -> None:
+    x = np.array([0.3, 2.0, 0.01, -0.02, 0.01, 0.001])
+    shifts = 1e-4 * np.eye(6)
+    slope = [(DOMAIN.prior_change(x, x + s) - DOMAIN.prior_change(x, x - s)) / 2e-4 for s in shifts]
+    np.testing.assert_allclose(DOMAIN.prior_slope(x), slope, rtol=1e-6, atol=1e-8)
+    assert DOMAIN.errors_at(x) == tuple(zip(NAMES, x[2:].tolist(), strict=True))
+    np.testing.assert_allclose(DOMAIN.x_of(TISSUE, dict(DOMAIN.errors_at(x)))[2:], x[2:])
+
+
+def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
+    spec = JobSpec.model_validate({"capture": "c"})
+    errors = {"green": errors_of("green", ("a", "b"), ("c0",), None)}
+    found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
+    (assumed,) = instrument_told(spec, errors, found)
+    assert assumed.startswith("Assumed, as the calibration does not state")
+    assert "1 % for the gain, 1 % for each light and 0.3 % for flare" in assumed
+    found["green"]["light_gain.b"] = -0.05
+    _, fault = instrument_told(spec, errors, found)
+    assert fault.startswith("In green the images put light_gain.b off by -5.0 %, 5.0 times its ± of 1 %")
+    off = spec.model_copy(update={"instrument": "off"})
+    assert instrument_told(off, {"green": InstrumentErrors()}, {})[0].startswith(
+        "The ± take the instrument for perfect"
+    )
