@@ -44,6 +44,8 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
     values: dict[str, Any] = {
         "capture": root, "boundary": "matched", "dentin": "known", "stains": True,
         "samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 6, "search_candidates": 500,
+        # A gain of the instrument is much like a stain that is the same everywhere; what media cannot explain is to be the stains' here.
+        "instrument": "off",
     }  # fmt: skip
     return JobSpec(**(values | options))
 
