@@ -154,9 +154,11 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
     if report.enamel_thickness is not None:
         for table in tables.values():
             table["enamel.thickness"] = report.enamel_thickness
-    return {
-        channel: {name: estimate.model_dump() for name, estimate in table.items()} for channel, table in tables.items()
-    }
+    return {channel: {name: _plain(estimate) for name, estimate in table.items()} for channel, table in tables.items()}
+
+
+def _plain(estimate: Estimate) -> dict[str, Any]:
+    return estimate.model_dump(exclude=None if estimate.se_parts else {"se_parts"})
 
 
 def errors_json(report: FitReport) -> dict[str, Any]:
