@@ -90,7 +90,7 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
     command = [
         sys.executable,
         "-m",
-        "dask",
+        "services.pipeline.dask_command",
         part,
         *secured,
         "--preload",

@@ -52,14 +52,14 @@ class Certificates:
 
     def security(self) -> Security:
         """What Dask's own client takes."""
-        from distributed import Security
+        from services.pipeline.dask_security import LastingSecurity
 
         files = {
             f"tls_{role}_{part}": str(path)
             for role in ("client", "scheduler", "worker")
             for part, path in (("cert", self.certificate), ("key", self.key))
         }
-        return Security(tls_ca_file=str(self.authority), require_encryption=True, **files)
+        return LastingSecurity(tls_ca_file=str(self.authority), require_encryption=True, **files)
 
     def arguments(self) -> tuple[str, ...]:
         """What Dask's commands take."""

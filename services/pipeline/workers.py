@@ -207,7 +207,9 @@ class Workers:
 
     def _open(self) -> Client:
         import dask
-        from distributed import Client, LocalCluster, Security
+        from distributed import Client, LocalCluster
+
+        from services.pipeline.dask_security import LastingSecurity
 
         _leave_dask_alone()
         # For good, and in this process too, as connections that are made later read it.
@@ -229,7 +231,7 @@ class Workers:
             n_workers=0,
             threads_per_worker=1,
             processes=True,
-            security=Security.temporary(),
+            security=LastingSecurity.temporary(),
             dashboard_address="127.0.0.1:0",
             resources={STAGES: UNLIMITED},
             silence_logs=50,
