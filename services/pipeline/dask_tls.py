@@ -47,6 +47,8 @@ class Certificates:
         """For a connection to the scheduler."""
         context = ssl.create_default_context(cafile=self.authority)
         context.check_hostname = False
+        # As Dask itself does: from Python 3.13 on the default refuses an authority without key usage, which many are made without.
+        context.verify_flags &= ~ssl.VERIFY_X509_STRICT
         context.load_cert_chain(self.certificate, self.key)
         return context
 
