@@ -11,7 +11,7 @@ from services.client.errors import UploadError
 
 MAX_PATH_BYTES = 240
 MAX_PARTS = 12
-TEXTS = frozenset({".json", ".jsonl", ".toml"})
+TEXTS = frozenset({".csv", ".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
 DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "slab.json"})

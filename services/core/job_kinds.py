@@ -50,6 +50,8 @@ _TEETH: Mapping[StageName, str] = {
 }
 _SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export": "services.fit.slab.stage:export"}
 
+SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_absorption"})
+"""What only a slab may be told."""
 _OF_A_JAW: Mapping[str, Any] = {"lobes": 1, "held": {}, "stains": False, "solver": "gauss-newton", "loss": "l2"}
 
 ENTRY_POINTS = "dentine.job_kinds"
@@ -60,7 +62,7 @@ JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
         "jaw": JobKind(
             "all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW
         ),
-        "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, frozenset({"effort"})),
+        "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, SLAB_OPTIONS),
     }
 )
 """The kinds of this package."""

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
+from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
 from services.core.uncertainty import CalibrationUncertainty
 
 
@@ -35,6 +36,10 @@ Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 KindName = Annotated[str, AfterValidator(known_kind), WithJsonSchema({"type": "string", "enum": list(JOB_KINDS)})]
 """Of ``JOB_KINDS``."""
+DictionaryName = Annotated[
+    str, AfterValidator(known_dictionary), WithJsonSchema({"type": "string", "enum": list(DICTIONARIES)})
+]
+"""Of ``DICTIONARIES``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
 
@@ -227,6 +232,17 @@ class JobSpec(Record):
         le=100,
         description="of kind slab: paths, in units of the default budget; ± shrink as its root",
     )
+    dictionary: DictionaryName = Field(
+        default=DEFAULT_DICTIONARY,
+        description="of kind slab: what the phase function is built from; "
+        + "; ".join(f"{name}: {one.summary}" for name, one in DICTIONARIES.items()),
+    )
+    particle_index: Number | None = Field(
+        default=None, ge=0.1, le=10, description="of dictionary mie: the particles' index of refraction, real part"
+    )
+    particle_absorption: Number = Field(
+        default=0.0, ge=0, le=10, description="of dictionary mie: imaginary part of the particles' index"
+    )
     workers: Whole = Field(default=2, ge=1, le=1024, description="processes of a local run")
     device: Device = Field(
         default="llvm", description="where paths are traced: the processor, or a CUDA device of every worker"
@@ -253,6 +269,11 @@ class JobSpec(Record):
         if foreign := sorted(foreign_options(self.kind, self.changed_options)):
             own = sorted(JobSpec.model_fields.keys() - foreign_options(self.kind, frozenset(JobSpec.model_fields)))
             raise ValueError(f"a job of kind {self.kind} has no option '{foreign[0]}'; it has {', '.join(own)}")
+        return self
+
+    @model_validator(mode="after")
+    def _particles_of_mie(self) -> JobSpec:
+        require_particles(self.dictionary, self.particle_index, self.particle_absorption)
         return self
 
     @model_validator(mode="after")

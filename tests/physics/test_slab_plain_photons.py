@@ -10,7 +10,7 @@ import pytest
 from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, near_beam_folder, truths
 from services.bench.slab.plain_photons import BATCHES, plain_images
 from services.bench.slab.stock_cell import RENDERS, cell_folder, medium_of, stock_images
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 from services.fit.slab.model.dictionary import henyey_greenstein
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from services.core.slab_folder import Light
+from services.core.slab.folder import Light
 from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein
 from services.fit.slab.model.forward import Block, render, run_block
 from services.fit.slab.model.interface import Interface, fresnel

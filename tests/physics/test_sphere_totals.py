@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from services.core.slab_folder import Cell, Glass
+from services.core.slab.folder import Cell, Glass
 from services.fit.slab.model.interface import Interface
 from services.fit.slab.sphere.instrument import expected
 from services.fit.slab.sphere.invert import interface_of

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.core.slab_folder import SlabFolder, read_folder
-from services.fit.slab.fit import SlabOptions, fit_slab, write_results
+from services.core.slab.folder import SlabFolder, read_folder
+from services.fit.slab.fit import fit_slab, write_results
 from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
+from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.result import SlabFit
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description

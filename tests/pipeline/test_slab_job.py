@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 
 from services.api.presets import find_preset
+from services.core.asset import load_asset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.settings import job_from_tree
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
+from services.fit.slab.dictionaries.hg import COSINES
 from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
@@ -189,7 +191,7 @@ def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(
 
 
 def test_a_cancel_ends_the_fit_between_two_blocks(spec: JobSpec, tmp_path: Path) -> None:
-    from services.fit.slab.fit import SlabOptions
+    from services.fit.slab.options import SlabOptions
     from services.fit.slab.stage import fit_task
 
     assert spec.capture is not None
@@ -212,6 +214,20 @@ def test_a_fault_of_the_last_wavelength_is_told_before_the_first_is_fitted(folde
     assert not (tmp_path / "job" / CHECKPOINT).exists()
 
 
+def test_a_job_by_a_dictionary_tells_of_its_atoms(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    # What is told is looked at here, and whether it is true in tests/unit/test_slab_dictionaries.py.
+    assert spec.capture is not None
+    lobes = spec.model_copy(update={"dictionary": "hg", "effort": 0.01})
+    run(lobes, LocalContext(copied_checkpoint(job, tmp_path), attempt=2))  # what the tents left is not taken
+    export(lobes, LocalContext(tmp_path, attempt=2))
+    told = load_asset(tmp_path).parameters["532"]
+    assert {name for name in told if name.startswith("atoms.")} == {f"atoms.g={g:g}" for g in COSINES}
+    page = (tmp_path / "report.html").read_text()
+    assert "<h2>Dictionary hg, 532 nm</h2>" in page
+    heaviest = max((name for name in told if name.startswith("atoms.")), key=lambda name: told[name].value)
+    assert heaviest.replace("atoms.", "σs of ") in page
+
+
 def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> None:
     assert stages_of(spec) == ("fit", "export")
     assert find_preset("slab").options == {"kind": "slab"}
@@ -221,7 +237,13 @@ def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> Non
     ("options", "sentence"),
     [
         ({"kind": "slap"}, "there is no kind of job 'slap'; the kinds are tooth, jaw, slab"),
-        ({"kind": "slab", "dentin": "none"}, "a job of kind slab has no option 'dentin'; it has capture, effort, kind"),
+        (
+            {"kind": "slab", "dentin": "none"},
+            "a job of kind slab has no option 'dentin'; it has capture, dictionary, effort",
+        ),
+        ({"kind": "slab", "dictionary": "vmf"}, "dictionary 'vmf' is not known; known are hg, mie, table, tents"),
+        ({"kind": "slab", "dictionary": "mie"}, "dictionary = mie needs particle_index"),
+        ({"kind": "jaw", "dictionary": "hg"}, "a job of kind jaw has no option 'dictionary'"),
         ({"kind": "slab", "rig": {"mouth": "demo"}, "capture": None}, "a job of kind slab has no option 'rig'"),
         ({"kind": "jaw", "effort": 2.0}, "a job of kind jaw has no option 'effort'; it has adam_rate"),
         ({"kind": "slab", "effort": 0}, "greater than or equal to 0.01"),

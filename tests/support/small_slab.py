@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 from services.fit.slab.model.rig import Rig, rig_of
 
 WAVELENGTH_NM = 532.0

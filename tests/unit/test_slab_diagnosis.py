@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Beam, PixelGrid, SlabFolder
+from services.core.slab.folder import Beam, PixelGrid, SlabFolder
 from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults
-from services.fit.slab.fit import SlabOptions, fit_images
+from services.fit.slab.fit import fit_images
 from services.fit.slab.images import Measurements, shot_noise
 from services.fit.slab.model.dictionary import henyey_greenstein
 from services.fit.slab.model.forward import render
+from services.fit.slab.options import SlabOptions
 from tests.support.small_slab import description, small_rig
 
 PIXELS = PixelGrid(x_mm=(-4.0, 4.0), y_mm=(-4.0, 4.0), columns=16, rows=16)

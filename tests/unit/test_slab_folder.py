@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from services.core.errors import CaptureInputError
-from services.core.slab_folder import read_folder
+from services.core.slab.folder import read_folder
 from services.fit.slab.images import read_images, shot_noise
 from tests.support.small_slab import WAVELENGTH_NM, description, write_folder
 

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from services.core.errors import CaptureInputError
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 from services.fit.slab.model.interface import Interface
 from services.fit.slab.through_beam import index_of
 from tests.support.small_slab import WAVELENGTH_NM, description

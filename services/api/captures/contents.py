@@ -13,7 +13,7 @@ from services.core.files.image_headers import declared
 from services.core.files.image_metadata import metadata_fault
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 
 MAX_TIMES_PACKED = 1100
 """Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""

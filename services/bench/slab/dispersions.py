@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from services.bench.slab.recovery import Truth, photographed, recovered
 from services.core.errors import InputError
-from services.core.slab_folder import SlabFolder
+from services.core.slab.folder import SlabFolder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Light, SlabFolder
+from services.core.slab.folder import Light, SlabFolder
 
 Array = NDArray[np.float64]
 

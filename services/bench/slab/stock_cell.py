@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Light, SlabCamera, SlabFolder
+from services.core.slab.folder import Light, SlabCamera, SlabFolder
 
 Array = NDArray[np.float64]
 

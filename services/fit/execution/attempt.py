@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
@@ -27,7 +28,7 @@ from services.fit.export.previews import write_pictures, write_preview
 from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 
 CHECKPOINT = "fit-checkpoint"
-NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "effort"})
+NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", *SLAB_OPTIONS})
 """Options that the answer of a fit does not depend on; what the capture holds counts by its contents."""
 ALWAYS_NAMED = frozenset(
     [

@@ -17,6 +17,8 @@ from services.fit.execution.engine_host import ENGINE, CancellableHost, ChildHos
 from services.fit.execution.fair_shares import Board, Share
 
 Task = Callable[..., Any]
+Call = tuple[str, Task, tuple[Any, ...]]
+"""What ``submit`` takes: a key, a task and its arguments."""
 TASKS_AHEAD = 2
 """Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows at once."""
 
@@ -29,6 +31,9 @@ class Executor(Protocol):
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """Results in the order given. Raises what a task raised."""
+
+    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+        """Run tasks that wait for no other, and give the result of each as soon as it is there. Raises what a task raised."""
 
 
 class LocalExecutor:
@@ -44,6 +49,11 @@ class LocalExecutor:
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """See Executor."""
         return list(pending)
+
+    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+        """See Executor; one after the other."""
+        for key, task, args in calls:
+            yield self.submit(key, task, *args)
 
 
 class DaskExecutor:
@@ -86,6 +96,17 @@ class DaskExecutor:
 
     def gather(self, pending: Sequence[_Planned]) -> list[Any]:
         """See Executor."""
+        for _ in self._ending(pending):
+            pass
+        return [planned.timed.value for planned in pending]
+
+    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+        """See Executor."""
+        for planned in self._ending([self.submit(key, task, *args) for key, task, args in calls]):
+            yield planned.timed.value
+
+    def _ending(self, pending: Sequence[_Planned]) -> Iterator[_Planned]:
+        """Tasks as they end; meanwhile those that wait are sent."""
         most, missing = self._most_at_once(), set(pending)
         while missing:
             while self._waiting and len(self._flying) < most:
@@ -99,7 +120,7 @@ class DaskExecutor:
                     missing.remove(planned)
                     planned.timed = future.result()
                     self._share.end(planned.timed.seconds, planned.timed.tasks)
-        return [planned.timed.value for planned in pending]
+                    yield planned
 
     def close(self) -> None:
         """This fit needs the workers no more."""

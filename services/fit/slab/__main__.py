@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
-from services.core.errors import DentineError
+from services.core.errors import DentineError, SettingsError
+from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES
 
 
 def main(
@@ -16,12 +18,26 @@ def main(
     out: Annotated[Path, typer.Option(help="Where parameters.json, phase.json and errors.json go.")],
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same answer.")] = 1,
     effort: Annotated[float, typer.Option(min=0.001, help="Paths, in units of the default budget.")] = 1.0,
+    dictionary: Annotated[str, typer.Option(help=f"One of {', '.join(DICTIONARIES)}.")] = DEFAULT_DICTIONARY,
+    particle_index: Annotated[float | None, typer.Option(help="Of dictionary mie: index of the particles.")] = None,
+    particle_absorption: Annotated[float, typer.Option(min=0, help="Its imaginary part.")] = 0.0,
 ) -> None:
     """Measure a material's scattering from images of a cell."""
-    from services.fit.slab.fit import SlabOptions, fit_slab, write_results
+    from services.fit.slab.fit import fit_slab, write_results
+    from services.fit.slab.options import SlabOptions
 
     try:
-        fits = fit_slab(folder, SlabOptions(seed=seed, effort=effort))
+        try:
+            options = SlabOptions(
+                seed=seed,
+                effort=effort,
+                dictionary=dictionary,
+                particle_index=particle_index,
+                particle_absorption=particle_absorption,
+            )
+        except ValidationError as problem:
+            raise SettingsError(f"{problem.errors()[0]['msg'].removeprefix('Value error, ')}.") from problem
+        fits = fit_slab(folder, options)
     except DentineError as error:
         print(error, file=sys.stderr)
         raise typer.Exit(error.exit_status) from error
@@ -30,10 +46,10 @@ def main(
         print(
             f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {100 * fit.errors.fit_error:.2f} %"
         )
-        for name in type(fit.parameters).model_fields:
-            told = getattr(fit.parameters, name)
+        quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
+        for name, told in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
             print(
-                f"  {name:16} {told.value:9.5f} ± {told.se:.5f} {told.unit}{'' if told.determined else '  not determined'}"
+                f"  {name:22} {told.value:9.5f} ± {told.se:.5f} {told.unit}{'' if told.determined else '  not determined'}"
             )
         for note in fit.notes:
             print(f"  {note}")

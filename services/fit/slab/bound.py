@@ -15,10 +15,11 @@ from services.fit.slab.images import shot_noise
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
-from services.fit.slab.solve.gauss_newton import quadratic_at, unknowns
+from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import precision, scales_for
-from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, flag_scales, phase_chain
+from services.fit.slab.solve.prior import flag_scales, precision, scales_for
+from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 
 Array = NDArray[np.float64]
 
@@ -73,11 +74,10 @@ def bound_of(
     shot = np.stack([shot_noise(image, noise) for image in mean]) / halves
     weights = 1 / (shot + (0 if variances is None else variances))
     equations = normal_equations(batches, material, mean, weights)
-    quadratic, x = quadratic_at(material, equations), unknowns(material)
+    x = Knots().unknowns(material)
+    quadratic = quadratic_at(x, equations)
     if scale is None:
         scale = max(scales_for(material.extinction_per_mm * rig.width_mm))
-    uncertainty = Uncertainty(
-        covariance_of(quadratic, precision(scale)),
-        covariance_of(quadratic, precision(flag_scales())),
-    )
+    chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
+    uncertainty = Uncertainty(chosen, alone, (chosen, alone))
     return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)

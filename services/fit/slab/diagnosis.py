@@ -6,10 +6,13 @@ medium that it starts from takes a thin sample and an absorbing one for each oth
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Beam, PixelGrid
+from services.core.slab.dictionaries import DEFAULT_DICTIONARY
+from services.core.slab.folder import Beam, PixelGrid
 from services.fit.slab.model.dictionary import Material
 
 Array = NDArray[np.float64]
@@ -23,6 +26,8 @@ MIN_ALBEDO = 0.2
 """Below, most of what scatters is absorbed before it leaves, and higher orders add nothing."""
 MAX_AT_MAXIMUM = 4
 """Pixels that may share an image's largest value: as many as are alike by symmetry in an image without noise."""
+MAX_MISFIT_SIGMAS = 5.0
+"""Standard errors by which squared residuals may exceed the noise before a dictionary is doubted: the chance is 3e-7 a fit."""
 MIN_LIT = 0.5
 """Share of an image's maximum from which pixels count for where the beam is."""
 MAX_OFF = 1.0
@@ -85,3 +90,17 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
             "single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a thinner cell."
         )
     return tuple(told)
+
+
+def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
+    """Whether the images are beyond what a dictionary of few atoms can make; the tents can make any.
+
+    Args:
+        misfit: half the weighted squares at the solution, and its Monte Carlo error.
+        values: number of them.
+    """
+    squares, error = 2 * misfit / values, math.hypot(math.sqrt(2 / values), 2 * misfit_se / values)
+    if dictionary == DEFAULT_DICTIONARY or squares <= 1 + MAX_MISFIT_SIGMAS * error:
+        return ()
+    what = f"The images differ from the nearest mix of dictionary {dictionary} by {math.sqrt(squares):.2g} times their noise"
+    return (f"{what}: the material may be no such mix, and then ± say too little; compare with {DEFAULT_DICTIONARY}.",)

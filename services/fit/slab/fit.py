@@ -10,20 +10,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.geometry import Record
-from services.core.slab_folder import SlabFolder, read_folder
+from services.core.slab.folder import SlabFolder, read_folder
 from services.core.store import write_atomic
-from services.fit.slab.diagnosis import sample_faults
+from services.fit.slab.diagnosis import mixture_faults, sample_faults
+from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.options import SlabOptions
+from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
 
+STEPS_OF_ATOMS = 20
+"""Most steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a start that was 30 % off took 11."""
 LAST_LOOK = 2**30
 """Number of the render, counted apart from the solver's, that errors are taken from."""
 
@@ -41,14 +46,6 @@ class Wavelength:
     """Camera and light of each image."""
 
 
-class SlabOptions(Record):
-    """What a fit may be told."""
-
-    seed: int = 1
-    effort: float = 1.0
-    """Paths, in units of the default budget."""
-
-
 def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = map) -> tuple[SlabFit, ...]:
     """Fit every wavelength of a folder.
 
@@ -61,7 +58,10 @@ def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = ma
     options = options or SlabOptions()
     folder = read_folder(root)
     everything = [(wavelength, read_images(root, folder, wavelength)) for wavelength in folder.wavelengths_nm]
-    return tuple(fit_images(folder, wavelength, measured, options, blocks).fit for wavelength, measured in everything)
+    return tuple(
+        fit_images(folder, wavelength, measured, options, blocks, dictionary_of(root, folder, wavelength, options)).fit
+        for wavelength, measured in everything
+    )
 
 
 def fit_images(
@@ -70,12 +70,14 @@ def fit_images(
     measured: Measurements,
     options: SlabOptions,
     blocks: Blocks = map,
+    dictionary: ChosenDictionary | None = None,
 ) -> Wavelength:
-    """Fit the images of one wavelength; see ``fit_slab``."""
+    """Fit the images of one wavelength by a dictionary, the tents where none is given; see ``fit_slab``."""
+    dictionary = dictionary or ChosenDictionary(Knots())
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
     rig = rig_of(folder, wavelength_nm, index.value)
-    solver = GaussNewton(rig, measured, options.seed, _budget(options.effort), blocks)
+    solver = GaussNewton(rig, measured, options.seed, _budget(options, dictionary), blocks, dictionary.coordinates)
     solution = solver.solve(start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
     phase = phase_of(material, uncertainty)
@@ -87,24 +89,28 @@ def fit_images(
         errors=_errors(measured, first, second),
         notes=measured.faults
         + sample_faults(material, rig.width_mm)
+        + mixture_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
         + _notes(measured, phase, converged=solution.converged),
         converged=solution.converged,
         steps=solution.steps,
         paths=solution.paths,
         core_seconds=time.process_time() - begun_s,
+        dictionary=options.dictionary,
+        atoms=atoms_of(dictionary, material, uncertainty),
     )
     shape = len(measured.values), rig.grid.rows, rig.grid.columns
     seen = np.where(np.isfinite(measured.variances), measured.values, np.nan).reshape(shape)
     return Wavelength(fit, seen, (0.5 * (first + second)).reshape(shape), measured.held_out, measured.names)
 
 
-def _budget(effort: float) -> Budget:
-    plain = Budget()
+def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
+    plain, effort = Budget(), options.effort
     last = tuple((max(1, round(effort * paths)), batches) for paths, batches in plain.last)
     return Budget(
         first_paths=max(1, round(effort * plain.first_paths)),
         search_paths=max(1, round(effort * plain.search_paths)),
         last=last,
+        most_steps=STEPS_OF_ATOMS if dictionary.names else plain.most_steps,
     )
 
 
@@ -147,4 +153,7 @@ def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for name in ("parameters", "phase", "errors"):
         told = {f"{fit.wavelength_nm:g}": getattr(fit, name).model_dump() for fit in fits}
+        if name == "parameters":
+            for fit in fits:
+                told[f"{fit.wavelength_nm:g}"] |= {atom: one.model_dump() for atom, one in fit.atoms.items()}
         write_atomic(out / f"{name}.json", json.dumps(told, indent=1).encode())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.slab_folder import SlabFolder, SlabImage
+from services.core.slab.folder import SlabFolder, SlabImage
 from services.fit.slab.diagnosis import grid_faults, image_faults
 from services.fit.slab.model.rig import Grid, grid_of
 

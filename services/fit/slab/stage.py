@@ -8,17 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.core.errors import CaptureInputError, JobCancelledError
+from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
-from services.core.slab_folder import SlabFolder, read_folder
+from services.core.slab.folder import SlabFolder, read_folder
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 from services.core.verdict import VERDICT
 
 if TYPE_CHECKING:
-    from services.fit.slab.fit import SlabOptions
     from services.fit.slab.model.forward import Block, BlockSums
+    from services.fit.slab.options import SlabOptions
     from services.fit.slab.results.result import SlabReport
 
 CHECKPOINT = "fit-checkpoint"
@@ -32,36 +33,38 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
         CaptureInputError: the folder cannot be read. JobCancelledError: between two blocks of paths.
     """
     from services.fit.execution.executors import executor
-    from services.fit.slab.fit import SlabOptions
+    from services.fit.slab.dictionaries.chosen import dictionary_of
     from services.fit.slab.images import read_images
+    from services.fit.slab.options import SlabOptions
     from services.fit.slab.results.kept import IMAGES, read_kept
     from services.fit.slab.results.result import SlabReport
-    from services.fit.slab.through_beam import index_of
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
     root, folder = _folder(spec)
+    options = SlabOptions.model_validate(spec.model_dump(include={"seed", *SLAB_OPTIONS}))
     for wavelength_nm in folder.wavelengths_nm:  # a fault in the last one is told before the first has cost its time
-        index_of(folder, wavelength_nm)
+        dictionary_of(root, folder, wavelength_nm, options)
         for fault in read_images(root, folder, wavelength_nm).faults:
             context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
     writer = StageWriter(context.root, "fit", context.attempt)
-    flag, options = context.root / CANCEL_FLAG, SlabOptions(seed=spec.seed, effort=spec.effort)
+    flag = context.root / CANCEL_FLAG
     places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
-    fits = []
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
-        run_on.gather(
-            [run_on.submit(f"{nm:g}", fit_task, root, nm, options, place, flag) for nm, place in places.items()]
-        )
-    for number, place in enumerate(places.values()):
+        calls = [(f"{nm:g}", fit_task, (root, nm, options, place, flag)) for nm, place in places.items()]
+        for number, name in enumerate(run_on.as_they_end(calls), 1):
+            kept = read_kept(context.root / CHECKPOINT / name)
+            assert kept is not None
+            which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}
+            done = number / len(places)
+            context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit), data=which))
+    fits = []
+    for place in places.values():
         kept = read_kept(place)
         assert kept is not None
         fits.append(kept.fit)
         write_atomic(writer.folder / f"{place.name}.npz", (place / IMAGES).read_bytes())
-        done = (number + 1) / len(places)
-        which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}
-        context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit), data=which))
     report = SlabReport(fits=tuple(fits))
     writer.publish(report)
     verdict = report.verdict()
@@ -76,6 +79,7 @@ def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions,
     Raises:
         JobCancelledError: ``flag`` exists.
     """
+    from services.fit.slab.dictionaries.chosen import dictionary_of
     from services.fit.slab.fit import fit_images
     from services.fit.slab.images import read_images
     from services.fit.slab.results.kept import fingerprint, keep, read_kept
@@ -85,7 +89,8 @@ def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions,
     if kept is None or kept.of != mark:
         folder = read_folder(root)
         measured = read_images(root, folder, wavelength_nm)
-        keep(place, mark, fit_images(folder, wavelength_nm, measured, options, _cancellable(flag)))
+        dictionary = dictionary_of(root, folder, wavelength_nm, options)
+        keep(place, mark, fit_images(folder, wavelength_nm, measured, options, _cancellable(flag), dictionary))
     return place.name
 
 

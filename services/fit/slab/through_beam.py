@@ -13,7 +13,7 @@ import math
 from typing import NamedTuple
 
 from services.core.errors import CaptureInputError
-from services.core.slab_folder import Cell, SlabFolder, ThroughBeam
+from services.core.slab.folder import Cell, SlabFolder, ThroughBeam
 
 SMALLEST_INDEX, LARGEST_INDEX = 1.0, 4.0
 MAX_APART = 4.0

@@ -1,7 +1,7 @@
 /** The files of a folder that was chosen or dropped, by their paths in it; what no capture may hold is left out. */
 
 /** As the server's own list: descriptions, images and meshes, and the chunks of arrays. */
-const OF_A_CAPTURE = /\.(json|jsonl|toml|npy|png|tif|tiff|exr|ply|obj|stl)$/i;
+const OF_A_CAPTURE = /\.(csv|json|jsonl|toml|npy|png|tif|tiff|exr|ply|obj|stl)$/i;
 const CHUNK = /[^/]\.zarr\/(.*\/)?c(\/\d+)+$/;
 
 export interface FolderFile {

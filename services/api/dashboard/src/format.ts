@@ -2,7 +2,7 @@
 
 import type { Estimate, Figure, Job, TimeRange } from "./api";
 
-const UNITS: Record<string, string> = { "1": "", "1/mm": "mm⁻¹", "per mm": "mm⁻¹", "mm^-1": "mm⁻¹" };
+const UNITS: Record<string, string> = { "1": "", "1/mm": "mm⁻¹", "per mm": "mm⁻¹", "mm^-1": "mm⁻¹", um: "µm" };
 
 export function unitOf(estimate: Estimate): string {
   return UNITS[estimate.unit] ?? estimate.unit;

@@ -4,6 +4,9 @@ import type { Parameters } from "./api";
 import { element } from "./element";
 import { significant, sourcesOf, unitOf, unitOfName, valueOf } from "./format";
 
+/** A slab's dictionary may have a hundred atoms. */
+const OF_AN_ATOM = /^(atoms|volumes)\./;
+
 export class ParameterTable {
   readonly root = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" }, element("p", { class: "soft" }, "No value yet."));
   private readonly current = new Map<string, Record<string, number>>();
@@ -29,12 +32,14 @@ export class ParameterTable {
   showResult(result: Parameters, heading: (channel: string) => string = (channel) => channel): void {
     this.isFinal = true;
     const channels = Object.keys(result);
-    const names = [...new Set(channels.flatMap((channel) => Object.keys(result[channel] ?? {})))];
+    const all = [...new Set(channels.flatMap((channel) => Object.keys(result[channel] ?? {})))];
+    const names = all.filter((name) => !OF_AN_ATOM.test(name));
     const unit = (name: string) => {
       const first = channels.map((channel) => result[channel]?.[name]).find((estimate) => estimate);
       return first ? unitOf(first) : "";
     };
-    this.fill("Result: value ± one standard error, and what most of its square is made of.", channels, names, unit, (name, channel) => {
+    const left = names.length < all.length ? " Those of single atoms of the dictionary are in the report." : "";
+    this.fill(`Result: value ± one standard error, and what most of its square is made of.${left}`, channels, names, unit, (name, channel) => {
       const estimate = result[channel]?.[name];
       if (!estimate) return ["–"];
       const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";

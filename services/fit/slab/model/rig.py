@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Cell, Light, PixelGrid, SlabCamera, SlabFolder
+from services.core.slab.folder import Cell, Light, PixelGrid, SlabCamera, SlabFolder
 from services.fit.slab.model.interface import Interface
 
 Array = NDArray[np.float64]

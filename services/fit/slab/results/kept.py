@@ -12,13 +12,17 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from services.core.geometry import Record
-from services.core.slab_folder import read_folder
+from services.core.slab.folder import read_folder
 from services.core.store import write_atomic, write_record
 from services.fit.execution.numerics import numerics_name
-from services.fit.slab.fit import SlabOptions, Wavelength
+from services.fit.slab.dictionaries.table import table_file
+from services.fit.slab.fit import Wavelength
+from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.result import SlabFit
 
 RESULT, IMAGES = "fit.json", "images.npz"
+LATER_OPTIONS = ("dictionary", "particle_index", "particle_absorption")
+"""Options that version 0.1.0 did not have."""
 
 
 class Kept(Record):
@@ -43,8 +47,13 @@ class Images:
 def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     """Identifies all that a wavelength's result depends on."""
     folder, digest = read_folder(root), hashlib.sha256()
-    for part in (numerics_name(), folder.model_dump_json(), options.model_dump_json(), f"{wavelength_nm:g}"):
+    # Options at these defaults are left out, so that what earlier versions kept is taken.
+    later = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
+    told = options.model_dump_json(exclude=later)
+    for part in (numerics_name(), folder.model_dump_json(), told, f"{wavelength_nm:g}"):
         digest.update(part.encode() + b"\n")
+    if options.dictionary == "table":
+        digest.update(hashlib.sha256(table_file(root).read_bytes()).digest())
     for image in folder.images:
         if folder.wavelength_of(image) == wavelength_nm:
             for file in (image.file, image.variance_file):

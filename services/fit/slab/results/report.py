@@ -26,6 +26,7 @@ LABELS = {
     "g": "mean cosine g",
     "index": "index of refraction",
 }
+ATOM_LABELS = {"volume_fraction": "volume of all spheres", "mean_radius": "mean radius, by volume"}
 RESIDUAL_OF_WHITE = 0.1
 """Share of an image's white at which the residual's colours end."""
 MAX_PICTURES = 12
@@ -55,6 +56,7 @@ def write_report(
         paths=f"{sum(fit.paths for fit in report.fits) / 1e6:.1f}",
         wavelengths=[f"{fit.wavelength_nm:g} nm" for fit in report.fits],
         parameters=[_row(report, name) for name in LABELS],
+        atoms=[(f"{fit.wavelength_nm:g} nm", fit.dictionary, _atoms(fit)) for fit in report.fits if fit.atoms],
         phases=[_phase(fit) for fit in report.fits],
         pictures=[(f"{fit.wavelength_nm:g} nm", _pictures(images[fit.wavelength_nm])) for fit in report.fits],
         residual_bar=gradient(DIVERGING),
@@ -89,6 +91,19 @@ def _row(report: SlabReport, name: str) -> dict[str, Any]:
         cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined)) for one in told
     ]
     return {"label": LABELS[name], "name": name, "cells": cells, "unit": "" if told[0].unit == "1" else "per mm"}
+
+
+def _atoms(fit: SlabFit) -> list[dict[str, Any]]:
+    """Rows of what the dictionary's atoms add up to, and of those that are there."""
+    there = {name: one for name, one in fit.atoms.items() if one.value > 0}
+    return [
+        {
+            "name": ATOM_LABELS.get(name, name.replace("atoms.", "σs of ", 1).replace("volumes.", "volume of ", 1)),
+            "cell": cell(Estimate(value=one.value, se=one.se, unit=one.unit, determined=one.determined)),
+            "unit": {"1/mm": "per mm", "um": "µm"}.get(one.unit, ""),
+        }
+        for name, one in there.items()
+    ]
 
 
 def _phase(fit: SlabFit) -> tuple[str, str, str]:

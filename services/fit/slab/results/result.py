@@ -10,10 +10,13 @@ from pydantic import Field
 
 from services.core.geometry import Record
 from services.core.results import FitReport, Verdict
+from services.core.slab.dictionaries import DEFAULT_DICTIONARY
 from services.core.verdict import verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
 from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 from services.fit.slab.through_beam import Index
+
+SlabUnit = Literal["1/mm", "1", "um"]
 
 
 class Quantity(Record):
@@ -21,7 +24,7 @@ class Quantity(Record):
 
     value: float
     se: float = Field(description="standard error")
-    unit: Literal["1/mm", "1"]
+    unit: SlabUnit
     determined: bool = Field(description="whether the images fix it, and not the prior")
 
 
@@ -76,6 +79,8 @@ class SlabFit(Record):
     steps: int = Field(description="of the search")
     paths: int
     core_seconds: float
+    dictionary: str = Field(default=DEFAULT_DICTIONARY, description="what the phase function was built from")
+    atoms: dict[str, Quantity] = Field(default={}, description="of the dictionary, where it has few; see ``atoms_of``")
 
 
 def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) -> Parameters:

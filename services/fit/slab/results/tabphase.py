@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.slab_folder import Cell
+from services.core.slab.folder import Cell
 from services.fit.slab.model.dictionary import ANGLES_RAD
 from services.fit.slab.results.result import SlabFit
 

@@ -1,7 +1,7 @@
-"""The default solver: Gauss-Newton in ln f at the knots and in sigma_a, on normal equations from pairs of batches.
+"""The default solver: Gauss-Newton on normal equations from pairs of batches, in the unknowns of a dictionary.
 
 init        a material and its normal equations
-step        a smoothness scale by evidence, a damped step, judged on the unbiased misfit of fresh batches
+step        a scale of the prior by evidence, a damped step, judged on the unbiased misfit of fresh batches
 terminate   the step promises no more than noise does, or the budget of steps is spent
 finish      one more step, from many more paths
 """
@@ -14,21 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.slab.images import Measurements
-from services.fit.slab.model.dictionary import KNOTS, Material
+from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.normal import NormalEquations, normal_equations, smoothed_variance
-from services.fit.slab.solve.prior import Quadratic, precision, scales_for
+from services.fit.slab.solve.prior import RIDGE, Quadratic
 
 Array = NDArray[np.float64]
 
-LARGEST_CHANGE = 1.0
-"""Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
 TOLERATED_RISE = 2.0
 """Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
 MAX_HALVINGS = 4
-
-
 WORTHWHILE = 2.0
 """A step that promises less than so many times what noise alone does waits for more paths."""
 UNFINISHED = 5.0
@@ -76,6 +73,11 @@ class Solution:
     converged: bool
     paths: int
     """In all, over lights and batches."""
+    coordinates: Coordinates
+    """Whose unknowns the quadratic is in."""
+    misfit: float
+    """Half of the weighted squares before the last step, Monte Carlo noise of the images left out."""
+    misfit_se: float
 
 
 @dataclass
@@ -87,14 +89,15 @@ class GaussNewton:
     seed: int
     budget: Budget
     blocks: Blocks
+    coordinates: Coordinates
     renders: int = 0
     paths: int = 0
     path_variance: Array | None = None
     """Monte Carlo variance of one path (images, pixels), a running mean over the renders before."""
 
     def solve(self, material: Material) -> Solution:
-        """Iterate from a material to the solution."""
-        state = self.init(material)
+        """Iterate from a guess to the solution."""
+        state = self.init(self.coordinates.begun(material))
         steps = 0
         converged = False
         while steps < self.budget.most_steps and not converged:
@@ -109,24 +112,23 @@ class GaussNewton:
 
     def step(self, state: State) -> tuple[State, bool]:
         """One step, and whether the search has come as far as its paths can tell."""
-        x, quadratic = unknowns(state.material), quadratic_at(state.material, state.equations)
-        scale = self.best_scale(state.material, quadratic)
-        prior = precision(scale)
-        change = self.change(quadratic, prior, x, state.damping)
-        promise, noise = (
-            promised(quadratic, prior, x, change),
-            noise_of_promise(quadratic, prior, state.equations.gradient_noise),
-        )
+        x = self.coordinates.unknowns(state.material)
+        quadratic = quadratic_at(x, state.equations)
+        prior = self.coordinates.precision(self.coordinates.scale(state.material, self.rig.width_mm, quadratic))
+        change = self.change(quadratic, prior, state.material, state.damping)
+        promise = promised(quadratic, prior, x, change)
+        noise = noise_of_promise(quadratic, prior, state.equations.gradient_noise)
         if promise < WORTHWHILE * noise and state.paths >= self.budget.search_paths:
             return state, True
         paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
         for halving in range(MAX_HALVINGS + 1):
             y = x + change / 2**halving
-            equations = self.linearised(material_at(y), paths, self.budget.batches)
+            moved = self.coordinates.material_at(y)
+            equations = self.linearised(moved, paths, self.budget.batches)
             after = equations.misfit + 0.5 * float(y @ prior @ y)
             if after <= before + TOLERATED_RISE * float(np.hypot(state.equations.misfit_se, equations.misfit_se)):
-                return State(material_at(y), equations, paths, max(state.damping / 4, DAMPING)), False
+                return State(moved, equations, paths, max(state.damping / 4, DAMPING)), False
         more = min(2 * state.paths, self.budget.search_paths)
         return State(
             state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping
@@ -138,23 +140,30 @@ class GaussNewton:
         for paths, batches in self.budget.last:
             for _ in range(self.budget.most_last):
                 equations = self.linearised(material, paths, batches)
-                quadratic, x = quadratic_at(material, equations), unknowns(material)
-                scale = self.best_scale(material, quadratic)
-                prior = precision(scale)
-                change = self.change(quadratic, prior, x, DAMPING)
-                material = material_at(x + change)
-                if promised(quadratic, prior, x, change) < UNFINISHED * noise_of_promise(
-                    quadratic, prior, equations.gradient_noise
-                ):
+                x = self.coordinates.unknowns(material)
+                quadratic = quadratic_at(x, equations)
+                scale = self.coordinates.scale(material, self.rig.width_mm, quadratic)
+                prior = self.coordinates.precision(scale)
+                change = self.change(quadratic, prior, material, DAMPING)
+                material = self.coordinates.material_at(x + change)
+                noise = noise_of_promise(quadratic, prior, equations.gradient_noise)
+                if promised(quadratic, prior, x, change) < UNFINISHED * noise:
                     break
         return Solution(
-            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths
-        )
+            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths,
+            self.coordinates, equations.misfit, equations.misfit_se,
+        )  # fmt: skip
 
-    @staticmethod
-    def change(quadratic: Quadratic, prior: Array, x: Array, damping: float) -> Array:
-        """The step to the damped minimum, each unknown held back by itself."""
-        return np.clip(quadratic.minimum(prior, x, damping) - x, -LARGEST_CHANGE, LARGEST_CHANGE)
+    def change(self, quadratic: Quadratic, prior: Array, around: Material, damping: float) -> Array:
+        """The step to the damped minimum, no unknown further than is good.
+
+        The Levenberg term is ``damping`` times the noise about the present point: what noise may have bent is held there. It
+        moves no fixed point, so that repeated steps from fresh paths end where an undamped one would.
+        """
+        x = self.coordinates.unknowns(around)
+        held = damping * quadratic.noise + RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(len(x))
+        least = self.coordinates.minimum(quadratic.matrix + prior + held, held @ x - quadratic.linear)
+        return self.coordinates.held_back(least - x, around)
 
     def linearised(self, material: Material, paths: int, batches: int) -> NormalEquations:
         """Normal equations of fresh batches."""
@@ -178,32 +187,18 @@ class GaussNewton:
             self.measured.held_out[:, None], 0, 1 / (self.measured.variances + known / (batches * paths))
         )
         self.path_variance = (own + known) / 2
-        return normal_equations(estimates, material, self.measured.values, weights)
-
-    def best_scale(self, material: Material, quadratic: Quadratic) -> float:
-        """The prior's scale of most evidence among those for this optical thickness."""
-        return max(scales_for(material.extinction_per_mm * self.rig.width_mm), key=quadratic.log_evidence)
+        equations = normal_equations(estimates, material, self.measured.values, weights)
+        return equations.chained(self.coordinates.chain(material))
 
 
-def unknowns(material: Material) -> Array:
-    """Logarithm of f at the knots, and sigma_a (UNKNOWNS,)."""
-    return np.append(np.log(material.scattering), material.absorption_per_mm)
-
-
-def quadratic_at(material: Material, equations: NormalEquations) -> Quadratic:
-    """The model of half the misfit in the unknowns themselves."""
-    x = unknowns(material)
+def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:
+    """The model of half the misfit in the unknowns themselves, from their values where it was taken."""
     return Quadratic(
         equations.matrix,
         equations.gradient - equations.matrix @ x,
         equations.noise,
         equations.noise_gradient - equations.noise @ x,
     )
-
-
-def material_at(x: Array) -> Material:
-    """The inverse of ``unknowns``."""
-    return Material(np.exp(x[:KNOTS]), max(float(x[-1]), 0.0))
 
 
 def promised(quadratic: Quadratic, prior: Array, x: Array, change: Array) -> float:

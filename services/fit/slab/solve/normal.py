@@ -10,7 +10,7 @@ each over a != b and divided by B (B - 1). One batch alone would add the power o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,14 @@ from services.fit.slab.model.forward import Batches
 Array = NDArray[np.float64]
 
 UNKNOWNS = KNOTS + 1
-"""ln f at the knots, and sigma_a in per mm."""
+"""What the forward model derives by: ln f at the knots, and sigma_a in per mm."""
 NEIGHBOURHOOD = 3
 """Edge in pixels of the square over which the Monte Carlo variance is smoothed."""
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """A quadratic model of half the misfit around one material."""
+    """A quadratic model of half the misfit around one material, in U unknowns."""
 
     misfit: float
     """Half of the weighted squares, without the noise of the estimate."""
@@ -36,13 +36,26 @@ class NormalEquations:
     gradient: Array
     matrix: Array
     gradient_noise: Array
-    """Covariance of the gradient's Monte Carlo noise (UNKNOWNS, UNKNOWNS), of rank B - 1."""
+    """Covariance of the gradient's Monte Carlo noise (U, U), of rank B - 1."""
     noise: Array
-    """Power of the Monte Carlo noise in the mean derivatives (UNKNOWNS, UNKNOWNS): what the matrix would have too much."""
+    """Power of the Monte Carlo noise in the mean derivatives (U, U): what the matrix would have too much."""
     noise_gradient: Array
     """What the gradient would have too much if each batch met itself."""
     used: int
     """Number of pixels."""
+
+    def chained(self, chain: Array | None) -> NormalEquations:
+        """The same in other unknowns, by the derivatives (UNKNOWNS, U) of these; None leaves them as they are."""
+        if chain is None:
+            return self
+        return replace(
+            self,
+            gradient=chain.T @ self.gradient,
+            matrix=chain.T @ self.matrix @ chain,
+            gradient_noise=chain.T @ self.gradient_noise @ chain,
+            noise=chain.T @ self.noise @ chain,
+            noise_gradient=chain.T @ self.noise_gradient,
+        )
 
 
 def derivative_rows(rows: Array, material: Material) -> Array:

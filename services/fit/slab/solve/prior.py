@@ -6,12 +6,13 @@ zero where no camera looks. The prior is not centred on an HG function, which wo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, SPACING_RAD
 from services.fit.slab.solve.normal import UNKNOWNS
 
 Array = NDArray[np.float64]
@@ -20,6 +21,9 @@ THIN_SCALES = (3.0, 10.0, 30.0)
 """Standard deviations of d2 ln f / d theta2, per rad2, among which the evidence chooses; HG 0.8 has 60 at its peak, 3 beyond 20 degrees."""
 THICK_SCALES = (1.0, 3.0)
 """The same where sigma_t w exceeds ``THICK``: there only few and smooth features are seen."""
+SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
+"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
+HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
 RIDGE = 1e-12
 """Of the largest curvature, so that a direction that nothing tells of can be solved for."""
 THICK = 4.0
@@ -48,9 +52,15 @@ def scales_for(thickness: float) -> tuple[float, ...]:
     return THICK_SCALES if thickness > THICK else THIN_SCALES
 
 
+def flag_scales() -> Array:
+    """The weak prior's scale at each knot, by the angle from the nearer pole."""
+    from_pole = np.minimum(ANGLES_RAD, math.pi - ANGLES_RAD)
+    return np.asarray(np.maximum(SHARPEST / (1 + (from_pole / POLE_RAD) ** 2), BLUNTEST))
+
+
 @dataclass(frozen=True)
 class Quadratic:
-    """Half the misfit near a material: linear^T x + x^T matrix x / 2 + a constant, in the unknowns x and not in steps."""
+    """Half the misfit near a material: linear^T x + x^T matrix x / 2 + a constant, in the unknowns x (U,) and not in steps."""
 
     matrix: Array
     linear: Array
@@ -58,36 +68,3 @@ class Quadratic:
     """What the Monte Carlo noise of the derivatives would add to the matrix, positive semidefinite."""
     noise_linear: Array
     """And to the linear term."""
-
-    def minimum(self, prior: Array, around: Array, damping: float) -> Array:
-        """The minimum with a prior, absorption not below zero.
-
-        The Levenberg term is ``damping`` times the noise about ``around``: what noise may have bent is held there. It moves
-        no fixed point, so that repeated steps from fresh paths end where an undamped one would.
-        """
-        held = damping * self.noise + RIDGE * float(np.abs(np.diag(self.matrix)).max()) * np.eye(UNKNOWNS)
-        return _bounded(self.matrix + prior + held, held @ around - self.linear)
-
-    def log_evidence(self, scale: float) -> float:
-        """Of the prior's scale, but for a constant that all scales share.
-
-        The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by following
-        directions of negative curvature, which the unbiased matrix has.
-        """
-        prior = precision(scale)
-        linear, total = self.linear + self.noise_linear, self.matrix + self.noise + prior
-        x = _bounded(total + RIDGE * float(np.diag(total).max()) * np.eye(UNKNOWNS), -linear)
-        sign, log_determinant = np.linalg.slogdet(total)
-        return (
-            float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale))
-            if sign > 0
-            else -np.inf
-        )
-
-
-def _bounded(matrix: Array, right: Array) -> Array:
-    """Solve for all unknowns; where the absorption comes out negative, for the others with none."""
-    x = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
-    if x[-1] < 0:
-        x = np.append(np.asarray(np.linalg.solve(matrix[:-1, :-1], right[:-1]), dtype=np.float64), 0.0)
-    return x

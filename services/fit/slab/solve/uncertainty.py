@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
+from services.fit.slab.model.dictionary import KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.gauss_newton import Solution
-from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import RIDGE, Quadratic, precision
+from services.fit.slab.solve.prior import RIDGE, Quadratic
 
 Array = NDArray[np.float64]
 
-SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
-"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
-HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
 MIN_SIGNAL = 0.1
 """Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
 LARGEST_SHARE = 0.1
@@ -29,12 +24,14 @@ LARGEST_COEFFICIENT_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariances (UNKNOWNS, UNKNOWNS) of ln f and sigma_a."""
+    """Covariances of ln f and sigma_a (KNOTS + 1, KNOTS + 1)."""
 
     covariance: Array
     """With the prior's scale that the evidence chose."""
     images_alone: Array
     """With a prior so weak that it tells nothing: what flags are judged by."""
+    of_unknowns: tuple[Array, Array]
+    """Both in the solver's own unknowns (U, U)."""
 
     def standard_error(self, slope: Array) -> float:
         """Of a quantity, from its derivatives by the unknowns."""
@@ -51,30 +48,41 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
     directions whose curvature stands out count. The images' Monte Carlo noise is in the weights, as the shot noise is.
     """
-    return Uncertainty(
-        *(covariance_of(solution.quadratic, precision(scale)) for scale in (solution.scale, flag_scales()))
+    coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
+    x = coordinates.unknowns(material)
+    priors = coordinates.precision(solution.scale), coordinates.weak_precision(material)
+    chosen, alone = (
+        covariance_of(quadratic, prior, _half_lines(quadratic, prior, x, coordinates.is_bound(x))) for prior in priors
     )
+    if (chain := coordinates.chain(material)) is None:
+        return Uncertainty(chosen, alone, (chosen, alone))
+    return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
 
 
-def flag_scales() -> Array:
-    """The weak prior's scale at each knot, by the angle from the nearer pole."""
-    from_pole = np.minimum(ANGLES_RAD, math.pi - ANGLES_RAD)
-    return np.asarray(np.maximum(SHARPEST / (1 + (from_pole / POLE_RAD) ** 2), BLUNTEST))
-
-
-def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
-    """Posterior covariance of the unknowns under a prior's precision (UNKNOWNS, UNKNOWNS)."""
-    ridge = RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(UNKNOWNS)
+def covariance_of(quadratic: Quadratic, prior: Array, held: Array | None = None) -> Array:
+    """Posterior covariance of the unknowns under a prior's precision (U, U), and one more of each unknown (U,)."""
+    ridge = RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(len(prior))
     reference = prior + quadratic.noise + ridge
     signals, vectors = linalg.eigh(quadratic.matrix, reference)
     # With vectors V, V^T reference V = 1, so that matrix = reference V signals V^T reference.
     told = reference @ vectors
     curvature = (told * np.where(signals > MIN_SIGNAL, signals, 0)) @ told.T
-    return np.asarray(np.linalg.inv(curvature + prior + ridge))
+    total = curvature + prior + ridge
+    return np.asarray(np.linalg.inv(total if held is None else total + np.diag(held)))
+
+
+def _half_lines(quadratic: Quadratic, prior: Array, x: Array, bound: NDArray[np.bool_]) -> Array:
+    """Precision (U,) that a bound adds to the unknowns that lie at it.
+
+    On the half line that is left to it, an unknown of slope s has exp(-s x - a x^2 / 2): a second moment of 1/a where s is
+    small, as without the bound, and of 2/s^2 where it is large.
+    """
+    slope = quadratic.linear + quadratic.noise_linear + (quadratic.matrix + quadratic.noise + prior) @ x
+    return np.where(bound, np.maximum(slope, 0) ** 2 / 2, 0.0)
 
 
 def slopes(material: Material) -> dict[str, Array]:
-    """Derivatives of the reported numbers by ln f and sigma_a (UNKNOWNS,)."""
+    """Derivatives of the reported numbers by ln f and sigma_a (KNOTS + 1,)."""
     parts, moments = material.scattering * tent_solid_angles(), material.scattering * cosine_moments()
     sigma_s, g = material.scattering_per_mm, material.mean_cosine
     return {

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from services.core.geometry import Record
-from services.core.slab_folder import Cell
+from services.core.slab.folder import Cell
 from services.fit.slab.model.interface import Interface
 from services.fit.slab.results.result import Quantity
 from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE

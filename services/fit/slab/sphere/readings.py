@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
-from services.core.slab_folder import Cell, Glass, Positive
+from services.core.slab.folder import Cell, Glass, Positive
 from services.core.store import read_record
 
 Share = Annotated[float, Field(ge=0, le=1)]

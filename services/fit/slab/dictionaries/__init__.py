@@ -1,0 +1,1 @@
+"""Dictionaries of phase functions, one a file; ``services/core/slab/dictionaries.py`` lists them."""

@@ -1,0 +1,120 @@
+"""The unknowns by which a solver moves a medium, and what is held of them beforehand.
+
+``Knots`` are ln f at the 200 knots under a smoothness prior; ``mixture.Mixtures`` are the weights of a dictionary's atoms. Both
+end with sigma_a. The forward model tells derivatives by ln f and sigma_a, and each kind of unknowns takes them on by the chain rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.slab.model.dictionary import KNOTS, Material
+from services.fit.slab.solve.normal import UNKNOWNS
+from services.fit.slab.solve.prior import RIDGE, Quadratic, flag_scales, precision, scales_for
+
+Array = NDArray[np.float64]
+
+LARGEST_CHANGE = 1.0
+"""Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
+
+
+class Coordinates(Protocol):
+    """One kind of unknowns x (U,)."""
+
+    def begun(self, guess: Material) -> Material:
+        """A medium of this kind like the guess, from which the search begins."""
+
+    def unknowns(self, material: Material) -> Array:
+        """Of a medium that ``begun`` or ``material_at`` gave."""
+
+    def material_at(self, x: Array) -> Material:
+        """The medium with these unknowns."""
+
+    def chain(self, material: Material) -> Array | None:
+        """Derivatives of ln f and sigma_a by the unknowns (UNKNOWNS, U); None where they are the unknowns themselves."""
+
+    def scale(self, material: Material, width_mm: float, quadratic: Quadratic) -> float:
+        """Scale of the prior, near a medium and as its images suggest."""
+
+    def precision(self, scale: float) -> Array:
+        """Inverse covariance of the prior (U, U) for one scale."""
+
+    def weak_precision(self, material: Material) -> Array:
+        """The same of a prior so weak that what it tells is not taken for a measurement."""
+
+    def minimum(self, matrix: Array, right: Array) -> Array:
+        """The x within bounds at which x^T matrix x / 2 - right^T x is least."""
+
+    def held_back(self, change: Array, material: Material) -> Array:
+        """A step of which no unknown moves further than a linearisation is good for."""
+
+    def is_bound(self, x: Array) -> NDArray[np.bool_]:
+        """Which unknowns lie at a bound that they may not pass."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """ln f at the knots, and sigma_a not below zero."""
+
+    def begun(self, guess: Material) -> Material:
+        """The guess itself."""
+        return guess
+
+    def unknowns(self, material: Material) -> Array:
+        """Ln f and sigma_a."""
+        return np.append(np.log(material.scattering), material.absorption_per_mm)
+
+    def material_at(self, x: Array) -> Material:
+        """The inverse of ``unknowns``."""
+        return Material(np.exp(x[:KNOTS]), max(float(x[-1]), 0.0))
+
+    def chain(self, material: Material) -> None:
+        """None: these are what the forward model derives by."""
+
+    def scale(self, material: Material, width_mm: float, quadratic: Quadratic) -> float:
+        """The curvature of ln f of most evidence among those for this optical thickness."""
+        candidates = scales_for(material.extinction_per_mm * width_mm)
+        return max(candidates, key=lambda scale: self.log_evidence(quadratic, scale))
+
+    def precision(self, scale: float) -> Array:
+        """Of a smooth ln f; nothing is assumed of the absorption."""
+        return precision(scale)
+
+    def weak_precision(self, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
+        """Of a ln f that may bend as sharply as any."""
+        return precision(flag_scales())
+
+    def minimum(self, matrix: Array, right: Array) -> Array:
+        """For all unknowns; where the absorption comes out negative, for the others with none."""
+        x = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+        if x[-1] < 0:
+            x = np.append(np.asarray(np.linalg.solve(matrix[:-1, :-1], right[:-1]), dtype=np.float64), 0.0)
+        return x
+
+    def held_back(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
+        """Each unknown by itself."""
+        return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+
+    def is_bound(self, x: Array) -> NDArray[np.bool_]:
+        """None: ln f has no bound, and the absorption is left free."""
+        return np.zeros(len(x), dtype=bool)
+
+    def log_evidence(self, quadratic: Quadratic, scale: float) -> float:
+        """Of a scale of the prior, but for a constant that all scales share.
+
+        The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by following
+        directions of negative curvature, which the unbiased matrix has.
+        """
+        prior = precision(scale)
+        linear, total = quadratic.linear + quadratic.noise_linear, quadratic.matrix + quadratic.noise + prior
+        x = self.minimum(total + RIDGE * float(np.diag(total).max()) * np.eye(UNKNOWNS), -linear)
+        sign, log_determinant = np.linalg.slogdet(total)
+        return (
+            float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale))
+            if sign > 0
+            else -np.inf
+        )
