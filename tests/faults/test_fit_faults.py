@@ -114,6 +114,22 @@ def echo(_host: object, number: int) -> int:
     return number
 
 
+def wait_for(_host: object, path: Path) -> str:
+    until = time.monotonic() + PATIENCE_S
+    while not path.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    return "waited" if path.exists() else "in vain"
+
+
+def test_results_are_given_as_tasks_end(client: Client, tmp_path: Path) -> None:
+    run_on = DaskExecutor(client, FAKE, "ends", tmp_path / "never")
+    told = tmp_path / "told"
+    ended = run_on.as_they_end([("late", wait_for, (told,)), ("early", echo, (7,))])
+    assert next(ended) == 7  # though it was the second, and the first waits for this line
+    told.touch()
+    assert list(ended) == ["waited"]
+
+
 def test_tasks_of_one_name_are_not_taken_for_each_other(client: Client) -> None:
     run_on = DaskExecutor(client, FAKE, "names", Path("never"))
     assert run_on.gather([run_on.submit("same", echo, number) for number in range(5)]) == list(range(5))

@@ -21,11 +21,17 @@ from services.core.settings import job_from_tree
 from services.core.slab.folder import SlabFolder
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
+from services.fit.execution.engine_host import InProcessHost
+from services.fit.execution.executors import LocalExecutor
 from services.fit.slab.dictionaries.hg import COSINES
 from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
+from services.fit.slab.options import SlabOptions
+from services.fit.slab.results.kept import IMAGES, Kept, read_kept
+from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 from services.fit.slab.results.tabphase import tabphase_values
+from services.fit.slab.schedule import WavelengthTask, run_wavelengths
 from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
@@ -190,14 +196,99 @@ def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(
     assert again.core_seconds != stored_fits(job)[0]["core_seconds"]
 
 
-def test_a_cancel_ends_the_fit_between_two_blocks(spec: JobSpec, tmp_path: Path) -> None:
-    from services.fit.slab.options import SlabOptions
-    from services.fit.slab.stage import fit_task
-
+@pytest.mark.parametrize("spread", [False, True])
+def test_a_cancel_ends_the_fit_between_two_blocks(spread: bool, spec: JobSpec, tmp_path: Path) -> None:
     assert spec.capture is not None
     (tmp_path / CANCEL_FLAG).touch()
+    task = WavelengthTask(spec.capture, 532.0, SlabOptions(effort=0.05), tmp_path / "532", tmp_path / CANCEL_FLAG)
     with pytest.raises(JobCancelledError):
-        fit_task(None, spec.capture, 532.0, SlabOptions(effort=0.05), tmp_path / "532", tmp_path / CANCEL_FLAG)
+        list(run_wavelengths(ManyThreads() if spread else LocalExecutor(InProcessHost()), [task], workers=1))
+    assert not (tmp_path / "532").exists()
+
+
+class ManyThreads(LocalExecutor):
+    """Says that it has workers for more than a wavelength, and keeps the names of what it ran."""
+
+    def __init__(self) -> None:
+        super().__init__(InProcessHost())
+        self.ran: list[str] = []
+
+    def threads(self, expected: int = 1) -> int:
+        return 8 * expected
+
+    def submit(self, key: str, task: Any, *args: Any) -> Any:
+        self.ran.append(key)
+        return super().submit(key, task, *args)
+
+
+def test_blocks_on_many_workers_give_the_answer_of_one(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    assert spec.capture is not None
+    options, run_on = SlabOptions(seed=spec.seed, effort=spec.effort), ManyThreads()
+    task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
+    assert list(run_wavelengths(run_on, [task], workers=1)) == [task.place]
+    assert len(set(run_on.ran)) == len(run_on.ran) > 100  # each block a task of its own
+    kept = read_kept(task.place)
+    assert kept is not None
+    for name in ("parameters", "phase", "errors"):
+        assert json.loads(getattr(kept.fit, name).model_dump_json()) == stored_fits(job)[0][name]
+
+
+def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: Path) -> None:
+    told = json.loads((folder / "slab.json").read_text())
+    told["pixels"] |= {"columns": 512, "rows": 512}
+    root, run_on = write_folder(tmp_path / "cell", told, np.full((8, 8), 0.01)), ManyThreads()
+    task = WavelengthTask(root, 532.0, SlabOptions(), tmp_path / "532", tmp_path / CANCEL_FLAG)
+    with pytest.raises(CaptureInputError, match="on the folder's grid"):  # as these images are smaller
+        list(run_wavelengths(run_on, [task], workers=1))
+    assert run_on.ran == ["532"]
+
+
+def test_a_wavelength_is_told_before_the_next_one_is_fitted(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = json.loads((folder / "slab.json").read_text())
+    others = [image | {"wavelength_nm": 635.0} for image in told["images"]]
+    root = write_folder(tmp_path / "cell", told | {"wavelengths_nm": [532.0, 635.0], "images": told["images"] + others})
+    order: list[str] = []
+
+    def fit(task: WavelengthTask, _blocks: object) -> Path:
+        order.append(f"fitted {task.wavelength_nm:g}")
+        return task.place
+
+    class Told(LocalContext):
+        def report(self, event: StageEvent) -> None:
+            if event.kind == "progress":
+                order.append(f"told {event.data['wavelength_nm']:g} at {event.done}")
+
+    def kept(place: Path) -> Kept:
+        wavelength_nm = float(place.name)
+        place.mkdir(parents=True, exist_ok=True)
+        (place / IMAGES).touch()
+        fit = stored_like(wavelength_nm)
+        return Kept(of="", fit=fit)
+
+    monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", fit)
+    monkeypatch.setattr("services.fit.slab.results.kept.read_kept", kept)
+    run(JobSpec(kind="slab", capture=root), Told(tmp_path / "job"))
+    assert order == ["fitted 532", "told 532 at 0.5", "fitted 635", "told 635 at 1.0"]
+
+
+def stored_like(wavelength_nm: float) -> SlabFit:
+    """Of a fit that nobody made."""
+    one = Quantity(value=1.0, se=0.1, unit="1/mm", determined=True)
+    parameters = Parameters(sigma_t=one, sigma_s=one, sigma_a=one, sigma_s_reduced=one, g=one, index=one)
+    phase = PhaseFunction(theta_deg=(), value_per_sr=(), se_per_sr=(), determined=())
+    return SlabFit(
+        wavelength_nm=wavelength_nm,
+        parameters=parameters,
+        phase=phase,
+        errors=Errors(fit_error=0.01, held_out_error=None),
+        notes=(),
+        converged=True,
+        steps=1,
+        paths=1,
+        core_seconds=1.0,
+    )
 
 
 def test_a_folder_of_no_slab_is_refused(tmp_path: Path) -> None:
@@ -261,12 +352,16 @@ def test_options_of_a_slab_are_read_again_as_they_were_stored(spec: JobSpec) -> 
 
 
 @pytest.mark.slow
-def test_wavelengths_are_fitted_on_two_workers_as_they_are_on_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("wavelengths_nm", [tuple(TRUTHS), (532.0,)])
+def test_wavelengths_are_fitted_on_two_workers_as_they_are_on_one(
+    wavelengths_nm: tuple[float, ...], tmp_path: Path
+) -> None:
+    # Two wavelengths run on a worker each, and the blocks of a single one on both.
     (cell := tmp_path / "cell").mkdir()
-    write_cell(cell, *TRUTHS)
+    write_cell(cell, *wavelengths_nm)
     asset = run_job(JobSpec(kind="slab", capture=cell, effort=0.02, workers=2), tmp_path / "two")
     assert asset.converged
-    require_truths(tmp_path / "two", *TRUTHS)
+    require_truths(tmp_path / "two", *wavelengths_nm)
     run_job(JobSpec(kind="slab", capture=cell, effort=0.02, workers=1), tmp_path / "one")
     for name in ("parameters.json", "phase.json", "errors.json"):
         assert (tmp_path / "one" / name).read_text() == (tmp_path / "two" / name).read_text()

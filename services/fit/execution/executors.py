@@ -35,6 +35,9 @@ class Executor(Protocol):
     def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
         """Run tasks that wait for no other, and give the result of each as soon as it is there. Raises what a task raised."""
 
+    def threads(self, expected: int = 1) -> int:
+        """How many tasks can run at once, where so many workers were asked for and some may still be starting."""
+
 
 class LocalExecutor:
     """Runs each task when it is submitted, in this process or in a child of it."""
@@ -54,6 +57,10 @@ class LocalExecutor:
         """See Executor; one after the other."""
         for key, task, args in calls:
             yield self.submit(key, task, *args)
+
+    def threads(self, expected: int = 1) -> int:  # noqa: ARG002 - this process is alone
+        """See Executor."""
+        return 1
 
 
 class DaskExecutor:
@@ -107,7 +114,7 @@ class DaskExecutor:
 
     def _ending(self, pending: Sequence[_Planned]) -> Iterator[_Planned]:
         """Tasks as they end; meanwhile those that wait are sent."""
-        most, missing = self._most_at_once(), set(pending)
+        most, missing = TASKS_AHEAD * self.threads(), set(pending)
         while missing:
             while self._waiting and len(self._flying) < most:
                 self._send(self._waiting.popleft())
@@ -135,14 +142,15 @@ class DaskExecutor:
         self._flying[planned.future] = planned
         self._ended.add(planned.future)
 
-    def _most_at_once(self) -> int:
+    def threads(self, expected: int = 1) -> int:
+        """See Executor."""
         able = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        threads = sum(
+        there = sum(
             int(worker["nthreads"])
             for worker in able
             if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items())
         )
-        return TASKS_AHEAD * max(threads, 1)
+        return max(there, expected)
 
 
 @dataclass(eq=False)

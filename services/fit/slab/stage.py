@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.core.errors import CaptureInputError, JobCancelledError
+from services.core.errors import CaptureInputError
 from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
@@ -18,8 +17,6 @@ from services.core.store import StageWriter, open_stage, write_atomic, write_rec
 from services.core.verdict import VERDICT
 
 if TYPE_CHECKING:
-    from services.fit.slab.model.forward import Block, BlockSums
-    from services.fit.slab.options import SlabOptions
     from services.fit.slab.results.result import SlabReport
 
 CHECKPOINT = "fit-checkpoint"
@@ -27,7 +24,7 @@ CHECKPOINT = "fit-checkpoint"
 
 
 def run(spec: JobSpec, context: StageContext) -> SlabReport:
-    """Fit every wavelength, each as a task of its own, and publish ``fit/`` with their images.
+    """Fit every wavelength on the workers, tell of each as it is done, and publish ``fit/`` with their images.
 
     Raises:
         CaptureInputError: the folder cannot be read. JobCancelledError: between two blocks of paths.
@@ -38,6 +35,7 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     from services.fit.slab.options import SlabOptions
     from services.fit.slab.results.kept import IMAGES, read_kept
     from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.schedule import WavelengthTask, run_wavelengths
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
@@ -51,10 +49,10 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     flag = context.root / CANCEL_FLAG
     places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
+    tasks = [WavelengthTask(root, nm, options, place, flag) for nm, place in places.items()]
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
-        calls = [(f"{nm:g}", fit_task, (root, nm, options, place, flag)) for nm, place in places.items()]
-        for number, name in enumerate(run_on.as_they_end(calls), 1):
-            kept = read_kept(context.root / CHECKPOINT / name)
+        for number, place in enumerate(run_wavelengths(run_on, tasks, spec.workers), 1):
+            kept = read_kept(place)
             assert kept is not None
             which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}
             done = number / len(places)
@@ -71,27 +69,6 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     data = {VERDICT: verdict.model_dump(mode="json")}
     context.report(StageEvent(stage="fit", kind="finished", done=1.0, message=verdict.headline, data=data))
     return report
-
-
-def fit_task(_host: Any, root: Path, wavelength_nm: float, options: SlabOptions, place: Path, flag: Path) -> str:
-    """Fit one wavelength into a folder, unless an earlier attempt has; returns the folder's name.
-
-    Raises:
-        JobCancelledError: ``flag`` exists.
-    """
-    from services.fit.slab.dictionaries.chosen import dictionary_of
-    from services.fit.slab.fit import fit_images
-    from services.fit.slab.images import read_images
-    from services.fit.slab.results.kept import fingerprint, keep, read_kept
-
-    mark = fingerprint(root, wavelength_nm, options)
-    kept = read_kept(place)
-    if kept is None or kept.of != mark:
-        folder = read_folder(root)
-        measured = read_images(root, folder, wavelength_nm)
-        dictionary = dictionary_of(root, folder, wavelength_nm, options)
-        keep(place, mark, fit_images(folder, wavelength_nm, measured, options, _cancellable(flag), dictionary))
-    return place.name
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
@@ -150,16 +127,6 @@ def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
             f"{spec.capture} holds no slab.json, which a job of kind slab is fitted from; check option 'capture'."
         )
     return spec.capture, read_folder(spec.capture)
-
-
-def _cancellable(flag: Path) -> Callable[[Callable[[Block], BlockSums], Sequence[Block]], Iterator[BlockSums]]:
-    def blocks(task: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
-        for block in some:
-            if flag.exists():
-                raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
-            yield task(block)
-
-    return blocks
 
 
 def _told(fit: Any) -> str:

@@ -1,0 +1,109 @@
+"""Where a slab's work runs: whole wavelengths on a worker each, or the blocks of paths of one wavelength on all workers."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from services.core.errors import JobCancelledError
+from services.core.slab.folder import SlabFolder, read_folder
+from services.fit.execution.executors import Executor
+from services.fit.slab.dictionaries.chosen import dictionary_of
+from services.fit.slab.fit import fit_images
+from services.fit.slab.images import read_images
+from services.fit.slab.model.dictionary import KNOTS
+from services.fit.slab.model.forward import Block, Blocks, BlockSums
+from services.fit.slab.options import SlabOptions
+from services.fit.slab.results.kept import fingerprint, keep, read_kept
+
+MOST_TRAVELLING_BYTES = 32 * 2**20
+"""Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones stay where they are."""
+
+
+@dataclass(frozen=True)
+class WavelengthTask:
+    """One wavelength of a job."""
+
+    root: Path
+    wavelength_nm: float
+    options: SlabOptions
+    place: Path
+    """Folder in which its result is kept."""
+    flag: Path
+    """The job is cancelled once it exists."""
+
+
+def run_wavelengths(run_on: Executor, tasks: Sequence[WavelengthTask], workers: int) -> Iterator[Path]:
+    """Fit wavelengths, unless an earlier attempt has; gives the folder of each as soon as it is done.
+
+    With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other here, and
+    its blocks on all workers. A block's sums depend on what names it alone and are added in the order of the blocks, so the
+    answer is the same to the last digit.
+
+    Args:
+        workers: that the job asked for; some may still be starting.
+
+    Raises:
+        JobCancelledError: between two blocks of paths.
+    """
+    if len(tasks) >= run_on.threads(workers) or not all(_may_travel(read_folder(task.root)) for task in tasks):
+        yield from run_on.as_they_end([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
+        return
+    for task in tasks:
+        yield fit_wavelength(task, _spread(run_on, task))
+
+
+def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
+    """A whole wavelength, one block after the other."""
+
+    def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
+        for block in some:
+            _raise_if_cancelled(task.flag)
+            yield trace(block)
+
+    return fit_wavelength(task, blocks)
+
+
+def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, flag: Path) -> BlockSums:
+    """One block of paths."""
+    _raise_if_cancelled(flag)
+    return trace(block)
+
+
+def fit_wavelength(task: WavelengthTask, blocks: Blocks) -> Path:
+    """Fit one wavelength into its folder, unless an earlier attempt has."""
+    mark = fingerprint(task.root, task.wavelength_nm, task.options)
+    kept = read_kept(task.place)
+    if kept is None or kept.of != mark:
+        folder = read_folder(task.root)
+        measured = read_images(task.root, folder, task.wavelength_nm)
+        dictionary = dictionary_of(task.root, folder, task.wavelength_nm, task.options)
+        keep(task.place, mark, fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary))
+    return task.place
+
+
+def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
+    """Blocks on all workers, their sums in the order of the blocks."""
+    numbers = itertools.count()
+
+    def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:
+        _raise_if_cancelled(task.flag)
+        name = f"{task.wavelength_nm:g}-{next(numbers)}"
+        pending = [run_on.submit(f"{name}-{k}", block_task, trace, block, task.flag) for k, block in enumerate(some)]
+        return run_on.gather(pending)
+
+    return blocks
+
+
+def _may_travel(folder: SlabFolder) -> bool:
+    """Whether a block's sums are small enough to leave their worker."""
+    values = len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (KNOTS + 2)
+    return 8 * values <= MOST_TRAVELLING_BYTES
+
+
+def _raise_if_cancelled(flag: Path) -> None:
+    if flag.exists():
+        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
