@@ -19,7 +19,7 @@ class Estimate(Record):
     se_parts: dict[str, float] = Field(
         default={},
         description="what the standard error is made of, largest first; the squares add up to its square. photographs: "
-        "their noise; rendering: that of renders; gain, light_gain, flare: the calibration's; prior: that of media and "
+        "their noise; rendering: that of renders; gain, light_gain, flare, teeth, dome: the calibration's; prior: that of media and "
         "shapes; mean_cosine: one that is held; unfinished: the step that was left",
     )
 

@@ -15,6 +15,7 @@ from services.core.records import JobSpec, PreparedManifest
 from services.core.results import Estimate, FitReport
 from services.core.stage import LocalContext
 from services.core.store import MANIFEST
+from services.core.uncertainty import TWIST
 from services.fit.inputs.observations import Observations, ViewStack, read_channel
 from services.fit.stage import export, run
 from tests.support.prepared import TRUTH, write_prepared
@@ -77,7 +78,7 @@ def test_every_error_says_what_it_is_made_of(brighter: tuple[Path, FitReport]) -
     parts = report.parameters["green"]["enamel.sigma_a"].se_parts
     assert parts["gain"] > 0
     assert parts["photographs"] > 0
-    assert report.assumed == ("gain", "light_gain", "flare")
+    assert report.assumed == ("gain", "light_gain", "flare", "teeth", "dome")
     assert report.instrument_told[0].startswith("Assumed, as the calibration does not state")
 
 
@@ -94,7 +95,8 @@ def test_a_stated_calibration_takes_the_place_of_what_is_assumed(tmp_path: Path)
     write_prepared(tmp_path)
     manifest = tmp_path / "prepared" / MANIFEST
     stored = json.loads(manifest.read_text())
-    names = ["gain.green", *(f"light_gain.l{k}" for k in range(6)), "flare.c0.green", "flare.c1.green"]
+    moves = [f"{thing}.{axis}" for thing in ("teeth", "dome") for axis in TWIST]
+    names = ["gain.green", *(f"light_gain.l{k}" for k in range(6)), "flare.c0.green", "flare.c1.green", *moves]
     stated = {"names": names, "covariance": np.diag([1e-6] * len(names)).tolist()}
     stored["record"]["uncertainty"] = stated
     assert PreparedManifest.model_validate(stored["record"]).uncertainty is not None

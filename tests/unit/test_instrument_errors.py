@@ -15,18 +15,19 @@ from services.core.geometry import Light
 from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.core.uncertainty import CalibrationUncertainty
-from services.fit.execution.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
 from services.fit.instrument.columns import columns, taken
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, errors_of
-from services.fit.instrument.told import instrument_told
+from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
+from services.fit.instrument.told import assumed_kinds, instrument_told
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.solve.covariance import estimates, instrument_estimates, uncertainty
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import normal_equations
-from services.fit.transport.scene.recipe import View
-from tests.support.prepared import camera
+from services.fit.transport.scene.recipe import View, single_tooth
+from tests.support.prepared import camera, sphere
 
 NAMES = ("gain.green", "light_gain.a", "light_gain.b", "flare.c0.green")
 ERRORS = InstrumentErrors(NAMES, tuple(map(tuple, np.diag([1e-4, 1e-4, 4e-4, 9e-6]).tolist())))
@@ -185,13 +186,47 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     spec = JobSpec.model_validate({"capture": "c"})
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), None)}
     found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
-    (assumed,) = instrument_told(spec, errors, found)
+    kinds = assumed_kinds(errors, None)
+    assert kinds == ("gain", "light_gain", "flare", "teeth", "dome")
+    (assumed,) = instrument_told(spec, errors, found, kinds)
     assert assumed.startswith("Assumed, as the calibration does not state")
-    assert "1 % for the gain, 1 % for each light and 0.3 % for flare" in assumed
+    assert "1 % for the gain, 1 % for each light, 0.3 % for flare, 0.05 mm and 0.1° for where the scan lies" in assumed
     found["green"]["light_gain.b"] = -0.05
-    _, fault = instrument_told(spec, errors, found)
+    _, fault = instrument_told(spec, errors, found, kinds)
     assert fault.startswith("In green the images put light_gain.b off by -5.0 %, 5.0 times its ± of 1 %")
     off = spec.model_copy(update={"instrument": "off"})
-    assert instrument_told(off, {"green": InstrumentErrors()}, {})[0].startswith(
+    assert instrument_told(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(
         "The ± take the instrument for perfect"
     )
+
+
+def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path: Path) -> None:
+    ball, lights = sphere(4.0), np.array([[100.0, 300.0, -700.0], [-200.0, 100.0, -600.0]])
+    recipe = single_tooth(ball, None, lights, np.array([1.0, 2.0]))
+    covariance, assumed = move_covariance(None)
+    assert assumed == ("teeth", "dome")
+    moves = write_moves(tmp_path, recipe, covariance, lights.mean(axis=0))
+    assert sorted(move.thing for move in moves) == ["dome"] * 6 + ["teeth"] * 6
+    assert len(by_scene(moves)) == 1
+    stored = read_recipe(moves[0].recipe)
+    np.testing.assert_allclose(stored.light_positions_mm[:2], lights)
+    points, twist = ball.vertices_mm[:5], np.zeros(6)
+    for move in moves:
+        moved = stored.light_positions_mm[move.first : move.first + 2]
+        seen, depth = move.seen_by(camera("c0")).project(points)
+        if move.thing == "dome":
+            np.testing.assert_allclose(seen, camera("c0").project(points)[0], atol=1e-9)
+            continue
+        # Where the moved tooth's points appear, and how far they are from the lights.
+        back = np.array(move.camera_move)
+        there = points @ back[:3, :3].T + back[:3, 3]
+        np.testing.assert_allclose(seen, camera("c0").project(there)[0], atol=1e-9)
+        away, expected = (np.linalg.norm(a[:, None] - b, axis=2) for a, b in ((points, moved), (there, lights)))
+        np.testing.assert_allclose(away, expected, rtol=1e-12)
+        assert (depth > 0).all()
+    twist[3] = 2 * 0.05
+    assert any(
+        np.allclose(move.camera_move, rigid(sign * twist, np.zeros(3)), atol=1e-6) for move in moves for sign in (1, -1)
+    )
+    stated = CalibrationUncertainty(names=("dome.tx",), covariance=((0.25,),))
+    assert move_covariance(stated)[0][9, 9] == 0.25

@@ -274,10 +274,12 @@ class Stages(ABC, Generic[Optics]):
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             return problem, solution, uncertainty(domain, x, equations)
-        known = whitening(domain, equations)
+        known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
-            sums = measure_closing(problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1))
+            sums = measure_closing(
+                problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1), moves
+            )
             return {
                 "sums": sums.record(),
                 "step": last_step(
@@ -288,7 +290,9 @@ class Stages(ABC, Generic[Optics]):
         self.pause()
         entry, _ = self.journal.once(f"{self.scope}/closing", compute)
         step = np.array(entry["step"])
-        measured = uncertainty(domain, x + step, equations, ClosingSums.of(entry["sums"]), step)
+        measured = uncertainty(
+            domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.thing for m in moves]
+        )
         return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 
     def _solve(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.instrument.columns import columns, taken
+from services.fit.instrument.moves import Move, by_scene, moves_task
 from services.fit.optics.domain import Domain, similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, closing_sums
@@ -22,17 +24,22 @@ Array = NDArray[np.float64]
 Held = Mapping[tuple[str, ...], tuple[float, float]]
 """Media whose mean cosine was held and may be wrong alike, with the mean and standard deviation of its prior in the unbounded domain."""
 
+MOVE_SAMPLES = 4
+"""Images of moved scans and domes have so many times fewer paths than the rest: there are thirteen."""
 SHIFT_SAMPLES = 2
 """Images of changed media have so many times fewer paths: they enter a variance, not the answer."""
 
 
-def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held: Held, samples: int) -> ClosingSums:
+def measure_closing(
+    problem: StackProblem[Optics], x: Array, whiten: Array, held: Held, samples: int, moves: Sequence[Move] = ()
+) -> ClosingSums:
     """Sums at x, in block order.
 
     Args:
         whiten: T (F, F), x = T y.
         held: each entry costs four images.
         samples: paths per pixel and seed.
+        moves: of scan and dome; each costs two images, and their changes follow those of what is held.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
     tissue, similar, how = problem.jacobian_media(x)
@@ -43,16 +50,37 @@ def measure_closing(problem: StackProblem[Optics], x: Array, whiten: Array, held
         (_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd))
         for parts, (mean, sd) in held.items()
     )
-    pending = []
-    for task in problem.passes_at(x).tasks(label, tissue, samples):
-        arguments = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
-        pending.append(run.submit(f"{label}-{task.index}", closing_task, task, *arguments))
+    tasks = problem.passes_at(x).tasks(label, tissue, samples)
+    changes = _changes_by_moves(problem, tasks, moves, label)
+    common = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
+    pending = [
+        run.submit(f"{label}-{task.index}", closing_task, task, *common, *own)
+        for task, own in zip(tasks, changes, strict=True)
+    ]
     parts: list[tuple[ClosingSums, TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts])
     total = parts[0][0]
     for sums, _ in parts[1:]:
         total = total + sums
     return total
+
+
+def _changes_by_moves(
+    problem: StackProblem[Optics], tasks: Sequence[BlockTask], moves: Sequence[Move], label: str
+) -> list[list[Any]]:
+    # By block and scene, what ``moves_task`` gives. All blocks of one scene before the next, as a worker keeps few scenes.
+    seeds = problem.seed(0, "closing-moves-1"), problem.seed(0, "closing-moves-2")
+    few = [replace(task, samples=max(task.samples // MOVE_SAMPLES, 1)) for task in tasks]
+    by_moves = [
+        [
+            problem.passes.executor.submit(
+                f"{label}-moves-{number}-{one.index}", moves_task, one, one.tissue, scene, seeds
+            )
+            for one in few
+        ]
+        for number, scene in enumerate(by_scene(moves))
+    ]
+    return [[scene[k] for scene in by_moves] for k in range(len(few))]
 
 
 def closing_task(
@@ -67,8 +95,12 @@ def closing_task(
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
+    *changes: NDArray[np.float32],
 ) -> tuple[ClosingSums, TraceRow]:
-    """One block's share. Rows of ``slopes`` that are ``borrowed`` are those of the similar media's Jacobian instead."""
+    """One block's share, with the changes by moves (K, 2, L, N) of each scene.
+
+    Rows of ``slopes`` that are ``borrowed`` are those of the similar media's Jacobian instead.
+    """
     start, block = time.time(), read_block(task.block)
     view, errors = block.fitted_view, dict(task.errors)
 
@@ -79,6 +111,7 @@ def closing_task(
 
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
     few = max(task.samples // SHIFT_SAMPLES, 1)
+    size = renders[0].size
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
 
     def derivatives(of: Differentiation, of_task: BlockTask, pair: tuple[int, int]) -> list[Array]:
@@ -97,7 +130,7 @@ def closing_task(
         (exact[0], exact[1]),
         borrowed,
         (residual(renders[0]), residual(renders[1])),
-        np.array(moved).reshape(len(ends), 2, renders[0].size),
+        np.concatenate([np.array(moved).reshape(len(ends), 2, size), *(one.reshape(-1, 2, size) for one in changes)]),
         block.fit_weight.reshape(-1),
         len(block.reference),
         len(slopes.errors),

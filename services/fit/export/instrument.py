@@ -15,6 +15,8 @@ SOURCES = {
     "gain": "gain",
     "light_gain": "lights",
     "flare": "flare",
+    "teeth": "scan",
+    "dome": "dome",
     "prior": "prior",
     "mean_cosine": "mean cosine",
     "unfinished": "unfinished",

@@ -18,6 +18,7 @@ from services.core.store import StoredArray, open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
 from services.fit.instrument.capture import Instrument
 from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
+from services.fit.instrument.moves import Move
 from services.fit.solve.losses import first_weights
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
@@ -114,6 +115,8 @@ class ChannelFiles:
     """Signal-to-noise power over fitted measurements."""
     errors: InstrumentErrors = NO_ERRORS
     """Of the instrument, those that act on what is fitted."""
+    moves: tuple[Move, ...] = ()
+    """Of scan and dome, which the ± consider."""
 
     @property
     def blocks(self) -> tuple[StoredFile, ...]:
@@ -299,13 +302,12 @@ def write_channel(
     brightest = {v.camera.name: float(np.where(v.valid, v.reference, 0.0).max(initial=0.0)) for v in views}
     seeing = [v.camera.name for v, f in zip(views, fitted, strict=True) if f.any()]
 
-    def recipe(lights: NDArray[np.bool_]) -> StoredFile:
-        chosen = replace(
+    def under(lights: NDArray[np.bool_]) -> SceneRecipe:
+        return replace(
             scene,
             light_positions_mm=scene.light_positions_mm[lights],
             light_intensities=scene.light_intensities[lights],
         )
-        return write_recipe(folder, chosen)
 
     def block(view: ViewStack, weight: Array, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
         cut = np.ix_(np.flatnonzero(lights), pixels)
@@ -343,7 +345,7 @@ def write_channel(
     few = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
     return ChannelFiles(
         channel=channel,
-        recipe=recipe(used),
+        recipe=write_recipe(folder, under(used)),
         coarse=level(coarse_pixels),
         full=level(None),
         search_blocks=tuple(
@@ -351,10 +353,11 @@ def write_channel(
             for view, weight, pixels in zip(views, weights, few, strict=True)
             if len(pixels)
         ),
-        evaluation_recipe=recipe(seen),
+        evaluation_recipe=write_recipe(folder, under(seen)),
         weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),
         errors=NO_ERRORS if instrument is None else instrument.errors(channel, seeing, used),
+        moves=() if instrument is None else instrument.moves(folder, under(used)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from services.core.records import JobSpec, PreparedManifest
 from services.core.uncertainty import CalibrationUncertainty
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
+from services.fit.instrument.moves import Move, move_covariance, write_moves
+from services.fit.transport.scene.recipe import SceneRecipe
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,12 @@ class Instrument:
     lights: tuple[str, ...]
     """Names, in the order of the views' images."""
     stated: CalibrationUncertainty | None
+    dome_centre_mm: tuple[float, ...]
+    """Mean position of all lights."""
+
+    def moves(self, folder: Path, recipe: SceneRecipe) -> tuple[Move, ...]:
+        """Moves of scan and dome under the lights of a recipe, with their scenes."""
+        return write_moves(folder, recipe, move_covariance(self.stated)[0], np.array(self.dome_centre_mm))
 
     def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
         """Those of a channel that act on the fitted photographs of some cameras under the lights (L,) that are used."""
@@ -43,4 +52,6 @@ def instrument_of(manifest: PreparedManifest, spec: JobSpec) -> Instrument | Non
     """What is known of the instrument; None where the job takes it for perfect, and for jaws and the solver adam, which do not know it."""
     if spec.instrument == "off" or spec.kind != "tooth" or spec.solver == "adam":
         return None
-    return Instrument(tuple(light.name for light in manifest.lights), manifest.uncertainty)
+    positions = np.array([light.position_mm for light in manifest.lights])
+    names = tuple(light.name for light in manifest.lights)
+    return Instrument(names, manifest.uncertainty, tuple(positions.mean(axis=0).tolist()))

@@ -22,6 +22,11 @@ DEFAULT_SE: Mapping[str, float] = MappingProxyType({"gain": 0.01, "light_gain": 
 """One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest valid pixel in that channel.
 A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens shade leaves about 0.3 % of veiling glare."""
 KINDS = tuple(DEFAULT_SE)
+_DEGREE = 0.0174532925
+DEFAULT_MOVE_SE: Mapping[str, tuple[float, ...]] = MappingProxyType(
+    {"teeth": (0.1 * _DEGREE,) * 3 + (0.05,) * 3, "dome": (0.1 * _DEGREE,) * 3 + (2.0,) * 3}
+)
+"""One standard error of rotations (rad) and translations (mm) of the scan and of the dome: what registration reaches at best, and what a tape measure does."""
 LINEAR_REACH = 0.1
 """Length over which images count as linear in an error, for step lengths; they are exactly linear."""
 

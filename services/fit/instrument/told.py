@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from services.core.records import JobSpec
+from services.core.uncertainty import CalibrationUncertainty
 from services.fit.instrument.errors import DEFAULT_SE, KINDS, InstrumentErrors, kind_of_error
+from services.fit.instrument.moves import move_covariance
 
 FAULT = 3.0
 """An error that the images move by more than so many of its ± before the fit is told as a fault: 1 good one in 370 is."""
-WORDS = {"gain": "the gain", "light_gain": "each light", "flare": "flare"}
+SIZES = {
+    "gain": f"{100 * DEFAULT_SE['gain']:g} % for the gain",
+    "light_gain": f"{100 * DEFAULT_SE['light_gain']:g} % for each light",
+    "flare": f"{100 * DEFAULT_SE['flare']:g} % for flare",
+    "teeth": "0.05 mm and 0.1° for where the scan lies",
+    "dome": "2 mm and 0.1° for where the dome stands",
+}
 REMEDY = {
     "gain": "measure the gain again on the white sphere",
     "light_gain": "check that light, its cable and its name, and measure it again",
@@ -17,18 +25,23 @@ REMEDY = {
 }
 
 
-def assumed_kinds(errors: Mapping[str, InstrumentErrors]) -> tuple[str, ...]:
-    """Kinds of which some error took its default, over all channels."""
+def assumed_kinds(errors: Mapping[str, InstrumentErrors], stated: CalibrationUncertainty | None) -> tuple[str, ...]:
+    """Kinds of which some error took its default, over all channels, and what moves as one; none where no error counts."""
     found = {kind_of_error(name) for own in errors.values() for name in own.assumed}
-    return tuple(kind for kind in KINDS if kind in found)
+    moved = move_covariance(stated)[1] if any(own.names for own in errors.values()) else ()
+    return (*(kind for kind in KINDS if kind in found), *moved)
 
 
 def instrument_told(
-    spec: JobSpec, errors: Mapping[str, InstrumentErrors], found: Mapping[str, Mapping[str, float]]
+    spec: JobSpec,
+    errors: Mapping[str, InstrumentErrors],
+    found: Mapping[str, Mapping[str, float]],
+    assumed: tuple[str, ...],
 ) -> tuple[str, ...]:
     """One sentence each, what was assumed first.
 
     Args:
+        assumed: kinds, as ``assumed_kinds`` gives them.
         errors: by channel, as they were known before the fit.
         found: by channel and name, what the images make of them.
     """
@@ -39,12 +52,17 @@ def instrument_told(
     if not any(own.names for own in errors.values()):
         whose = "a jaw" if spec.kind == "jaw" else f"the solver {spec.solver}"
         return (f"The ± take the instrument for perfect: a fit of {whose} does not know its gain, lights and flare.",)
-    return (*_assumed(assumed_kinds(errors)), *_faults(errors, found))
+    unmoved = (
+        ("The ± of a fit with two lobes take the scan and the dome to lie where the calibration says.",)
+        if spec.lobes == 2
+        else ()
+    )
+    return (*_assumed(assumed), *unmoved, *_faults(errors, found))
 
 
 def _assumed(kinds: tuple[str, ...]) -> Iterator[str]:
     if kinds:
-        sizes = [f"{100 * DEFAULT_SE[kind]:g} % for {WORDS[kind]}" for kind in kinds]
+        sizes = [SIZES[kind] for kind in kinds]
         listed = sizes[0] if len(sizes) == 1 else f"{', '.join(sizes[:-1])} and {sizes[-1]}"
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "

@@ -11,6 +11,7 @@ and noise v, E tau^2 / (tau^2 + v) (Efron and Morris 1973), tau^2 such that sum 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -58,10 +59,14 @@ class ClosingSums:
     @property
     def shift_covariance(self) -> Array:
         """Covariance (F, F) of the gradient by the changes, sum of b b', each shortened to the length that it has without noise."""
+        return self.shifts_of(range(len(self.shifts)))
+
+    def shifts_of(self, chosen: Iterable[int]) -> Array:
+        """The same of some of the changes alone."""
         total = np.zeros_like(self.response)
-        for shift, noise in zip(self.shifts, self.shift_noise, strict=True):
-            square = float(shift @ shift)
-            total += max(0.0, 1 - float(np.trace(noise)) / max(square, 1e-300)) * np.outer(shift, shift)
+        for k in chosen:
+            shift, square = self.shifts[k], float(self.shifts[k] @ self.shifts[k])
+            total += max(0.0, 1 - float(np.trace(self.shift_noise[k])) / max(square, 1e-300)) * np.outer(shift, shift)
         return total
 
 

@@ -16,7 +16,7 @@ r        what is left of the step to the minimum, where the fit ended short of i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from types import MappingProxyType
@@ -229,13 +229,19 @@ def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: Cl
 
 
 def uncertainty(
-    domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums | None = None, step: Array | None = None
+    domain: Domain,
+    x: Array,
+    equations: NormalEquations,
+    sums: ClosingSums | None = None,
+    step: Array | None = None,
+    moved: Sequence[str] = (),
 ) -> Uncertainty:
     """Uncertainty at a solution from the normal equations there.
 
     Args:
         sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where Jacobians are the images' own.
         step: what the fit moved after it.
+        moved: what the last of the closing measurement's changes are of, ``teeth`` or ``dome`` each; the others are of held mean cosines.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     known = whitening(domain, equations)
@@ -249,15 +255,19 @@ def uncertainty(
         meat = meat + parts["rendering"]
         left = t.T @ (equations.gradient + domain.prior_slope(x))
     else:
-        solved, moved = (
+        solved, gone = (
             response(sums, prior, domain.relation, len(domain.errors.names)),
             np.linalg.solve(t, np.zeros(count) if step is None else step),
         )
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
-        rendered, unsure = _positive(pooled.noise), np.diag(solved.variance @ (moved + pooled.carried) ** 2)
-        parts |= {"rendering": rendered + unsure, "mean_cosine": sums.shift_covariance}
+        rendered, unsure = _positive(pooled.noise), np.diag(solved.variance @ (gone + pooled.carried) ** 2)
+        kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
+        parts |= {"rendering": rendered + unsure}
+        parts |= {
+            kind: sums.shifts_of(k for k, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds)
+        }
         meat = meat + rendered + sums.shift_covariance + unsure
-        left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, moved) - prior @ moved
+        left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, gone) - prior @ gone
 
     # What is left of the step counts as error along what is not open.
     rest = t @ inverse @ left / domain.scale

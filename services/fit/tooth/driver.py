@@ -157,6 +157,7 @@ class FitDriver:
         correlations = {c: correlation(known[c]) for c in fits}
         errors = {c: known[c].domain.errors for c in fits}
         instrument = {c: found for c in fits if (found := instrument_estimates(known[c]))}
+        assumed = assumed_kinds(errors, observations.manifest.uncertainty)
         values = {c: {name: one.value for name, one in found.items()} for c, found in instrument.items()}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
@@ -177,8 +178,8 @@ class FitDriver:
             correlations=correlations,
             instrument=instrument,
             instrument_prior={c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in instrument},
-            assumed=assumed_kinds(errors),
-            instrument_told=instrument_told(self.attempt.spec, errors, values),
+            assumed=assumed,
+            instrument_told=instrument_told(self.attempt.spec, errors, values, assumed),
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )

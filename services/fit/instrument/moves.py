@@ -1,0 +1,130 @@
+"""Moves of the scan and of the dome as one: what they do to images enters the ±, and no fit moves them.
+
+Images of a moved tooth need many paths: 0.05 mm move an image by 2 %, and two images of 256 paths differ by as much by chance. As coordinates such moves
+would follow that noise. So they are considered and not estimated (Schmidt 1966): each changes the photographs by one standard deviation of its own, and
+the answer with them.
+
+A tooth that moves by T under cameras and lights that stay is a tooth that stays under cameras and lights that move by T^-1, so no surface is built again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.geometry import Camera
+from services.core.uncertainty import TWIST, CalibrationUncertainty
+from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_recipe
+from services.fit.execution.engine_host import EngineHost
+from services.fit.instrument.errors import DEFAULT_MOVE_SE
+from services.fit.optics.parameters import Mouth, Tissue
+from services.fit.transport.scene.recipe import SceneRecipe, View
+
+Array = NDArray[np.float64]
+
+MOVED = tuple(DEFAULT_MOVE_SE)
+"""What moves as one: ``teeth`` and ``dome``."""
+REACH = 2.0
+"""Standard deviations between the two images of a difference: wider is quieter, and images of 0.1 mm or 4 mm apart are still about linear."""
+MAX_LIGHTS = 80
+"""Of one scene, which holds the lights where they are and as several moves have them; more would cost memory for their maps."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """One standard deviation of a move, as lights and cameras see it."""
+
+    thing: str
+    """``teeth`` or ``dome``."""
+    recipe: StoredFile
+    """The scene whose first lights are where they are said to be, and which has them again where the move puts them."""
+    first: int
+    """Index of the first moved light."""
+    camera_move: tuple[tuple[float, ...], ...]
+    """4 x 4, multiplies camera_from_world from the right."""
+
+    def seen_by(self, camera: Camera) -> Camera:
+        """The camera as the move puts it."""
+        pose = np.asarray(camera.camera_from_world) @ np.array(self.camera_move)
+        return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, pose.tolist()))})
+
+
+def rigid(twist: Array, centre_mm: Array) -> Array:
+    """The move (4, 4) by a rotation vector (rad) and a translation (mm) about a centre; Rodrigues' formula."""
+    angle = float(np.linalg.norm(twist[:3]))
+    x, y, z = twist[:3] / angle if angle > 0 else np.zeros(3)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    move = np.eye(4)
+    move[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    move[:3, 3] = centre_mm + twist[3:] - move[:3, :3] @ centre_mm
+    return move
+
+
+def move_covariance(stated: CalibrationUncertainty | None) -> tuple[Array, tuple[str, ...]]:
+    """Covariance (12, 12) of the moves of teeth and dome, and the things of which some part took its default."""
+    names = [f"{thing}.{axis}" for thing in MOVED for axis in TWIST]
+    covariance = np.diag([se**2 for thing in MOVED for se in DEFAULT_MOVE_SE[thing]])
+    own = [name for name in names if stated is not None and name in stated.names]
+    if stated is not None:
+        here, there = [names.index(name) for name in own], [stated.names.index(name) for name in own]
+        covariance[np.ix_(here, here)] = stated.matrix[np.ix_(there, there)]
+    assumed = {name.partition(".")[0] for name in names if name not in own}
+    return covariance, tuple(thing for thing in MOVED if thing in assumed)
+
+
+def write_moves(folder: Path, recipe: SceneRecipe, covariance: Array, dome_centre_mm: Array) -> tuple[Move, ...]:
+    """Independent moves whose covariances add up to the whole, with their scenes."""
+    teeth_centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in recipe.teeth]).mean(axis=0)
+    lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array]]()
+    values, vectors = np.linalg.eigh(covariance)
+    for value, vector in zip(values, vectors.T, strict=True):
+        twist = REACH * np.sqrt(max(value, 0.0)) * vector
+        thing = MOVED[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
+        back = np.linalg.inv(rigid(twist[:6], teeth_centre_mm))
+        both = back @ rigid(twist[6:], dome_centre_mm)
+        moves.append((thing, lights @ both[:3, :3].T + both[:3, 3], np.linalg.inv(back)))
+    found, count = list[Move](), max(MAX_LIGHTS // len(lights) - 1, 1)
+    for start in range(0, len(moves), count):
+        part = moves[start : start + count]
+        positions = np.concatenate([lights, *(moved for _, moved, _ in part)])
+        intensities = np.tile(recipe.light_intensities, len(part) + 1)
+        stored = write_recipe(folder, replace(recipe, light_positions_mm=positions, light_intensities=intensities))
+        found += [
+            Move(thing, stored, (k + 1) * len(lights), tuple(map(tuple, camera.tolist())))
+            for k, (thing, _, camera) in enumerate(part)
+        ]
+    return tuple(found)
+
+
+def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
+    """Moves that share a scene, in order."""
+    scenes = dict.fromkeys(move.recipe.digest for move in moves)
+    return tuple(tuple(move for move in moves if move.recipe.digest == digest) for digest in scenes)
+
+
+def moves_task(
+    host: EngineHost, task: BlockTask, tissue: Tissue | Mouth, moves: tuple[Move, ...], seeds: tuple[int, int]
+) -> NDArray[np.float32]:
+    """By how much moves of one scene, of one standard deviation each, change a block's images: (K, 2, L, N) by move and seed."""
+    block = read_block(task.block)
+    view, count = block.fitted_view, len(block.reference)
+    lit = view.lights if view.lights is not None else tuple(range(count))
+
+    def image(recipe: StoredFile, camera: Camera, first: int, seed: int) -> Array:
+        chosen = View(camera, view.pixels, tuple(first + light for light in lit))
+        stack = host.call("images", recipe, tissue, chosen, samples=task.samples, seed=seed)
+        return np.asarray(stack.mean[first : first + count], dtype=np.float64)
+
+    base = [image(moves[0].recipe, view.camera, 0, seed) for seed in seeds]
+    changes = [
+        [
+            image(move.recipe, move.seen_by(view.camera), move.first, seed) - still
+            for seed, still in zip(seeds, base, strict=True)
+        ]
+        for move in moves
+    ]
+    return (np.array(changes) / REACH).astype(np.float32)
