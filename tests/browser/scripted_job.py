@@ -43,7 +43,13 @@ class ScriptedJob:
             log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message=message, data=data))
             export = log.begin_stage("export")
             table = {
-                "enamel.sigma": Estimate(value=4.0321, se=0.0512, unit="1/mm", determined=True),
+                "enamel.sigma": Estimate(
+                    value=4.0321,
+                    se=0.0512,
+                    unit="1/mm",
+                    determined=True,
+                    se_parts={"gain": 0.04, "photographs": 0.0316, "rendering": 0.004},
+                ),
                 "dentin.g1": Estimate(value=0.41, se=0.9, unit="1", determined=False),
             }
             (folder / "parameters.json").write_text(

@@ -94,6 +94,10 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     job.steps.release()
     expect(page.locator(".job .badge")).to_have_text("succeeded")
     expect(page.locator("tr", has_text="enamel.sigma").first).to_contain_text("4.032 ± 0.051")
+    # Shares of the square, 0.04² of it by the gain; what is less than a twentieth is left out.
+    expect(page.locator("tr", has_text="enamel.sigma").first.locator(".sources").first).to_have_text(
+        "gain 61 %, photographs 38 %"
+    )
     expect(page.locator("tr", has_text="dentin.g1").first).to_contain_text("not determined")
     expect(page.get_by_role("link", name="report.html")).to_be_visible()
     expect(page.get_by_role("link", name="Open the report")).to_be_visible()
