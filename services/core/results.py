@@ -101,7 +101,7 @@ class FitReport(Record):
     notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
     next_capture: str = Field(
         default="",
-        description="in plain words, which further light or view would help most; empty where none was looked for",
+        description="in plain words, which further light, view or measurement of the instrument would help most; empty where none was looked for",
     )
     seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
 

@@ -15,6 +15,7 @@ from services.core.geometry import Light
 from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.core.uncertainty import CalibrationUncertainty
+from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
 from services.fit.instrument.columns import columns, taken
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, errors_of
@@ -230,3 +231,27 @@ def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path
     )
     stated = CalibrationUncertainty(names=("dome.tx",), covariance=((0.25,),))
     assert move_covariance(stated)[0][9, 9] == 0.25
+
+
+def test_knowing_an_error_better_beforehand_is_worth_what_a_fit_with_that_prior_would_say() -> None:
+    found = equations(np.random.default_rng(8))
+    known = uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), found)
+    better = np.diag([0.25e-4, 1e-4, 4e-4, 9e-6])
+    errors = InstrumentErrors(NAMES, tuple(map(tuple, better.tolist())))
+    domain = Domain(DOMAIN.coordinates, errors)
+    expected = uncertainty(domain, domain.x_of(TISSUE), found).covariance
+    np.testing.assert_allclose(covariance_if_known(known, "gain"), expected, rtol=1e-6, atol=1e-15)
+
+
+def test_says_which_measurement_of_the_instrument_would_help_most() -> None:
+    # One measurement that a gain alone keeps from telling the extinction: half the gain's ± is half of everything.
+    extinction, gain = Coordinate(("enamel.sigma",)), InstrumentErrors(("gain.green",), ((1e-4,),))
+    for errors, expected in (
+        (gain, "Measuring the gain to 0.5 % would cut the error of enamel scattering from 10 % to 5.0 %."),
+        (InstrumentErrors(), ""),
+    ):
+        domain, row = Domain((extinction,), errors), np.array([[0.1], [1.0]])[: 1 + len(errors.names)]
+        measured = np.zeros(1), np.zeros(1), np.array([1e-10]), np.array([1e10])
+        found = normal_equations(row, row, *measured, exact=len(errors.names))
+        known = uncertainty(domain, domain.x_of(TISSUE), found)
+        assert calibration_advice(TISSUE, ("enamel",), known) == expected

@@ -17,6 +17,7 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.fit.checks.alignment import offsets_told
 from services.fit.checks.identifiability import NOTHING, correlation, told
+from services.fit.checks.next_calibration import calibration_advice
 from services.fit.checks.thickness import ThicknessMap, thickness_map
 from services.fit.execution.attempt import Attempt, judge, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
@@ -93,6 +94,8 @@ class FitDriver:
                 shape = fits[channel].tissue.shape
                 if spec.advise and number == 0 and fits[channel].solution.result.converged:
                     next_capture = schedule.next_capture(fits[channel], attempt.inputs)
+                    measured = calibration_advice(fits[channel].tissue, schedule.media, fits[channel].known)
+                    next_capture = f"{next_capture} {measured}".strip()
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if layout is not None and textures:
             keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))

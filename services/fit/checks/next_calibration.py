@@ -1,0 +1,79 @@
+"""Which measurement of the instrument would help most: the covariance of a fit whose calibration knew one kind of error twice as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.checks.identifiability import in_words
+from services.fit.checks.next_capture import WORTH, relative_errors
+from services.fit.instrument.errors import kind_of_error
+from services.fit.instrument.moves import MOVED
+from services.fit.optics.parameters import Tissue
+from services.fit.solve.covariance import Uncertainty, estimates
+from services.fit.solve.information import Addition, covariance_with
+
+Array = NDArray[np.float64]
+
+FEWER = 2.0
+"""By what each ± of a kind is divided."""
+WORDS = {
+    "gain": "Measuring the gain",
+    "light_gain": "Measuring each light",
+    "flare": "Measuring the flare",
+    "teeth": "Registering the scan",
+    "dome": "Measuring where the dome stands",
+}
+
+
+def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty) -> str:
+    """One sentence on the kind of error that is worth measuring, judged by the quantity whose relative error is largest, or the next; '' where none is.
+
+    Args:
+        tissue: the solution.
+        parts: ``enamel``, ``dentin``.
+        known: uncertainty there.
+    """
+    before = relative_errors(estimates(tissue, parts, known))
+    kinds = dict.fromkeys([*map(kind_of_error, known.domain.errors.names), *(k for k in MOVED if k in known.parts)])
+    after = {
+        kind: relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_if_known(known, kind))))
+        for kind in kinds
+    }
+    for name in sorted(before, key=lambda name: -before[name]):
+        if not after:
+            break
+        kind = min(after, key=lambda kind: after[kind][name])
+        if after[kind][name] <= (1 - WORTH) * min(before[name], 1.0):
+            was = _percent(before[name]) if before[name] <= 1 else "more than 100 %"
+            cut = f"would cut the error of {in_words(name)} from {was} to {_percent(after[kind][name])}"
+            return f"{WORDS[kind]} {_how_well(known, kind)} {cut}."
+    return ""
+
+
+def covariance_if_known(known: Uncertainty, kind: str) -> Array:
+    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand."""
+    if kind in MOVED:
+        return np.asarray(known.covariance - (1 - FEWER**-2) * known.parts[kind])
+    assert known.sandwich is not None
+    domain = known.domain
+    chosen = [domain.tissue_count + k for k, name in enumerate(domain.errors.names) if kind_of_error(name) == kind]
+    added = np.zeros_like(known.covariance)
+    added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * domain.precision[np.ix_(chosen, chosen)]
+    whitened = known.sandwich.transform.T @ added @ known.sandwich.transform
+    return covariance_with(known.sandwich, Addition(whitened, whitened))
+
+
+def _how_well(known: Uncertainty, kind: str) -> str:
+    if kind in MOVED:
+        return "twice as well"
+    errors = known.domain.errors
+    se = min(se for name, se in zip(errors.names, errors.se.tolist(), strict=True) if kind_of_error(name) == kind)
+    return f"to {100 * se / FEWER:.2g} %"
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.1f} %"
