@@ -18,6 +18,7 @@ _BENCHMARKS = MappingProxyType(
         "slab": "services.bench.slab.forward:run",
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",
+        "slab-surface": "services.bench.slab.surface:run",
         "stability": "services.bench.stability.run:run",
         "tooth": "services.bench.fits.tooth:run",
         "transport-gradient": "services.bench.transport.gradient:run",

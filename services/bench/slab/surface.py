@@ -1,0 +1,149 @@
+"""``dentine bench slab-surface``: the error of images over all mixtures of three phase functions (Gkioulekas et al. 2013, figure 5).
+
+The problem is not convex, so the paper looks at it: if the surface has one minimum, at the truth, a descent cannot be caught
+elsewhere. Images of every mixture are compared with those of the true one; two independent renders each keep the walk's noise
+out of the error's mean.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.bench import Row
+from services.bench.slab.dispersions import Keep, near_beam_folder
+from services.fit.slab.model.dictionary import Material, hg_values, tent_solid_angles
+from services.fit.slab.model.forward import render
+from services.fit.slab.model.rig import Rig, rig_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+COSINES = (0.8, 0.0, -0.5)
+"""Of the three HG phase functions, which span forward, even and backward scattering."""
+EXTINCTIONS_PER_MM = (0.5, 2.0, 8.0)
+ALBEDO = 0.98
+TRUTHS = ((6, 2, 2), (2, 4, 4))
+"""Weights of the true mixtures, in steps of the grid."""
+STEPS, QUICK_STEPS = 10, 5
+BATCHES, PATHS = 8, 1000
+"""Of each mixture; the truth's images have sixteen times as many paths."""
+
+
+class SurfaceRow(Row):
+    """One mixture. ``error`` is the relative L2 difference of its images, with the walk's noise taken out, 0 where it is negative."""
+
+    extinction_per_mm: float
+    truth: tuple[float, ...]
+    weights: tuple[float, ...]
+    squared: float
+    """Square of the error, which noise may take below zero."""
+    squared_se: float
+
+
+def mixture_of(weights: tuple[float, ...], extinction_per_mm: float) -> Material:
+    """The medium of weights that add up to one."""
+    solid = tent_solid_angles()
+    shapes = [hg_values(g) / float(hg_values(g) @ solid) for g in COSINES]
+    phase = np.sum([weight * shape for weight, shape in zip(weights, shapes, strict=True)], axis=0)
+    return Material(ALBEDO * extinction_per_mm * phase, (1 - ALBEDO) * extinction_per_mm)
+
+
+def mixtures(steps: int) -> list[tuple[int, int, int]]:
+    """All points of the simplex, in steps."""
+    return [
+        (first, second, steps - first - second) for first in range(steps + 1) for second in range(steps + 1 - first)
+    ]
+
+
+def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
+    """One row per truth, extinction and mixture."""
+    folder, steps = near_beam_folder(), QUICK_STEPS if quick else STEPS
+    rig = rig_of(folder, folder.wavelengths_nm[0])
+    rows: list[dict[str, Any]] = []
+    for extinction in EXTINCTIONS_PER_MM[1:2] if quick else EXTINCTIONS_PER_MM:
+        for truth in TRUTHS[:1] if quick else TRUTHS:
+            weights = tuple(part / STEPS for part in truth)
+            images = _render(rig, mixture_of(weights, extinction), step=0, paths=16 * PATHS).mean(axis=0)
+            for number, point in enumerate(mixtures(steps)):
+                begun = time.process_time()
+                mixed = tuple(part / steps for part in point)
+                squared, spread = _squared_error(
+                    _render(rig, mixture_of(mixed, extinction), step=number + 1, paths=PATHS), images
+                )
+                rows.append(
+                    SurfaceRow(
+                        benchmark="slab-surface",
+                        peer="dentine",
+                        seconds=time.process_time() - begun,
+                        error=math.sqrt(max(squared, 0.0)),
+                        extinction_per_mm=extinction,
+                        truth=weights,
+                        weights=mixed,
+                        squared=squared,
+                        squared_se=spread,
+                    ).model_dump()
+                )
+            keep(rows)
+    return rows
+
+
+def _render(rig: Rig, material: Material, *, step: int, paths: int) -> Array:
+    return render(rig, material, seed=17, step=step, batches=BATCHES, paths=paths, scores=False).images
+
+
+def _squared_error(batches: Array, truth: Array) -> tuple[float, float]:
+    """Mean over pairs of different batches, and its standard error by leaving each batch out."""
+    residuals = (batches - truth).reshape(len(batches), -1)
+    products = residuals @ residuals.T / float((truth**2).sum())
+    np.fill_diagonal(products, 0)
+    count, total = len(batches), float(products.sum())
+    squared = total / (count * (count - 1))
+    without = (total - 2 * products.sum(axis=1)) / ((count - 1) * (count - 2))
+    return squared, math.sqrt((count - 1) / count * float(((without - without.mean()) ** 2).sum()))
+
+
+def other_minima(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mixtures of one surface, but for the lowest, with no neighbour that is lower by more than their noise explains."""
+    at = {row["weights"]: row for row in rows}
+    lowest = min(rows, key=lambda row: row["squared"])
+    step = min(weight for row in rows for weight in row["weights"] if weight > 0)
+    found = []
+    for weights, row in at.items():
+        near = [
+            other
+            for place, other in at.items()
+            if 0 < sum(abs(a - b) for a, b in zip(place, weights, strict=True)) < 2.5 * step
+        ]
+        if row is not lowest and all(
+            other["squared"] > row["squared"] + 3 * math.hypot(row["squared_se"], other["squared_se"]) for other in near
+        ):
+            found.append(row)
+    return found
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """A triangle for each truth and extinction, with contours of the error and a cross at the truth."""
+    from services.bench.plots import grid
+
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((tuple(row["truth"]), row["extinction_per_mm"]), []).append(row)
+    figure, panels = grid(len(groups))
+    for axes, ((truth, extinction), points) in zip(panels, groups.items(), strict=True):
+        x, y = (np.array([row["weights"][axis] for row in points]) for axis in (0, 1))
+        drawn = axes.tricontourf(x, y, [100 * row["error"] for row in points], levels=12, cmap="viridis")
+        figure.colorbar(drawn, ax=axes, label="error of images, %")
+        axes.plot(*truth[:2], "x", color="white", markersize=10, markeredgewidth=2)
+        axes.set(
+            title=f"σt = {extinction:g} per mm",
+            xlabel=f"weight of HG {COSINES[0]:g}",
+            ylabel=f"weight of HG {COSINES[1]:g}",
+        )
+    return figure
