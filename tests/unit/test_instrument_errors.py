@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +242,9 @@ def test_knowing_an_error_better_beforehand_is_worth_what_a_fit_with_that_prior_
     domain = Domain(DOMAIN.coordinates, errors)
     expected = uncertainty(domain, domain.x_of(TISSUE), found).covariance
     np.testing.assert_allclose(covariance_if_known(known, "gain"), expected, rtol=1e-6, atol=1e-15)
+    # A step that was left is no calibration's.
+    left = replace(known, parts=known.parts | {"unfinished": np.eye(6)})
+    np.testing.assert_allclose(covariance_if_known(left, "gain"), expected + np.eye(6), rtol=1e-6, atol=1e-15)
 
 
 def test_says_which_measurement_of_the_instrument_would_help_most() -> None:

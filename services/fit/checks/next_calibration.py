@@ -55,7 +55,7 @@ def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty)
 
 
 def covariance_if_known(known: Uncertainty, kind: str) -> Array:
-    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand."""
+    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand; the step that was left stays left."""
     if kind in MOVED:
         return np.asarray(known.covariance - (1 - FEWER**-2) * known.parts[kind])
     assert known.sandwich is not None
@@ -64,7 +64,8 @@ def covariance_if_known(known: Uncertainty, kind: str) -> Array:
     added = np.zeros_like(known.covariance)
     added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * domain.precision[np.ix_(chosen, chosen)]
     whitened = known.sandwich.transform.T @ added @ known.sandwich.transform
-    return covariance_with(known.sandwich, Addition(whitened, whitened))
+    left = known.parts.get("unfinished", np.zeros_like(added))
+    return covariance_with(known.sandwich, Addition(whitened, whitened)) + left
 
 
 def _how_well(known: Uncertainty, kind: str) -> str:
