@@ -323,10 +323,10 @@ def test_a_report_is_shown_inside_no_other_page(house: House) -> None:
 
 @pytest.mark.attack("routes × scopes", "the ids of others' jobs in the dome's answers")
 def test_the_dome_names_jobs_to_those_alone_who_may_see_them(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    job, status = (
-        house.ids["job_id"],
-        dict.fromkeys(("interlock_closed", "emergency_stop", "supply_on", "stopped"), False),
-    )
+    # A job of its own, as the tests above may have deleted the other.
+    asked = {"capture": f"captures/{house.ids['capture']}", "seed": 3}
+    job = house.ask("POST", "/v1/jobs", "own", Scope.SUBMIT, json=asked).json()["id"]
+    status = dict.fromkeys(("interlock_closed", "emergency_stop", "supply_on", "stopped"), False)
     told = {"firmware": "1", "light_count": 1, "faults": (), "lit": (), "temperature_degc": (), "current_ma": ()}
     answer = DomeAnswer(number=1, status=DomeStatus.model_validate(told | status))
     monkeypatch.setattr(Dome, "_process_ask", lambda *_, **__: answer)

@@ -59,7 +59,7 @@ def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) ->
     [
         (
             ["create", "x", "--scope", "write"],
-            "Scope 'write' does not exist; known are read, submit, operate-dome, admin",
+            "Scope 'write' does not exist; known are read, submit, operate-dome, metrics, admin",
         ),
         (["create", "a b", "--scope", "read"], "Token name 'a b'"),
         (["create", "a", "--scope", "read", "--group", "a/b"], "Group 'a/b' of token a"),
