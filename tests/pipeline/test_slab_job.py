@@ -316,7 +316,7 @@ def test_a_job_by_a_dictionary_tells_of_its_atoms(job: Path, spec: JobSpec, tmp_
     page = (tmp_path / "report.html").read_text()
     assert "<h2>Dictionary hg, 532 nm</h2>" in page
     heaviest = max((name for name in told if name.startswith("atoms.")), key=lambda name: told[name].value)
-    assert heaviest.replace("atoms.", "σs of ") in page
+    assert f"<td>{heaviest.replace('atoms.g=', 'σs of g ')}</td>" in page
 
 
 def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> None:

@@ -98,12 +98,19 @@ def _atoms(fit: SlabFit) -> list[dict[str, Any]]:
     there = {name: one for name, one in fit.atoms.items() if one.value > 0}
     return [
         {
-            "name": ATOM_LABELS.get(name, name.replace("atoms.", "σs of ", 1).replace("volumes.", "volume of ", 1)),
+            "name": ATOM_LABELS.get(name, _atom_label(name)),
             "cell": cell(Estimate(value=one.value, se=one.se, unit=one.unit, determined=one.determined)),
             "unit": {"1/mm": "per mm", "um": "µm"}.get(one.unit, ""),
         }
         for name, one in there.items()
     ]
+
+
+def _atom_label(name: str) -> str:
+    """``atoms.radius=0.250um`` for people."""
+    what, _, atom = name.partition(".")
+    told = atom.replace("=", " ").removesuffix("um") + (" µm" if atom.endswith("um") else "")
+    return f"{'volume' if what == 'volumes' else 'σs'} of {told}"
 
 
 def _phase(fit: SlabFit) -> tuple[str, str, str]:
