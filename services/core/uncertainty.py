@@ -11,8 +11,9 @@ camera.CAMERA.AXIS             a camera moved; also its fx, fy, cx, cy          
 light.LIGHT.x, .y, .z          one light moved                                              mm
 =============================  ===========================================================  ==================
 
-AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), applied on the left in the world's axes. The brightest pixel of a camera is the greatest
-radiance among its valid pixels in that channel, over all its photographs.
+AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), in the world's axes; teeth turn about the mean of their vertices,
+the dome about the mean of its lights. Moves of single cameras and lights are read and checked, and no fit uses them yet. The
+brightest pixel of a camera is the greatest radiance among its valid pixels in that channel, over all its photographs.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def require_known_names(
     lights: Sequence[Light],
     origin: str,
 ) -> None:
-    """Refuse an error of a thing that is not there.
+    """Refuse the error of an unknown channel, camera or light.
 
     Raises:
         CaptureInputError: names the first one.

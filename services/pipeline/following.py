@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Listener = Callable[[JobEvent], None]
 
-ENDS = ("finished", "error", "cancelled")
+ENDS = ("finished", "error")
 """Statuses of a task that do not change by themselves; a lost one, whose worker died with the result, runs again."""
 POLL_S = 0.25
 KEEP_S = 10.0
@@ -60,26 +60,28 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
-    ended_as = None
-    while ended_as is None:
-        ended_as = _ended_as(stage)
-        watch.tell()
-        if time.monotonic() > keep_at:
-            keep_workers()
-            keep_at = time.monotonic() + KEEP_S
-        if give_up_at is None and flag.exists():
-            give_up_at = time.monotonic() + GRACE_S
-        # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
-        if ended_as is None and give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture":
-            _stop_workers_of(client, key)
-            raise JobCancelledError(
-                "The job was cancelled on request; its workers were stopped, and what it had published is kept."
-            )
     try:
+        ended_as = None
+        while ended_as is None:
+            ended_as = _ended_as(stage)
+            watch.tell()
+            if time.monotonic() > keep_at:
+                keep_workers()
+                keep_at = time.monotonic() + KEEP_S
+            if give_up_at is None and flag.exists():
+                give_up_at = time.monotonic() + GRACE_S
+            # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
+            is_given_up = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
+            if ended_as is None and is_given_up:
+                _stop_workers_of(client, key)
+                raise JobCancelledError(
+                    "The job was cancelled on request; its workers were stopped, and what it had published is kept."
+                )
         # By what it ended as, and not by what it is now: a result that is here may die with its worker, and run again.
         if ended_as != "finished":
             stage.result()
     except KilledWorker as problem:
+        watch.tell()
         raise WorkerLostError(
             f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
             {"stage": task.stage, "deaths": problem.allowed_failures + 1},
@@ -87,10 +89,11 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
 
 
 def _ended_as(stage: Future) -> str | None:
-    """``finished`` once a task's result is here, ``error`` or ``cancelled``; None while it may still end otherwise.
+    """``finished`` once a task's result is here, or ``error``; None while it may still end otherwise.
 
-    Asks for ``POLL_S`` at most. A task that has finished has not ended before its result is here: its worker may die with it, and
-    then the task is lost for a while and runs again.
+    Asks twice for ``POLL_S`` at most, for the end and for the result, and raises what Dask does where the scheduler was lost. A task
+    that has finished has not ended before its result is here: its worker may die with it, and then the task is lost for a while
+    and runs again.
     """
     from distributed import wait
 

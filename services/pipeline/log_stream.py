@@ -23,8 +23,10 @@ class QueuedStream:
     """Takes whole lines for another stream and writes them in a thread."""
 
     def __init__(self, stream: TextIO, max_waiting_lines: int = MAX_WAITING_LINES) -> None:
-        self._stream, self._lost_lines, self._counting = stream, 0, threading.Lock()
-        self._lines: queue.Queue[str | None] = queue.Queue(max_waiting_lines)
+        self._stream, self._max_waiting_lines, self._lost_lines = stream, max_waiting_lines, 0
+        # Both let the same thread in again: the garbage collector may run in the midst of a write, and what it ends may log.
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._counting = threading.RLock()
         # A daemon, as a stalled reader must not keep the process from ending.
         self._thread = threading.Thread(target=self._hand_on, name="log", daemon=True)
         self._thread.start()
@@ -35,14 +37,13 @@ class QueuedStream:
 
     def write(self, text: str) -> int:
         """Queue a line; once the stream is drained it is written at once, as the process ends."""
-        if not self._thread.is_alive():
-            self._write(text)
-            return len(text)
-        try:
-            self._lines.put_nowait(text)
-        except queue.Full:
+        if self._lines.qsize() < self._max_waiting_lines:
+            self._lines.put(text)
+        else:
             with self._counting:
                 self._lost_lines += 1
+        if not self._thread.is_alive():
+            self._write_rest()
         return len(text)
 
     def flush(self) -> None:
@@ -50,11 +51,16 @@ class QueuedStream:
 
     def drain(self) -> None:
         """Have every line written that waits, and end the thread."""
-        with suppress(queue.Full):
-            self._lines.put(None, timeout=CLOSE_S)
-            self._thread.join(CLOSE_S)
-        while not self._thread.is_alive() and not self._lines.empty():  # what came behind the end
-            self._write(self._lines.get() or "")
+        self._lines.put(None)
+        self._thread.join(CLOSE_S)
+        if not self._thread.is_alive():
+            self._write_rest()
+
+    def _write_rest(self) -> None:
+        """Lines that came behind the end."""
+        with suppress(queue.Empty):
+            while True:
+                self._write(self._lines.get_nowait() or "")
 
     def _hand_on(self) -> None:
         for line in iter(self._lines.get, None):

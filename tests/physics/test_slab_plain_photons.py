@@ -7,15 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, near_beam_folder, truths
+from services.bench.slab.cell import near_beam_folder
+from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, truths
 from services.bench.slab.plain_photons import BATCHES, plain_images
-from services.bench.slab.stock_cell import RENDERS, cell_folder, medium_of, stock_images
 from services.core.slab.folder import SlabFolder
 from services.fit.slab.model.dictionary import henyey_greenstein
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from tests.support.slab_tables import rows_of
 from tests.support.small_slab import WAVELENGTH_NM, description
+from tests.support.stock_cell import RENDERS, matched_folder, medium_of, stock_images
 from tests.support.z_scores import require_unbiased, student_to_normal
 
 G = 0.5
@@ -63,7 +64,7 @@ def test_every_dispersion_is_diluted_to_where_a_cell_tells_most() -> None:
 
 @pytest.mark.slow
 def test_images_of_a_matched_cell_agree_with_stock_mitsuba() -> None:
-    told = cell_folder()
+    told = matched_folder()
     # Cameras on both faces, one of which looks 3 degrees beside the beam.
     folder = told.model_copy(update={"images": tuple(told.images[k] for k in (1, 3, 4))})
     plain, of_plain = plain_images(folder, 1.02, 1 / 1.02, henyey_greenstein_shape, photons=1_000_000, seed=5)

@@ -294,6 +294,7 @@ def test_nothing_that_is_printed_shows_a_secret(table: Tokens) -> None:
         ("a dentine_0123456789ab_x-Y_z012345 b", "a dentine_0123456789ab_… b"),
         ("dentine_0123456789ab_1800000000.abcdef0123", "dentine_0123456789ab_…"),
         ("whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw=", "whsec_…"),
+        ("dark_0123456789ab_1795000000_ab12.cd34", "dark_0123456789ab_…"),
         ("/v1/jobs/dentine", "/v1/jobs/dentine"),
     ],
 )

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from services.core.records import JobSpec
 from services.fit.execution.attempt import fingerprint
+from services.fit.execution.blocks import StoredFile
+from services.fit.inputs.observations import ChannelFiles, Level
+from services.fit.instrument.errors import InstrumentErrors
+from services.fit.instrument.moves import Move
 from services.fit.stage import describe_options
 
 CAPTURE = Path("/captures/anna")
@@ -40,6 +45,22 @@ def test_every_option_that_changes_the_answer_makes_another_checkpoint() -> None
 
 def test_an_option_that_was_added_is_named_by_its_default_nowhere() -> None:
     assert digest(image_tolerance=0.004) == DEFAULTS
+
+
+def test_another_uncertainty_of_the_instrument_makes_another_checkpoint() -> None:
+    scene, spec = StoredFile(Path("/scene"), "scene"), JobSpec(capture=CAPTURE)
+    move = Move("dome", StoredFile(Path("/moved"), "moved"), 8, ((1.0, 0.0, 0.0, 0.0),))
+    plain = ChannelFiles("green", scene, (level := Level((), (), 0, 0.0)), level, (), scene, 1.0, 1.0)
+    known = InstrumentErrors(("gain.green",), ((1e-4,),))
+    files = [
+        plain,
+        replace(plain, errors=known),
+        replace(plain, errors=replace(known, names=("light_gain.a",))),
+        replace(plain, errors=known, moves=(move,)),
+        replace(plain, errors=known, moves=(replace(move, recipe=scene),)),
+        replace(plain, errors=known, moves=(replace(move, camera_move=((2.0, 0.0, 0.0, 0.0),)),)),
+    ]
+    assert len({fingerprint(spec, "engine", [one]) for one in files}) == len(files)
 
 
 def test_the_report_names_the_options_that_were_set() -> None:

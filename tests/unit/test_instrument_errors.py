@@ -24,7 +24,7 @@ from services.fit.instrument.moves import by_scene, move_covariance, rigid, writ
 from services.fit.instrument.told import assumed_kinds, instrument_told
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.solve.covariance import estimates, instrument_estimates, uncertainty
+from services.fit.solve.covariance import _prior_parts, estimates, instrument_estimates, uncertainty
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import normal_equations
@@ -259,3 +259,37 @@ def test_says_which_measurement_of_the_instrument_would_help_most() -> None:
         found = normal_equations(row, row, *measured, exact=len(errors.names))
         known = uncertainty(domain, domain.x_of(TISSUE), found)
         assert calibration_advice(TISSUE, ("enamel",), known) == expected
+
+
+TOGETHER = np.diag([1e-4, 1e-4, 4e-4, 9e-6])
+TOGETHER[0, 1] = TOGETHER[1, 0] = 0.9e-4
+CORRELATED = Domain(DOMAIN.coordinates, InstrumentErrors(NAMES, tuple(map(tuple, TOGETHER.tolist()))))
+
+
+def test_parts_of_the_prior_add_up_where_kinds_go_together() -> None:
+    t = np.random.default_rng(5).standard_normal((6, 3))
+    parts = _prior_parts(CORRELATED, t)
+    assert set(parts) == {"prior", "gain", "light_gain", "flare"}
+    np.testing.assert_allclose(sum(parts.values()), t.T @ CORRELATED.precision @ t, rtol=1e-9)
+    for part in parts.values():
+        assert np.linalg.eigvalsh(part).min() > -1e-6 * np.abs(part).max(), "a part of a variance is negative"
+
+
+def test_a_gain_that_goes_with_a_light_is_known_twice_as_well_when_it_is_said_so() -> None:
+    # Photographs of no weight: what is known of the gain is its prior, which is divided as stated.
+    random, count = np.random.default_rng(9), 6
+    rows = [random.standard_normal((count, 20)) for _ in range(2)]
+    found = normal_equations(*rows, np.zeros(20), np.zeros(20), np.full(20, 1e6), np.full(20, 1e-12), exact=4)
+    known = uncertainty(CORRELATED, CORRELATED.x_of(TISSUE), found)
+    gain = CORRELATED.tissue_count
+    assert known.covariance[gain, gain] == pytest.approx(1e-4, rel=1e-3)
+    assert covariance_if_known(known, "gain")[gain, gain] == pytest.approx(0.25e-4, rel=1e-3)
+
+
+def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
+    stated = CalibrationUncertainty(names=("camera.c0.rx", "light.a.x"), covariance=((1e-6, 0.0), (0.0, 1.0)))
+    found = {"green": dict.fromkeys(NAMES, 0.0)}
+    told = instrument_told(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, found, (), stated)
+    assert told == (
+        "The calibration states how wrong camera.c0.rx and 1 more may be, which the ± do not know: no fit moves single cameras and lights.",
+    )

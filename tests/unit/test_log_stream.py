@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import queue
 import sys
 import threading
 from collections.abc import Iterator
@@ -74,6 +75,22 @@ def test_lines_that_find_no_room_are_counted_and_told(stalled: Stalled) -> None:
     lines = stalled.getvalue().splitlines()
     assert sum("Later." in line for line in lines) == 3
     assert [line for line in lines if "5 lines of the log were lost" in line]
+
+
+def test_what_logs_in_the_midst_of_a_write_does_not_wait_for_itself() -> None:
+    # The garbage collector may run within a write, and what it ends may log in the same thread: asyncio's tasks do.
+    stream = QueuedStream(io.StringIO(), max_waiting_lines=0)
+    assert isinstance(stream._lines, queue.SimpleQueue), "the only queue whose put lets its own thread in again"
+
+    def log() -> None:
+        with stream._counting:  # as the write holds it that finds no room
+            stream.write("Within.\n")
+
+    thread = threading.Thread(target=log, daemon=True)
+    thread.start()
+    thread.join(STALL_S)
+    assert not thread.is_alive()
+    stream.drain()
 
 
 def test_the_server_writes_its_log_so_and_all_of_it_when_it_ends(

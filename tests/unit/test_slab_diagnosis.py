@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import Beam, PixelGrid, SlabFolder
 from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults
+from services.fit.slab.dictionaries.chosen import ChosenDictionary
 from services.fit.slab.fit import fit_images
 from services.fit.slab.images import Measurements, shot_noise
 from services.fit.slab.model.dictionary import henyey_greenstein
 from services.fit.slab.model.forward import render
 from services.fit.slab.options import SlabOptions
+from services.fit.slab.solve.coordinates import Knots
 from tests.support.small_slab import description, small_rig
 
 PIXELS = PixelGrid(x_mm=(-4.0, 4.0), y_mm=(-4.0, 4.0), columns=16, rows=16)
@@ -85,6 +87,7 @@ def test_a_fit_of_an_absorbing_sample_says_so_and_not_that_it_is_thin() -> None:
     variances = np.stack([shot_noise(image) for image in exact])
     images = exact + np.sqrt(variances) * rng.normal(size=exact.shape)
     measured = Measurements(images, variances, np.zeros(len(images), dtype=bool), ("a",) * len(images), True)
-    notes = fit_images(SlabFolder.model_validate(description()), 532.0, measured, SlabOptions(effort=0.1)).fit.notes
+    folder, options = SlabFolder.model_validate(description()), SlabOptions(effort=0.1)
+    notes = fit_images(folder, 532.0, measured, options, map, ChosenDictionary(Knots())).fit.notes
     assert sum(note.startswith("The sample absorbs too much: ") for note in notes) == 1
     assert not any(note.startswith("The sample is too") for note in notes)

@@ -48,7 +48,7 @@ class Session(Record):
     dark_key: str | None = Field(
         default=None,
         description="of a browser session whose token may operate the dome: sent as 'Authorization: Bearer …' and without"
-        " the cookie, it opens ALL OFF and nothing else",
+        " the cookie, it darkens the dome and does nothing else",
     )
 
 

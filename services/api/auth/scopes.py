@@ -44,7 +44,7 @@ def needs(scope: str, *, audited: bool = False, darkens: bool = False) -> params
 
     Args:
         audited: of a route that only reads; changes always are.
-        darkens: whether it darkens a dome, so that its row of the audit is written before those of others.
+        darkens: whether it darkens a dome, perhaps among other things, so that its row of the audit is written before those of others.
     """
     known = Scope(scope)
     return params.Security(Needs(known, audited=audited, darkens=darkens), scopes=[known])
@@ -88,15 +88,17 @@ class GuardedRoute:
         """Let a caller with the route's scope pass.
 
         Raises:
-            ScopeError: the caller lacks the scope, or its dark key opens no such route, or the route declares none or several.
+            ScopeError: the caller lacks the scope, or has a dark key and the route does more than darken, or the route declares
+                none or several scopes.
         """
         if self.needs is None:
             raise ScopeError(
                 f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route."
             )
-        if caller.only_darkens and not self.needs.darkens:
+        # A cancel darkens too, but it ends jobs without a dome as well.
+        if caller.only_darkens and not (self.needs.darkens and self.needs.scope is Scope.OPERATE_DOME):
             raise ScopeError(
-                "A session's dark key opens ALL OFF and nothing else; send the session's cookie, or a token."
+                "A session's dark key darkens the dome and does nothing else; send the session's cookie, or a token."
             )
         require(caller, self.needs.scope)
 

@@ -7,7 +7,7 @@
     dark_<token id>_<expiry, Unix s>_<SHA-256 of the cookie's claim>.<HMAC-SHA256>     a session's dark key
 
 A page cannot read its cookie, and what is sent with a cookie waits for one of the browser's six connections, which long downloads
-may all hold. A dark key, which opens what darkens a dome and nothing else, is sent without the cookie, over a connection of its own.
+may all hold. A dark key, which darkens the dome and does nothing else, is sent without the cookie, over a connection of its own.
 
 The signing key lies beside the database and not in it, so that a copy of the database opens no session.
 """
@@ -70,7 +70,7 @@ class Sessions:
         )
 
     def dark_key(self, session: Session) -> str:
-        """What opens ALL OFF for as long as a session lasts."""
+        """A key that darkens the dome for as long as a session lasts."""
         claim = f"{DARK}{session.token_id}_{session.expires_s:.0f}_{session.sha256}"
         return f"{claim}.{self._sign(claim)}"
 

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.bench import Row
-from services.bench.slab.dispersions import Keep, near_beam_folder
+from services.bench.slab.cell import near_beam_folder
+from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import FINE_RAD, NOISE, Truth, photographed, recovered
 from services.core.errors import InputError
 from services.fit.slab.bound import bound_of
-from services.fit.slab.model.dictionary import ANGLES_RAD
+from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.solve.uncertainty import slopes
 
@@ -38,15 +40,11 @@ BOUND_PATHS = 2000
 PHOTONS = 2_000_000
 
 
-def _hg(g: float) -> Callable[[Array], Array]:
-    return lambda angles: (1 - g * g) / (1 + g * g - 2 * g * np.cos(angles)) ** 1.5
-
-
 PHASES: dict[str, Callable[[Array], Array]] = {
     "isotropic": np.ones_like,
-    "HG 0.5": _hg(0.5),
-    "HG 0.8": _hg(0.8),
-    "two lobes": lambda angles: 0.7 * _hg(0.85)(angles) + 0.3 * _hg(-0.3)(angles),
+    "HG 0.5": partial(hg_values, 0.5),
+    "HG 0.8": partial(hg_values, 0.8),
+    "two lobes": lambda angles: 0.7 * hg_values(0.85, angles) + 0.3 * hg_values(-0.3, angles),
 }
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.recovery import Truth, photographed, recovered
 from services.core.errors import InputError
 from services.core.slab.folder import SlabFolder
@@ -68,40 +69,6 @@ def truths() -> list[Truth]:
             options = [mie_truth(diameter_nm, colour, dilution, folder) for dilution in DILUTIONS]
             every.append(min(options, key=lambda one: abs(math.log(one.thickness / BEST_THICKNESS))))
     return every + [mie_truth(diameter_nm, colour, 1.0, folder) for colour, diameter_nm in THICK]
-
-
-def near_beam_folder() -> SlabFolder:
-    """A cell of 1 mm without glass: three lights, three cameras a side, one of which looks 3 degrees beside the beam of the first."""
-    angles = {"f": (-5, -15, -25), "b": (8, 18, -15)}
-    sides = {"f": "front", "b": "back"}
-    lights = [{"name": f"l{k}", "side": "front", "angle_deg": float(angle)} for k, angle in enumerate((5, 15, 25))]
-    cameras = [
-        {"name": f"{letter}{k}", "side": sides[letter], "angle_deg": float(angle)}
-        for letter, own in angles.items()
-        for k, angle in enumerate(own)
-    ]
-    return SlabFolder.model_validate(
-        {
-            "kind": "slab",
-            "units": "mm",
-            "wavelengths_nm": [532.0],
-            "cell": {"width_mm": 1.0, "index": 1.33},
-            "beam": {"profile": "gaussian", "sigma_mm": 0.25},
-            "pixels": {"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 16, "rows": 16},
-            "lights": lights,
-            "cameras": cameras,
-            "images": [
-                {
-                    "camera": camera["name"],
-                    "light": light["name"],
-                    "file": f"{camera['name']}_{light['name']}.npy",
-                    "variance_file": f"{camera['name']}_{light['name']}_var.npy",
-                }
-                for light in lights
-                for camera in cameras
-            ],
-        }
-    )
 
 
 def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:

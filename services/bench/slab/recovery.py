@@ -48,12 +48,12 @@ class Truth:
         return (self.scattering_per_mm + self.absorption_per_mm) * self.folder.cell.width_mm
 
     def material(self) -> Material:
-        """In the span of the dictionary."""
+        """The medium as a mixture of the dictionary's tents."""
         shape = self.phase(ANGLES_RAD)
         return Material(self.scattering_per_mm * shape / float(shape @ tent_solid_angles()), self.absorption_per_mm)
 
     def phase_per_sr(self) -> Array:
-        """At the fine angles, normalised there."""
+        """The phase function at the fine angles, normalised there."""
         values = self.phase(FINE_RAD)
         total = 2 * math.pi * float(np.trapezoid(values * np.sin(FINE_RAD), FINE_RAD))
         return np.asarray(values / total)

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench import Row
-from services.bench.slab.dispersions import Keep, near_beam_folder
-from services.fit.slab.model.dictionary import Material, hg_values, tent_solid_angles
+from services.bench.slab.cell import near_beam_folder
+from services.bench.slab.dispersions import Keep
+from services.fit.slab.model.dictionary import Material, hg_values
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.solve.mixture import unit_atoms
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,9 +51,7 @@ class SurfaceRow(Row):
 
 def mixture_of(weights: tuple[float, ...], extinction_per_mm: float) -> Material:
     """The medium of weights that add up to one."""
-    solid = tent_solid_angles()
-    shapes = [hg_values(g) / float(hg_values(g) @ solid) for g in COSINES]
-    phase = np.sum([weight * shape for weight, shape in zip(weights, shapes, strict=True)], axis=0)
+    phase = unit_atoms(np.stack([hg_values(g) for g in COSINES], axis=1)) @ np.array(weights)
     return Material(ALBEDO * extinction_per_mm * phase, (1 - ALBEDO) * extinction_per_mm)
 
 
@@ -142,7 +142,7 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
         figure.colorbar(drawn, ax=axes, label="error of images, %")
         axes.plot(*truth[:2], "x", color="white", markersize=10, markeredgewidth=2)
         axes.set(
-            title=f"σt = {extinction:g} per mm",
+            title=f"σt = {extinction:g} per mm, {len(other_minima(points))} other minima",
             xlabel=f"weight of HG {COSINES[0]:g}",
             ylabel=f"weight of HG {COSINES[1]:g}",
         )

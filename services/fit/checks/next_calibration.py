@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.checks.identifiability import in_words
-from services.fit.checks.next_capture import WORTH, relative_errors
+from services.fit.checks.next_capture import WORTH, in_percent, relative_errors
 from services.fit.instrument.errors import kind_of_error
 from services.fit.instrument.moves import MOVED
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, estimates
-from services.fit.solve.information import Addition, covariance_with
+from services.fit.solve.information import Addition, covariance_after
 
 Array = NDArray[np.float64]
 
@@ -48,8 +48,8 @@ def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty)
             break
         kind = min(after, key=lambda kind: after[kind][name])
         if after[kind][name] <= (1 - WORTH) * min(before[name], 1.0):
-            was = _percent(before[name]) if before[name] <= 1 else "more than 100 %"
-            cut = f"would cut the error of {in_words(name)} from {was} to {_percent(after[kind][name])}"
+            was = in_percent(before[name]) if before[name] <= 1 else "more than 100 %"
+            cut = f"would cut the error of {in_words(name)} from {was} to {in_percent(after[kind][name])}"
             return f"{WORDS[kind]} {_how_well(known, kind)} {cut}."
     return ""
 
@@ -60,12 +60,13 @@ def covariance_if_known(known: Uncertainty, kind: str) -> Array:
         return np.asarray(known.covariance - (1 - FEWER**-2) * known.parts[kind])
     assert known.sandwich is not None
     domain = known.domain
-    chosen = [domain.tissue_count + k for k, name in enumerate(domain.errors.names) if kind_of_error(name) == kind]
+    own = [k for k, name in enumerate(domain.errors.names) if kind_of_error(name) == kind]
+    chosen = [domain.tissue_count + k for k in own]
+    # Information that divides the kind's own covariance, whatever it goes together with.
     added = np.zeros_like(known.covariance)
-    added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * domain.precision[np.ix_(chosen, chosen)]
+    added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * np.linalg.inv(domain.errors.matrix[np.ix_(own, own)])
     whitened = known.sandwich.transform.T @ added @ known.sandwich.transform
-    left = known.parts.get("unfinished", np.zeros_like(added))
-    return covariance_with(known.sandwich, Addition(whitened, whitened)) + left
+    return covariance_after(known, Addition(whitened, whitened))
 
 
 def _how_well(known: Uncertainty, kind: str) -> str:
@@ -74,7 +75,3 @@ def _how_well(known: Uncertainty, kind: str) -> str:
     errors = known.domain.errors
     se = min(se for name, se in zip(errors.names, errors.se.tolist(), strict=True) if kind_of_error(name) == kind)
     return f"to {100 * se / FEWER:.2g} %"
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.1f} %"

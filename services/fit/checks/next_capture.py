@@ -29,7 +29,7 @@ from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.instrument.columns import columns
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
-from services.fit.solve.information import Addition, addition, covariance_with
+from services.fit.solve.information import Addition, addition, covariance_after
 from services.fit.transport.scene.recipe import SceneRecipe, View
 
 Array = NDArray[np.float64]
@@ -135,8 +135,8 @@ def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate
     for name in names:
         candidate, (after, unsure) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
         if after + unsure <= (1 - WORTH) * min(before[name], 1.0):
-            was = _percent(before[name]) if before[name] <= 1 else "more than 100 %"
-            return f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to {_percent(after)}."
+            was = in_percent(before[name]) if before[name] <= 1 else "more than 100 %"
+            return f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to {in_percent(after)}."
     return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(names[0])} by more than a tenth."
 
 
@@ -146,10 +146,7 @@ def predicted(
     """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice, differ by noise alone."""
 
     def after(added: Addition) -> dict[str, float]:
-        assert known.sandwich is not None
-        return relative_errors(
-            estimates(tissue, parts, replace(known, covariance=covariance_with(known.sandwich, added)))
-        )
+        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_after(known, added))))
 
     whole, *halves = (after(added) for added in (candidate.whole, *(half.scaled(2) for half in candidate.halves)))
     return {name: (value, 0.5 * abs(halves[0][name] - halves[1][name])) for name, value in whole.items()}
@@ -290,5 +287,6 @@ def advice_task(
     return out, trace_row("advice", task, start)
 
 
-def _percent(fraction: float) -> str:
+def in_percent(fraction: float) -> str:
+    """A relative error as a report's sentences give it."""
     return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.1f} %"

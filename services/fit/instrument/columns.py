@@ -14,10 +14,11 @@ Array = NDArray[np.float64]
 
 def taken(image: Array, block: Block, errors: Mapping[str, float]) -> Array:
     """The photographs (L, N) that the instrument would take of an image (L, N) with these errors."""
-    if not errors:
+    acting = block.instrument
+    if not errors or acting is None:
         return image
-    change = np.array(list(errors.values())) @ columns(image, block, tuple(errors))
-    return image + change.reshape(image.shape)
+    gains = 1 + errors.get(acting.gain, 0.0) + np.array([errors.get(light, 0.0) for light in acting.lights])[:, None]
+    return np.asarray(gains * image + errors.get(acting.flare, 0.0) * acting.brightest)
 
 
 def columns(image: Array, block: Block, names: Sequence[str]) -> Array:

@@ -37,10 +37,12 @@ def instrument_told(
     errors: Mapping[str, InstrumentErrors],
     found: Mapping[str, Mapping[str, float]],
     assumed: tuple[str, ...],
+    stated: CalibrationUncertainty | None = None,
 ) -> tuple[str, ...]:
     """One sentence each, what was assumed first.
 
     Args:
+        stated: by the calibration.
         assumed: kinds, as ``assumed_kinds`` gives them.
         errors: by channel, as they were known before the fit.
         found: by channel and name, what the images make of them.
@@ -57,7 +59,7 @@ def instrument_told(
         if spec.lobes == 2
         else ()
     )
-    return (*_assumed(assumed), *unmoved, *_faults(errors, found))
+    return (*_assumed(assumed), *_unused(stated), *unmoved, *_faults(errors, found))
 
 
 def _assumed(kinds: tuple[str, ...]) -> Iterator[str]:
@@ -67,6 +69,16 @@ def _assumed(kinds: tuple[str, ...]) -> Iterator[str]:
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
             "The ± depend on these; give uncertainty in capture.json."
+        )
+
+
+def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
+    unused = [name for name in (stated.names if stated is not None else ()) if name.startswith(("camera.", "light."))]
+    if unused:
+        rest = f" and {len(unused) - 1} more" if unused[1:] else ""
+        yield (
+            f"The calibration states how wrong {unused[0]}{rest} may be, which the ± do not know: "
+            "no fit moves single cameras and lights."
         )
 
 

@@ -21,7 +21,6 @@ from services.fit.slab.model.rig import Rig, rig_of
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
-from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
@@ -69,11 +68,10 @@ def fit_images(
     wavelength_nm: float,
     measured: Measurements,
     options: SlabOptions,
-    blocks: Blocks = map,
-    dictionary: ChosenDictionary | None = None,
+    blocks: Blocks,
+    dictionary: ChosenDictionary,
 ) -> Wavelength:
-    """Fit the images of one wavelength by a dictionary, the tents where none is given; see ``fit_slab``."""
-    dictionary = dictionary or ChosenDictionary(Knots())
+    """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``."""
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
     rig = rig_of(folder, wavelength_nm, index.value)

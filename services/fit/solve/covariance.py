@@ -281,12 +281,15 @@ def uncertainty(
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
-    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Kinds that go together share what they have in common.
-    kinds = np.array(["prior"] * domain.tissue_count + [kind_of_error(name) for name in domain.errors.names])
-    parts = {}
+    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Columns of a Cholesky factor are parts that
+    # add up and of which none is negative; what kinds that go together have in common counts for the first of them.
+    count, precision = domain.tissue_count, domain.precision
+    parts = {"prior": t[:count].T @ precision[:count, :count] @ t[:count]}
+    kinds = np.array([kind_of_error(name) for name in domain.errors.names])
+    factor = np.linalg.cholesky(precision[count:, count:])
     for kind in dict.fromkeys(kinds.tolist()):
-        half = np.where(kinds == kind, 0.5, 0.0)
-        parts[kind] = t.T @ (domain.precision * (half[:, None] + half)) @ t
+        half = t[count:].T @ (factor * (kinds == kind))
+        parts[kind] = half @ half.T
     return parts
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.covariance import Sandwich
+from services.fit.solve.covariance import Sandwich, Uncertainty
 
 Array = NDArray[np.float64]
 
@@ -55,6 +55,12 @@ def covariance_with(known: Sandwich, added: Addition) -> Array:
     information, meat = (_positive(matrix) for matrix in (added.information, added.meat))
     inverse = np.linalg.inv(np.linalg.inv(known.inverse) + information)
     return np.asarray(known.transform @ inverse @ (known.meat + meat) @ inverse.T @ known.transform.T)
+
+
+def covariance_after(known: Uncertainty, added: Addition) -> Array:
+    """Covariance (F, F) of x as the fit states it, had it the further measurements; the step that was left stays left."""
+    assert known.sandwich is not None
+    return covariance_with(known.sandwich, added) + known.parts.get("unfinished", np.zeros_like(known.covariance))
 
 
 def _positive(matrix: Array) -> Array:

@@ -78,11 +78,6 @@ class NormalEquations:
             self, gradient=self.gradient + self.hessian @ step, gradient_noise=noise, carried=self.carried + step
         )
 
-    def step_noise(self, step: Array) -> float:
-        """Standard deviation of the change g'p + p'Hp/2 that the model predicts for a step p."""
-        curvature = float(self.hessian_noise.variance(step[:, None])[0])
-        return float(np.sqrt(max(float(step @ self.gradient_noise @ step) + 0.25 * curvature, 0.0)))
-
     def eigenvalue_noise(self, directions: Array) -> Array:
         """Standard deviation of u'Hu for each column u of ``directions`` (F, K)."""
         return np.sqrt(self.hessian_noise.variance(directions))

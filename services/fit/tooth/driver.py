@@ -160,7 +160,8 @@ class FitDriver:
         correlations = {c: correlation(known[c]) for c in fits}
         errors = {c: known[c].domain.errors for c in fits}
         instrument = {c: found for c in fits if (found := instrument_estimates(known[c]))}
-        assumed = assumed_kinds(errors, observations.manifest.uncertainty)
+        stated = observations.manifest.uncertainty
+        assumed = assumed_kinds(errors, stated)
         values = {c: {name: one.value for name, one in found.items()} for c, found in instrument.items()}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
@@ -182,7 +183,7 @@ class FitDriver:
             instrument=instrument,
             instrument_prior={c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in instrument},
             assumed=assumed,
-            instrument_told=instrument_told(self.attempt.spec, errors, values, assumed),
+            instrument_told=instrument_told(self.attempt.spec, errors, values, assumed, stated),
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )

@@ -107,6 +107,6 @@ def henyey_greenstein(scattering_per_mm: float, g: float, absorption_per_mm: flo
     return Material(scattering_per_mm * shape / float(shape @ tent_solid_angles()), absorption_per_mm)
 
 
-def hg_values(g: float) -> Array:
-    """HG phase function at the knots, 1/sr."""
-    return np.asarray((1 - g * g) / (4 * math.pi) / ((1 - g) ** 2 + 4 * g * np.sin(ANGLES_RAD / 2) ** 2) ** 1.5)
+def hg_values(g: float, angles_rad: Array = ANGLES_RAD) -> Array:
+    """HG phase function at some angles, 1/sr; at the knots where none are given."""
+    return np.asarray((1 - g * g) / (4 * math.pi) / ((1 - g) ** 2 + 4 * g * np.sin(angles_rad / 2) ** 2) ** 1.5)

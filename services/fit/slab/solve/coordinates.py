@@ -100,7 +100,7 @@ class Knots:
         return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
-        """None: ln f has no bound, and the absorption is left free."""
+        """None counts as bound: ln f has no bound, and the ± of an absorption at zero are those of a free one."""
         return np.zeros(len(x), dtype=bool)
 
     def log_evidence(self, quadratic: Quadratic, scale: float) -> float:

@@ -71,7 +71,7 @@ class Mixtures:
         return Mixture(np.maximum(self.atoms @ weights, darkest), max(float(x[-1]), 0.0), weights)
 
     def chain(self, material: Material) -> Array:
-        """D ln f / dw = D / f."""
+        """Derivatives of ln f by the weights are the atoms divided by f."""
         matrix = np.zeros((UNKNOWNS, self.atoms.shape[1] + 1))
         matrix[:KNOTS, :-1] = self.atoms / material.scattering[:, None]
         matrix[KNOTS, -1] = 1

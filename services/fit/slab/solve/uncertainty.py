@@ -87,7 +87,7 @@ def slopes(material: Material) -> dict[str, Array]:
     sigma_s, g = material.scattering_per_mm, material.mean_cosine
     return {
         "sigma_t": np.append(parts, 1.0),
-        "sigma_s": np.append(parts, 0.0),
+        "sigma_s": material.slope_of_scattering(),
         "sigma_a": np.append(np.zeros(KNOTS), 1.0),
         "sigma_s_reduced": np.append(parts - moments, 0.0),
         "g": np.append((moments - g * parts) / sigma_s, 0.0),

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.bench.slab.cell import near_beam_folder
 from services.core.slab.folder import Light, SlabCamera, SlabFolder
 
 Array = NDArray[np.float64]
 
-WAVELENGTH_NM = 532.0
-"""Only a name here: the medium is given."""
 HALF_CELL_MM = 12.0
 """The cell's lateral half edge, twice that of the pixels: what leaves there comes back to no pixel."""
 HALF_PLATE_MM, PLATE_NODES, PLATE_AWAY_MM = 14.0, 2048, 60.0
@@ -30,39 +29,15 @@ RENDERS = 8
 """Independent renders of an image, whose spread gives its variance."""
 
 
-def cell_folder(**changes: Any) -> SlabFolder:
-    """A matched cell of 1 mm under a beam of 1 mm, 3 lights and 6 cameras, of which one looks 3 degrees beside a beam.
-
-    The beam is as broad as stock Mitsuba can light well: a connection from anywhere outside of it brings nothing.
+def matched_folder() -> SlabFolder:
+    """The benchmarks' cell with a matched boundary, under a beam of 1 mm: as broad as stock Mitsuba can light well, as a connection
+    from outside of it brings nothing.
     """
-    lights = [{"name": f"l{angle}", "side": "front", "angle_deg": float(angle)} for angle in (5, 15, 25)]
-    cameras = [
-        {"name": f"{side[0]}{number}", "side": side, "angle_deg": float(angle)}
-        for side, angles in (("front", (-5, -15, -25)), ("back", (8, 18, -15)))
-        for number, angle in enumerate(angles)
-    ]
-    told: dict[str, Any] = {
-        "kind": "slab",
-        "units": "mm",
-        "wavelengths_nm": [WAVELENGTH_NM],
-        "cell": {"width_mm": 1.0, "index": None, "boundary": "matched"},
-        "beam": {"profile": "gaussian", "sigma_mm": 1.0, "power": 1.0},
-        "pixels": {"x_mm": [-6.0, 6.0], "y_mm": [-6.0, 6.0], "columns": 12, "rows": 12},
-        "lights": lights,
-        "cameras": cameras,
-    }
-    told.update(changes)
-    told["images"] = [
-        {
-            "camera": camera["name"],
-            "light": light["name"],
-            "file": f"{camera['name']}_{light['name']}.npy",
-            "variance_file": f"{camera['name']}_{light['name']}_var.npy",
-        }
-        for light in told["lights"]
-        for camera in told["cameras"]
-    ]
-    return SlabFolder.model_validate(told)
+    return near_beam_folder(
+        cell={"width_mm": 1.0, "index": None, "boundary": "matched"},
+        beam={"profile": "gaussian", "sigma_mm": 1.0},
+        pixels={"x_mm": [-6.0, 6.0], "y_mm": [-6.0, 6.0], "columns": 12, "rows": 12},
+    )
 
 
 def stock_images(
