@@ -198,6 +198,7 @@ def test_killed_helper_worker_changes_nothing(client: Client, undisturbed: Path,
     assert (tmp_path / "fit.lease").read_text() == "1"
 
 
+@pytest.mark.slow
 def test_killed_renderer_is_started_again(client: Client, undisturbed: Path, tmp_path: Path) -> None:
     write_prepared(tmp_path)
     future = client.submit(fit_once, tmp_path, SLOW, pure=False)

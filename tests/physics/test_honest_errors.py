@@ -76,6 +76,7 @@ def test_errors_of_images_are_honest(engine: Engine) -> None:
     require_honest(intervals(means, variances, truth.mean, truth.variance, 16, light))
 
 
+@pytest.mark.slow
 def test_errors_of_derivatives_are_honest(engine: Engine) -> None:
     truth = engine.jacobian(TISSUE, VIEW, NAMES, samples=TRUTH_SAMPLES, seed=9100, batches=16)
     runs = [engine.jacobian(TISSUE, VIEW, NAMES, samples=SAMPLES, seed=9101 + seed) for seed in range(SEEDS)]

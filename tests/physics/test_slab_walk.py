@@ -146,7 +146,7 @@ def test_glass_of_no_thickness_and_the_samples_index_changes_nothing() -> None:
     np.testing.assert_allclose(walled, plain, rtol=1e-6)
 
 
-@pytest.mark.parametrize("thickness", [1.0, 8.0])
+@pytest.mark.parametrize("thickness", [pytest.param(1.0, marks=pytest.mark.slow), 8.0])
 def test_scores_agree_with_differences(thickness: float) -> None:
     """12 atoms and 12 random directions: differences with common random numbers against scores from other paths.
 

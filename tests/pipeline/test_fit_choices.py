@@ -95,6 +95,7 @@ def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
     assert errors["robust"] < 0.5 * errors["l2"]
 
 
+@pytest.mark.slow
 def test_what_is_held_stays_and_only_the_shape_is_asked_for_where_all_media_are(tmp_path: Path) -> None:
     media = {
         f"{part}.{leaf}": getattr(getattr(TRUTH, part), leaf)
@@ -117,6 +118,7 @@ def test_a_held_albedo_is_not_moved_by_the_cosine(tmp_path: Path) -> None:
     assert table["enamel.sigma"].se
 
 
+@pytest.mark.slow
 def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
     options = {"solver": "adam", "adam_steps": 80}
     write_prepared(tmp_path / "whole")

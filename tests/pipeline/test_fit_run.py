@@ -75,6 +75,7 @@ def test_says_what_is_known_what_goes_together_and_what_would_help(
     assert "would" in report.next_capture
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_seen_over_noise(tmp_path: Path) -> None:
     # z of 4 quantities over 6 captures and seeds: the mean square of 24 values lies in 0.2 to 2.6 for all but 1e-3 of cases even if the 4 move together.
     z = []
