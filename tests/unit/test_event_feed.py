@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,16 @@ def work(repository: Repository, lease: Lease) -> None:
     repository.settle(lease, Trigger.SUCCEED)
 
 
+@contextmanager
+def working(repository: Repository, *leases: Lease) -> Iterator[None]:
+    """Jobs that work meanwhile. All have ended when it ends, as one still writing would keep a connection open past the repository's close."""
+    with ThreadPoolExecutor(len(leases)) as threads:
+        ends = [threads.submit(work, repository, lease) for lease in leases]
+        yield
+    for end in ends:
+        end.result()
+
+
 @asynccontextmanager
 async def running(repository: Repository) -> AsyncIterator[EventFeed]:
     one = EventFeed(repository)
@@ -74,11 +84,10 @@ def test_every_stream_is_told_everything_once_and_in_order_however_slow_it_is(re
                 group.create_task(listen(one.follow(lease.job.id, 0), 0.001 * (number % 7)))
                 for number in range(STREAMS)
             ]
-            for leased in (other, lease):
-                threading.Thread(target=work, args=(repository, leased)).start()
         return [task.result() for task in tasks]
 
-    texts = asyncio.run(watch())
+    with working(repository, other, lease):
+        texts = asyncio.run(watch())
     stored = [event.id for event in repository.events_of(lease.job.id).read()]
     assert len(stored) == STEPS + 4
     assert [ids_of(text) for text in texts] == [stored] * STREAMS
@@ -106,11 +115,10 @@ def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(
     async def watch() -> str:
         async with running(repository) as one, asyncio.TaskGroup() as group:
             task = group.create_task(listen(one.follow_several(places), 0.001))
-            for lease in leases:
-                threading.Thread(target=work, args=(repository, lease)).start()
         return task.result()
 
-    told = events_in(asyncio.run(watch()))
+    with working(repository, *leases):
+        told = events_in(asyncio.run(watch()))
     for lease, after in ((leases[0], 0), (leases[2], known)):
         events = [json.loads(data) for kind, data in told if kind == "message"]
         assert [event["id"] for event in events if event["job"] == lease.job.id] == [
