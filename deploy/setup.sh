@@ -40,6 +40,7 @@ prepare_packages() {
     fi
     say "installing packages into .venv"
     .venv/bin/python -m pip install --quiet --editable '.[dev]' </dev/null
+    rm -f .venv/.installed-*
     touch "$stamp"
 }
 
@@ -74,6 +75,7 @@ prepare_dashboard() {
         npm --prefix $folder ci --silent </dev/null || return
     fi
     npm --prefix $folder run --silent build </dev/null || return
+    rm -f "$folder"/node_modules/.built-*  # one stamp alone: that of an earlier source would pass for this bundle's when that source comes back
     touch "$stamp"
 }
 
