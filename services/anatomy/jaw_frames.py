@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.anatomy.frame import ToothFrame
 from services.anatomy.scans.matching import CrownMatch
-from services.anatomy.scans.patches import areas_mm2
+from services.anatomy.scans.patches import middle_mm
 from services.anatomy.templates.average_arch import arch_from_middles, is_upper, nominal_places
 from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Tooth
@@ -106,7 +106,7 @@ def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame
 def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
     # The arch's pose first: of the turns about the line of middles, the one in which middles and shapes are nearest to the average's.
     numbers, matches = tuple(tooth.fdi for tooth in teeth), [CrownMatch(tooth.fdi, tooth.outer) for tooth in teeth]
-    middles = np.array([_middle_mm(tooth) for tooth in teeth])
+    middles = np.array([middle_mm(tooth.outer) for tooth in teeth])
     nominal, nominal_axes = nominal_places(numbers)
     turns, misfits = _arch_turns(
         arch_from_middles(numbers, middles), middles - middles.mean(axis=0), nominal - nominal.mean(axis=0)
@@ -159,11 +159,6 @@ def _angles_deg(one: Array, two: Array) -> Array:
     # Of the rotations between axes (N, 3, 3) and (N, 3, 3).
     cosine = (np.einsum("nij,nij->n", one, two) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def _middle_mm(tooth: Tooth) -> Array:
-    corners = tooth.outer.vertices_mm[tooth.outer.faces]
-    return np.asarray(np.average(corners.mean(axis=1), axis=0, weights=areas_mm2(tooth.outer)))
 
 
 def _box_middle_mm(tooth: Tooth) -> Array:

@@ -82,7 +82,7 @@ def test_labels_that_cannot_be_used_end_in_a_sentence(tmp_path: Path, labels: np
 
 def test_metres_are_refused(tmp_path: Path) -> None:
     write_vtp(tmp_path / "scan.vtp", Mesh(SCAN.mesh.vertices_mm / 1000, SCAN.mesh.faces), universal(SCAN.fdi))
-    with pytest.raises(MeshError, match="must be in millimetres, so rescale it"):
+    with pytest.raises(MeshError, match="it seems to be in m: say units = 'm'"):
         read_scan(tmp_path / "scan.vtp")
 
 
@@ -136,7 +136,11 @@ def test_triangles_of_points_that_do_not_exist_are_refused(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("name", "sentence"),
-    [("a.vtp", r"a\.vtp does not exist"), ("a.ply", r"a\.ply does not exist"), ("a.stl", "neither .vtp nor .ply")],
+    [
+        ("a.vtp", r"a\.vtp does not exist"),
+        ("a.ply", r"a\.ply does not exist"),
+        ("a.glb", "neither .vtp, .ply, .stl nor .obj"),
+    ],
 )
 def test_missing_and_unlabelled_formats_are_named(tmp_path: Path, name: str, sentence: str) -> None:
     with pytest.raises(CaptureInputError, match=sentence):

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from services.core.geometry import Mesh
 
 Faces = NDArray[np.int32]
+TINY_MM2 = 1e-30
+"""Added to areas that are weights, so that a part of vanishing triangles still has a middle."""
 
 
 def neighbours(faces: Faces) -> NDArray[np.int64]:
@@ -41,6 +43,11 @@ def areas_mm2(mesh: Mesh) -> NDArray[np.float64]:
 def vector_area_mm2(mesh: Mesh) -> NDArray[np.float64]:
     """Sum of the faces' normals times their areas (3,): for a cap, the normal of its boundary loop."""
     return np.asarray(_crosses(mesh).sum(axis=0) / 2)
+
+
+def middle_mm(mesh: Mesh) -> NDArray[np.float64]:
+    """Centre of a surface's area (3,)."""
+    return np.asarray(np.average(mesh.vertices_mm[mesh.faces].mean(axis=1), axis=0, weights=areas_mm2(mesh) + TINY_MM2))
 
 
 def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:

@@ -1,6 +1,8 @@
-"""Roots for scanned crowns: an open crown becomes a solid by a tapering stub along the tooth's axis from its cervical line."""
+"""Roots for scanned crowns: an open crown becomes a solid by a tapering root, or a stub of one, from its cervical line."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,8 @@ from services.anatomy.scans.patches import (
     ring_faces,
     vector_area_mm2,
 )
+from services.anatomy.templates.average_arch import is_upper
+from services.anatomy.templates.dimensions import root_length_mm
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
@@ -24,6 +28,9 @@ TAPER = 0.72
 """Width of the root's end to that of the cervical line."""
 ROUNDING_MM = 1.2
 """Height of the root's rounded end, part of ``STUB_MM``."""
+WHOLE_TAPER, MOLAR_TAPER = 0.35, 0.5
+"""The same of a root as long as those of its kind: a single root ends in a blunt point, the roots of a molar stand apart."""
+FIRST_MOLAR = 6
 ROW_MM = 0.45
 WIDEST_BRIDGE_MM = 3.5
 """Between the two sides of a contact; wider, they are a tooth's front and back."""
@@ -33,13 +40,35 @@ HARMONICS = 3
 """Of the closed curve that the root's cross-section ends in."""
 
 
-def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: float = STUB_MM) -> Mesh:
+@dataclass(frozen=True)
+class Root:
+    """Form of a made-up root; its cross-section narrows evenly from the cervical line to the end."""
+
+    length_mm: float = STUB_MM
+    """Beyond the cervical line's most apical point."""
+    taper: float = TAPER
+    """Width at the end, before it is rounded, to that of the cervical line."""
+    rounding_mm: float = ROUNDING_MM
+    """Height of the rounded end, part of the length."""
+
+
+STUB = Root()
+
+
+def whole_root(fdi: int) -> Root:
+    """The root of a tooth of average length for its kind; molars' several roots are one, as wide as they are together."""
+    place = fdi % 10
+    return Root(root_length_mm(place, is_upper=is_upper(fdi)), MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER)
+
+
+def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Root = STUB) -> Mesh:
     """A watertight solid whose surface outside the gums is the crown's own triangles.
 
     Args:
         crown: open surface, one piece but for what is thrown away: specks, and faces at edges of more than two.
         occlusal: unit vector along the tooth's axis, out of the mouth's gums.
         name: of the tooth, for errors.
+        root: what continues it.
 
     Raises:
         MeshError: the crown is closed, or not cut off by its cervical line across the axis.
@@ -57,7 +86,7 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, stub_mm: 
 
     crown = _bridge_contacts(crown, occlusal)
     loop = boundary_loops(crown.faces)[0]
-    rows, pole = _stub_rows(crown.vertices_mm[loop], occlusal, stub_mm)
+    rows, pole = _stub_rows(crown.vertices_mm[loop], occlusal, root)
     first, around = len(crown.vertices_mm), len(loop)
     ring = np.concatenate([loop[None], first + np.arange(len(rows) * around).reshape(len(rows), around)])
     vertices = np.concatenate([crown.vertices_mm, rows.reshape(-1, 3), pole[None]])
@@ -131,25 +160,25 @@ def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
 
 
 def _stub_rows(
-    loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], stub_mm: float
+    loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], root: Root
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Columns run from the cervical line to a smooth ring across the axis, and on over a rounded end to a pole.
     height = loop_mm @ occlusal
     flat = loop_mm - np.outer(height, occlusal)
     centre = flat.mean(axis=0)
-    end = centre + TAPER * _smooth_ring(flat - centre, occlusal)
-    end_height = height.min() - stub_mm + ROUNDING_MM
+    end = centre + root.taper * _smooth_ring(flat - centre, occlusal)
+    end_height = height.min() - root.length_mm + root.rounding_mm
 
     steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
     wall = harmonic_rows(loop_mm, end + end_height * occlusal, steps)
-    bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * ROUNDING_MM / ROW_MM))) + 1)[1:-1]
+    bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * root.rounding_mm / ROW_MM))) + 1)[1:-1]
     lid = np.stack(
         [
-            centre + np.cos(bend) * (end - centre) + (end_height - ROUNDING_MM * np.sin(bend)) * occlusal
+            centre + np.cos(bend) * (end - centre) + (end_height - root.rounding_mm * np.sin(bend)) * occlusal
             for bend in bends
         ]
     )
-    return np.concatenate([wall, lid]), centre + (end_height - ROUNDING_MM) * occlusal
+    return np.concatenate([wall, lid]), centre + (end_height - root.rounding_mm) * occlusal
 
 
 def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:

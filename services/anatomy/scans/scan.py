@@ -9,11 +9,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.patches import middle_mm
+from services.anatomy.scans.units import MM_PER_UNIT, Unit, require_anatomical_scale
+from services.anatomy.templates.average_arch import is_upper
 from services.core.errors import CaptureInputError, InputError
-from services.core.files.meshes import read_labelled_mesh
+from services.core.files.scans import SIDECARS, ScanFile, read_scan_file, read_sidecar
 from services.core.geometry import Mesh
 
-Numbering = Literal["universal", "fdi"]
+Numbering = Literal["universal", "fdi", "either"]
+"""How labels name teeth; ``either`` takes FDI numbers where the labels name teeth of one jaw in them, else Universal ones."""
+Jaw = Literal["upper", "lower"]
 
 GINGIVA = 0
 EXTENT_MM = (8.0, 200.0)
@@ -26,6 +31,8 @@ class LabelledScan:
 
     mesh: Mesh
     fdi: NDArray[np.int64]
+    doubled_vertices: int = 0
+    """How many vertices of the file were copies of others and were joined with them."""
 
     @property
     def teeth(self) -> tuple[int, ...]:
@@ -45,30 +52,42 @@ def fdi_from_universal(number: int) -> int:
     return 10 * (quadrant + 1) + (8 - place if quadrant % 2 == 0 else place + 1)
 
 
-def read_scan(path: Path, numbering: Numbering = "universal", array: str = "Label") -> LabelledScan:
-    """Read a VTK PolyData file (.vtp) with a cell array of labels, or a PLY file with a face property of labels; mm.
+def read_scan(
+    path: Path,
+    numbering: Numbering = "universal",
+    labels: str = "Label",
+    *,
+    units: Unit = "mm",
+    jaw: Jaw | None = None,
+) -> LabelledScan:
+    """Read a scan (.vtp, .ply, .stl or .obj) with a label for each triangle or each vertex.
 
     Args:
+        path: of the scan.
         numbering: how labels name teeth; 0 is gingiva in either.
-        array: name of the cell array or face property.
+        labels: name of the file's array or property; or of a file beside the scan (.json, .npy, .txt, .csv), which a
+            format without properties needs.
+        units: of the file's coordinates.
+        jaw: which jaw the scan is said to be of; None where nothing is said.
 
     Raises:
-        CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one jaw. MeshError: not in millimetres.
+        CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one jaw.
+        MeshError: of a size that no jaw has in this unit.
     """
-    mesh, arrays = read_labelled_mesh(path)
-    found = next((values for name, values in arrays.items() if name.lower() == array.lower()), None)
-    if found is None:
-        held = ", ".join(sorted(arrays)) or "none"
-        raise CaptureInputError(
-            f"Scan {path} has no label per triangle named {array} (it has: {held}); export it with its segmentation."
-        )
-    values = np.asarray(found, dtype=np.float64)
-    if values.shape != (len(mesh.faces),):
-        raise CaptureInputError(
-            f"Scan {path} has labels {array} of shape {values.shape} for {len(mesh.faces)} triangles; export one label per triangle."
-        )
+    file = read_scan_file(path)
+    values = _triangle_labels(file, path, labels)
+    mesh, doubled = _welded(file.mesh)
+    mesh = Mesh(MM_PER_UNIT[units] * mesh.vertices_mm, mesh.faces)
+    scan = LabelledScan(mesh, _fdi_numbers(values, numbering, path), doubled)
+    _require_one_jaw(scan, path, jaw)
+    if np.isfinite(mesh.vertices_mm).all():
+        middles = [middle_mm(Mesh(mesh.vertices_mm, mesh.faces[scan.fdi == number])) for number in scan.teeth]
+        require_anatomical_scale(scan.teeth, np.array(middles), units, f"scan {path}")
     mesh.require_surface(f"of scan {path}", EXTENT_MM)
-    scan = LabelledScan(mesh, _fdi_numbers(values, numbering, path))
+    return scan
+
+
+def _require_one_jaw(scan: LabelledScan, path: Path, jaw: Jaw | None) -> None:
     if not (scan.fdi == GINGIVA).any():
         raise CaptureInputError(
             f"Scan {path} has no gingiva (label {GINGIVA}); export it with the gums around the teeth."
@@ -77,19 +96,70 @@ def read_scan(path: Path, numbering: Numbering = "universal", array: str = "Labe
         raise CaptureInputError(
             f"Scan {path} has {len(scan.teeth)} labelled teeth; export at least two, which tell left from right."
         )
-    if len({number // 10 in (1, 2) for number in scan.teeth}) > 1:
+    if len({is_upper(number) for number in scan.teeth}) > 1:
         raise CaptureInputError(
             f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend the labels."
         )
-    return scan
+    found = "upper" if is_upper(scan.teeth[0]) else "lower"
+    if jaw is not None and jaw != found:
+        raise CaptureInputError(
+            f"Scan {path} is said to be of the {jaw} jaw, but its labels name teeth of the {found} one "
+            f"({', '.join(map(str, scan.teeth))}); correct jaw in [scan], or give the other scan."
+        )
+
+
+def _triangle_labels(file: ScanFile, path: Path, labels: str) -> NDArray[np.float64]:
+    # One label a triangle, from the file itself or from one beside it.
+    if Path(labels).suffix.lower() in SIDECARS:
+        beside = path.parent / labels
+        return _per_triangle(read_sidecar(beside), file, f"Label file {beside}")
+    for arrays in (file.triangle_arrays, file.vertex_arrays):
+        found = next((values for name, values in arrays.items() if name.lower() == labels.lower()), None)
+        if found is not None:
+            return _per_triangle(np.asarray(found, dtype=np.float64), file, f"Scan {path}, array {labels},")
+    held = ", ".join(sorted(file.triangle_arrays | file.vertex_arrays)) or "none"
+    raise CaptureInputError(
+        f"Scan {path} has no label per triangle named {labels} (it has: {held}); export it with its segmentation, "
+        "or name a file of labels beside it (.json, .npy, .txt, .csv)."
+    )
+
+
+def _per_triangle(values: NDArray[np.float64], file: ScanFile, what: str) -> NDArray[np.float64]:
+    triangles, vertices = len(file.mesh.faces), len(file.mesh.vertices_mm)
+    if values.shape == (triangles,):
+        return values
+    if values.shape == (vertices,):
+        # The label that two of the corners share; of three different ones the first.
+        one, two, three = (values[file.mesh.faces[:, k]] for k in range(3))
+        return np.asarray(np.where(two == three, two, one))
+    raise CaptureInputError(
+        f"{what} has labels of shape {values.shape} for {triangles} triangles and {vertices} vertices; export one a triangle."
+    )
+
+
+def _welded(mesh: Mesh) -> tuple[Mesh, int]:
+    # Vertices at one place are one; an STL file writes each of them some six times. Single precision is what scanners write.
+    joined, first, index = np.unique(
+        mesh.vertices_mm.astype(np.float32), axis=0, return_index=True, return_inverse=True
+    )
+    doubled = len(mesh.vertices_mm) - len(joined)
+    if doubled == 0:
+        return mesh, 0
+    # The order of the file is kept.
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return Mesh(mesh.vertices_mm[first[order]], rank[index.reshape(-1)][mesh.faces].astype(np.int32)), doubled
 
 
 def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) -> NDArray[np.int64]:
     names = {fdi_from_universal(n): n for n in range(1, 33)}
+    labels, index = np.unique(values, return_inverse=True)
+    if numbering == "either":
+        numbering = "fdi" if _names_one_jaw(labels, frozenset(names)) else "universal"
     number_of = {float(GINGIVA): GINGIVA} | {
         float(n if numbering == "universal" else fdi): fdi for fdi, n in names.items()
     }
-    labels, index = np.unique(values, return_inverse=True)
     unknown = [f"{label:g}" for label in labels if float(label) not in number_of]
     if unknown:
         expected = "1 to 32" if numbering == "universal" else "11 to 48"
@@ -97,3 +167,8 @@ def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) 
             f"Scan {path} has label {unknown[0]}, which names no tooth in {numbering} numbering; give {GINGIVA} for gingiva, {expected} for teeth."
         )
     return np.array([number_of[float(label)] for label in labels], dtype=np.int64)[index.reshape(-1)]
+
+
+def _names_one_jaw(labels: NDArray[np.float64], fdi: frozenset[int]) -> bool:
+    teeth = [float(label) for label in labels if label != GINGIVA]
+    return all(label in fdi for label in teeth) and len({is_upper(int(label)) for label in teeth}) <= 1

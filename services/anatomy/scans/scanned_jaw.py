@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +11,18 @@ from numpy.typing import NDArray
 from services.anatomy.frame import ToothFrame
 from services.anatomy.scans.patches import (
     areas_mm2,
+    boundary_loops,
     compact,
     fill_holes,
     manifold_piece,
+    middle_mm,
     smooth_borders,
     smooth_labels,
     touching_pieces,
     vector_area_mm2,
     without_specks,
 )
-from services.anatomy.scans.roots import close_crown
+from services.anatomy.scans.roots import STUB, Root, close_crown, whole_root
 from services.anatomy.scans.scan import GINGIVA, LabelledScan
 from services.anatomy.scans.scanned_gums import gums_solid
 from services.anatomy.templates.average_arch import nominal_places, side_of_front
@@ -35,6 +38,28 @@ FLAT = 0.2
 
 
 @dataclass(frozen=True)
+class Repairs:
+    """What was wrong with a scan's surface and is mended."""
+
+    doubled_vertices: int
+    """Joined with others at the same place."""
+    removed_triangles: int
+    """Without area, twice there, at edges of more than two, or apart from the jaw."""
+    holes_mm: tuple[float, ...]
+    """Lengths around the holes that were closed, the longest first."""
+
+    def sentence(self) -> str:
+        """For a report."""
+        holes = f"{len(self.holes_mm)} holes closed" + (
+            f" (the longest {self.holes_mm[0]:.1f} mm around)" if self.holes_mm else ""
+        )
+        return (
+            f"{self.doubled_vertices} doubled vertices joined, {self.removed_triangles} triangles removed that did not "
+            f"belong to one plain surface, {holes}."
+        )
+
+
+@dataclass(frozen=True)
 class ScannedJaw:
     """Solids in arch coordinates, mm. Teeth overlap the gums, which hold their roots; roots are made up, and so is the gums' base."""
 
@@ -44,23 +69,24 @@ class ScannedJaw:
     gums: Mesh
     arch_from_scan: NDArray[np.float64]
     """Rigid transform (4, 4)."""
+    repairs: Repairs
 
 
-def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
+def jaw_from_scan(scan: LabelledScan, roots: Literal["stub", "whole"] = "stub") -> ScannedJaw:
     """Close every crown and the gums of a scan.
+
+    Args:
+        scan: of one jaw.
+        roots: a stub of 4 mm, all that a camera's light reaches, or as long as the average of the tooth's kind.
 
     Raises:
         CaptureInputError: a label is in several pieces, or left and right are exchanged. MeshError: a part cannot be closed.
     """
     _require_whole_teeth(scan)
-    surface, labels = _clean(scan)
+    surface, labels, repairs = _clean(scan)
     crowns = {number: compact(Mesh(surface.vertices_mm, surface.faces[labels == number])) for number in scan.teeth}
-    middles = np.array(
-        [
-            np.average(crown.vertices_mm[crown.faces].mean(axis=1), axis=0, weights=areas_mm2(crown))
-            for crown in crowns.values()
-        ]
-    )
+    middles = np.array([middle_mm(crown) for crown in crowns.values()])
+    _require_outward(surface, labels)
     rotation = _arch_axes(scan.teeth, surface, middles)
     turned = surface.vertices_mm @ rotation.T
     shift = -(turned.min(axis=0) + turned.max(axis=0)) / 2
@@ -70,12 +96,30 @@ def jaw_from_scan(scan: LabelledScan) -> ScannedJaw:
     crowns = {number: Mesh(crown.vertices_mm @ rotation.T + shift, crown.faces) for number, crown in crowns.items()}
     axes = _tooth_axes(scan.teeth, crowns, middles @ rotation.T + shift)
     teeth = tuple(
-        Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}")) for number in scan.teeth
+        Tooth(number, close_crown(crowns[number], axes[number][2], f"tooth {number}", _root(number, roots)))
+        for number in scan.teeth
     )
     deepest = min(float(tooth.outer.vertices_mm[:, 2].min()) for tooth in teeth)
     gums = gums_solid(surface, labels == GINGIVA, np.array([0.0, 0.0, 1.0]), deepest)
     frames = tuple(ToothFrame.centred(axes[tooth.fdi], tooth.outer) for tooth in teeth)
-    return ScannedJaw(teeth, frames, gums, np.block([[rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
+    arch_from_scan = np.block([[rotation, shift[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    return ScannedJaw(teeth, frames, gums, arch_from_scan, repairs)
+
+
+def _root(fdi: int, roots: Literal["stub", "whole"]) -> Root:
+    return whole_root(fdi) if roots == "whole" else STUB
+
+
+def _require_outward(surface: Mesh, labels: NDArray[np.int64]) -> None:
+    # Crowns stand above the gingiva at their necks, seen along the surface's mean normal; in a mirror they hang below.
+    crowns, gingiva = (Mesh(surface.vertices_mm, surface.faces[keep]) for keep in (labels > 0, labels == GINGIVA))
+    neck = np.intersect1d(crowns.faces, gingiva.faces)
+    rise = (middle_mm(crowns) - surface.vertices_mm[neck].mean(axis=0)) @ _unit(vector_area_mm2(surface))
+    if rise < 0:
+        raise CaptureInputError(
+            "The scan is inside out or a mirror image: its teeth point into the gums; "
+            "turn its triangles around, or mirror the scan back, and export it again."
+        )
 
 
 def _require_whole_teeth(scan: LabelledScan) -> None:
@@ -90,7 +134,7 @@ def _require_whole_teeth(scan: LabelledScan) -> None:
             )
 
 
-def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:
+def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64], Repairs]:
     # One manifold surface with one rim, labels without specks and with smooth borders.
     kept = manifold_piece(scan.mesh)
     labels = scan.fdi[kept]
@@ -100,10 +144,19 @@ def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64]]:
         raise CaptureInputError(
             f"In the scan {what} hangs together with nothing else; export one connected surface of the jaw."
         )
-    surface, sources = fill_holes(compact(Mesh(scan.mesh.vertices_mm, scan.mesh.faces[kept])))
+    surface = compact(Mesh(scan.mesh.vertices_mm, scan.mesh.faces[kept]))
+    holes_mm = sorted(
+        (_length_mm(surface.vertices_mm[loop]) for loop in boundary_loops(surface.faces)[1:]), reverse=True
+    )
+    repairs = Repairs(scan.doubled_vertices, int(np.count_nonzero(~kept)), tuple(holes_mm))
+    surface, sources = fill_holes(surface)
     labels = np.concatenate([labels, labels[sources]])
     labels = without_specks(surface, smooth_labels(surface.faces, labels))
-    return smooth_borders(surface, labels), labels
+    return smooth_borders(surface, labels), labels, repairs
+
+
+def _length_mm(loop_mm: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.roll(loop_mm, -1, axis=0) - loop_mm, axis=1).sum())
 
 
 def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Average dimensions of the upper teeth: Wheeler's averages, some recalled, all recorded in steps of 0.5 mm."""
+"""Average dimensions of the upper teeth, and roots of both jaws: Wheeler's averages, some recalled, all recorded in steps of 0.5 mm."""
 
 from __future__ import annotations
 
@@ -42,6 +42,16 @@ UPPER_TEETH = (
     ToothDimensions("second molar", 7, 7.0, 9.0, 7.0, 11.0, 10.0, 1.0, 0.0, "from memory"),
     ToothDimensions("third molar", 8, 6.5, 8.5, 6.5, 10.0, 9.5, 1.0, 0.0, "from memory"),
 )
+
+
+UPPER_ROOTS_MM = (13.0, 13.0, 17.0, 14.0, 14.0, 13.0, 12.0, 11.0)
+LOWER_ROOTS_MM = (12.5, 14.0, 16.0, 14.0, 14.5, 14.0, 13.0, 11.0)
+"""Cervical line to apex by place from the midline, recalled from Wheeler's table of averages; of molars the longest root."""
+
+
+def root_length_mm(position: int, *, is_upper: bool) -> float:
+    """Average length of the root of the tooth at a place 1 to 8 from the midline."""
+    return (UPPER_ROOTS_MM if is_upper else LOWER_ROOTS_MM)[position - 1]
 
 
 def upper_tooth(position: int) -> ToothDimensions:

@@ -1,15 +1,13 @@
-"""Read and write meshes. The one place that chooses a mesh file format; trimesh does the parsing, imported when needed, ``vtk_polydata`` that of VTK."""
+"""Read and write meshes: the one place that chooses a mesh file format. trimesh does the parsing; ``scans`` reads labelled scans."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, MeshError
-from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh, Tooth, teeth_folder
 
 FDI_NUMBERS = frozenset(
@@ -41,36 +39,6 @@ def read_mesh(path: Path) -> Mesh:
         raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     return Mesh(welded, index.reshape(-1)[faces].astype(np.int32))
-
-
-def read_labelled_mesh(path: Path) -> tuple[Mesh, dict[str, NDArray[Any]]]:
-    """Read a VTK PolyData (.vtp) or PLY file as it stands, with what it says of each face by name, (F,) or (F, components).
-
-    Raises:
-        CaptureInputError: absent, unreadable, or of a format that holds nothing about faces.
-    """
-    if path.suffix.lower() == ".vtp":
-        data = read_polydata(path)
-        return Mesh(data.points, data.triangles), data.cell_arrays
-    if path.suffix.lower() != ".ply":
-        raise CaptureInputError(f"Scan {path} is neither .vtp nor .ply; export it as labelled VTK PolyData or PLY.")
-    if not path.is_file():
-        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
-    import trimesh
-
-    try:
-        loaded = trimesh.load_mesh(path, process=False)
-        # The only place where trimesh keeps properties of a PLY file's faces.
-        properties = loaded.metadata["_ply_raw"]["face"]["data"]
-        names = properties.dtype.names if isinstance(properties, np.ndarray) else tuple(properties)
-        arrays = {
-            name: np.asarray(properties[name]).reshape(-1)
-            for name in names
-            if name not in ("vertex_indices", "vertex_index")
-        }
-        return Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32)), arrays
-    except Exception as problem:
-        raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

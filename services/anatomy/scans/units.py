@@ -1,0 +1,61 @@
+"""In which unit a scan was written, judged by how far apart its teeth stand."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.anatomy.templates.average_arch import is_upper, side_of_front
+from services.anatomy.templates.dimensions import upper_tooth
+from services.core.errors import MeshError
+
+Unit = Literal["mm", "cm", "m", "inch"]
+
+MM_PER_UNIT = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4})
+LIKELY = (0.6, 1.6)
+"""Distance between neighbouring teeth to that of average upper ones, as a median over a jaw: lower incisors are narrower by a third,
+teeth of one person differ from the average by up to 20 %, and crowded or gapped arches by as much again."""
+
+
+def neighbour_ratio(teeth: tuple[int, ...], middles: NDArray[np.float64]) -> float | None:
+    """Median distance between the middles (N, 3) of teeth that stand side by side, relative to average widths in mm.
+
+    None where no two of the teeth are neighbours.
+    """
+    along = {side_of_front(fdi) * (fdi % 10) - (side_of_front(fdi) > 0): k for k, fdi in enumerate(teeth)}
+    ratios = [
+        float(np.linalg.norm(middles[along[place + 1]] - middles[k])) / _pitch_mm(teeth[k], teeth[along[place + 1]])
+        for place, k in along.items()
+        if place + 1 in along and is_upper(teeth[k]) == is_upper(teeth[along[place + 1]])
+    ]
+    return float(np.median(ratios)) if ratios else None
+
+
+def require_anatomical_scale(teeth: tuple[int, ...], middles_mm: NDArray[np.float64], unit: Unit, what: str) -> None:
+    """Refuse a scan whose teeth are as far apart as nobody's, and name the unit in which they would be somebody's.
+
+    Args:
+        middles_mm: of the crowns (N, 3), after conversion from ``unit``.
+        what: the scan's name for the message.
+
+    Raises:
+        MeshError: names the unit that fits.
+    """
+    ratio = neighbour_ratio(teeth, middles_mm)
+    if ratio is None or LIKELY[0] <= ratio <= LIKELY[1]:
+        return
+    scaled = {name: ratio * factor / MM_PER_UNIT[unit] for name, factor in MM_PER_UNIT.items()}
+    fitting = sorted(
+        (name for name, value in scaled.items() if LIKELY[0] <= value <= LIKELY[1]),
+        key=lambda name: abs(float(np.log(scaled[name]))),
+    )
+    said = f"Teeth in {what} stand {ratio:.3g} times as far apart as average ones if its unit is {unit}"
+    remedy = f"it seems to be in {fitting[0]}: say units = '{fitting[0]}'" if fitting else "export it in millimetres"
+    raise MeshError(f"{said}; {remedy}.")
+
+
+def _pitch_mm(one: int, two: int) -> float:
+    return (upper_tooth(one % 10).md_crown_mm + upper_tooth(two % 10).md_crown_mm) / 2

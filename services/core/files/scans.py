@@ -1,0 +1,130 @@
+"""Read a scan's file as it stands, with what it says of each triangle and of each vertex: VTK PolyData, PLY, STL and OBJ."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.files.vtk_polydata import read_polydata
+from services.core.geometry import Mesh
+
+FORMATS = (".vtp", ".ply", ".stl", ".obj")
+SIDECARS = (".json", ".npy", ".txt", ".csv")
+MAX_TRIANGLES = 2_000_000
+"""Ten times those of a fine intra-oral scan; repairing more takes minutes and gigabytes, and shows nothing more of a tooth."""
+STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
+"""Of a binary STL file: 80 bytes of text and a count, then 50 bytes a triangle."""
+PLY_HEAD_BYTES = 65536
+"""Enough for the head of a PLY file, which says how many faces follow."""
+
+
+@dataclass(frozen=True)
+class ScanFile:
+    """A surface in its file's unit, and arrays by name, of each triangle (F,) or (F, components) and of each vertex (V,)."""
+
+    mesh: Mesh
+    triangle_arrays: dict[str, NDArray[Any]]
+    vertex_arrays: dict[str, NDArray[Any]]
+
+
+def read_scan_file(path: Path) -> ScanFile:
+    """Read a scan; nothing is welded or turned around.
+
+    Raises:
+        CaptureInputError: absent, unreadable, of another format, or of more triangles than a scan has.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise CaptureInputError(f"Scan {path} is neither .vtp, .ply, .stl nor .obj; export it as one of these.")
+    if not path.is_file():
+        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+    require_few_triangles(path, _announced_triangles(path))
+    found = _read_polydata(path) if suffix == ".vtp" else _read_by_trimesh(path)
+    if len(found.mesh.faces) == 0:
+        raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
+    if found.mesh.faces.min() < 0 or found.mesh.faces.max() >= len(found.mesh.vertices_mm):
+        raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
+    require_few_triangles(path, len(found.mesh.faces))
+    return found
+
+
+def require_few_triangles(path: Path, count: int) -> None:
+    """Refuse a scan of more triangles than any tooth needs.
+
+    Raises:
+        CaptureInputError: says how many there are and how many are enough.
+    """
+    if count > MAX_TRIANGLES:
+        raise CaptureInputError(
+            f"Scan {path} has {count:,} triangles, more than {MAX_TRIANGLES:,}; "
+            "reduce it to 500,000 or fewer in the scanner's program and export it again."
+        )
+
+
+def read_sidecar(path: Path) -> NDArray[np.float64]:
+    """Labels from a file beside the scan: numbers one a line (.txt, .csv), an array (.npy), or ``labels`` of a .json file.
+
+    Raises:
+        CaptureInputError: absent, of another format, or no list of numbers.
+    """
+    if not path.is_file():
+        raise CaptureInputError(f"Label file {path} does not exist; put it there or correct its name.")
+    try:
+        if path.suffix.lower() == ".json":
+            return np.asarray(json.loads(path.read_text())["labels"], dtype=np.float64).reshape(-1)
+        if path.suffix.lower() == ".npy":
+            return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64).reshape(-1)
+        return np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
+    except (ValueError, KeyError, TypeError, EOFError) as problem:
+        raise CaptureInputError(
+            f"Label file {path} cannot be read ({problem}); give one number a line, an .npy array or a .json file with 'labels'."
+        ) from problem
+
+
+def _announced_triangles(path: Path) -> int:
+    # What the file's head says, so that a file that is too large is refused before it is read.
+    with path.open("rb") as file:
+        head = file.read(PLY_HEAD_BYTES)
+    if path.suffix.lower() == ".stl" and len(head) >= STL_HEADER_BYTES:
+        count = int(struct.unpack_from("<I", head, 80)[0])
+        whole = path.stat().st_size == STL_HEADER_BYTES + STL_TRIANGLE_BYTES * count
+        return count if whole else 0
+    if path.suffix.lower() == ".ply":
+        words = head.partition(b"end_header")[0].split()
+        counts = [words[k + 2] for k in range(len(words) - 2) if words[k : k + 2] == [b"element", b"face"]]
+        return int(counts[0]) if counts and counts[0].isdigit() else 0
+    return 0
+
+
+def _read_polydata(path: Path) -> ScanFile:
+    data = read_polydata(path)
+    return ScanFile(Mesh(data.points, data.triangles), data.cell_arrays, {})
+
+
+def _read_by_trimesh(path: Path) -> ScanFile:
+    import trimesh
+
+    # Vertices keep the file's order, which a sidecar of one label a vertex counts on.
+    options = {"skip_materials": True, "maintain_order": True} if path.suffix.lower() == ".obj" else {}
+    try:
+        loaded = trimesh.load_mesh(path, process=False, **options)
+        mesh = Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32))
+        raw = loaded.metadata.get("_ply_raw", {}) if path.suffix.lower() == ".ply" else {}
+        triangles, vertices = (_properties(raw[what]["data"]) if what in raw else {} for what in ("face", "vertex"))
+    except Exception as problem:
+        raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
+    return ScanFile(mesh, triangles, vertices)
+
+
+def _properties(data: Any) -> dict[str, NDArray[Any]]:
+    # The only place where trimesh keeps properties of a PLY file's faces and vertices.
+    names = data.dtype.names if isinstance(data, np.ndarray) else tuple(data)
+    geometry = ("vertex_indices", "vertex_index", "x", "y", "z")
+    return {name: np.asarray(data[name]).reshape(-1) for name in names if name not in geometry}
