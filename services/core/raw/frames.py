@@ -1,0 +1,135 @@
+"""Counts of one frame of a raw folder, held against what ``raw.toml`` says of its camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.raw.decoding import Decoded, decode
+from services.core.raw.folder import require_inside
+from services.core.raw.records import RawCamera, RawFolder, RawFrame
+
+Counts = NDArray[np.uint16] | NDArray[np.float32]
+_LETTERS = {"red": "R", "green": "G", "blue": "B"}
+GREENS_APART = 4.0
+"""How many times further apart the two green pixels of a mosaic may be than its red and blue ones before it is taken for another."""
+CLEARLY_APART = 0.05
+"""Relative difference of the green pixels' means below which nothing is said: sensors' two greens differ by 1 or 2 %."""
+
+
+def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
+    """Counts of a frame, whole numbers as uint16 and others as float32.
+
+    Returns:
+        (H, W) of a mosaic; (H, W, C) of other cameras, in the order of ``folder.channels``.
+
+    Raises:
+        CaptureInputError: names the file, its camera and light, and what is wrong with it.
+        PlatformError: the extra ``raw`` is needed and absent.
+    """
+    what = f"Frame {root / frame.file} ({frame.label})"
+    path = require_inside(root, frame.file, what)
+    camera = folder.camera_named(frame.camera)
+    try:
+        decoded = decode(path)
+        counts = _significant(_shaped(decoded, camera), camera)
+        _require_pattern(decoded, counts, camera)
+    except OSError as problem:
+        raise CaptureInputError(
+            f"{what} cannot be opened ({problem.strerror}); check the disk and its permissions."
+        ) from problem
+    except ValueError as problem:
+        raise CaptureInputError(f"{what} {problem}.") from problem
+    if camera.mosaic != "none":
+        return counts
+    order = [camera.channels.index(channel) for channel in folder.channels]
+    if order != sorted(order):
+        counts[:] = counts[..., order]
+    return counts
+
+
+def _shaped(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
+    """The file's values, (H, W) or (H, W, C) as the camera says, channels in the camera's order."""
+    values, names = decoded.values, decoded.names
+    if names is not None and len(names) == len(camera.channels) and camera.mosaic == "none":
+        letters = [_LETTERS.get(channel, channel) for channel in camera.channels]
+        if len(names) > 1 and set(names) != set(letters):
+            raise ValueError(
+                f"has channels {', '.join(names)}, but its camera has {', '.join(camera.channels)}; rename them"
+            )
+        values = values[..., [names.index(letter) for letter in letters]] if len(names) > 1 else values
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    width, height = camera.size
+    if values.ndim not in {2, 3} or values.shape[:2] != (height, width):
+        size = " x ".join(map(str, (values.shape[1::-1] if values.ndim in {2, 3} else values.shape)))
+        turned = " (turned by 90 degrees?)" if values.shape[:2] == (width, height) else ""
+        raise ValueError(
+            f"has {size} pixels{turned}, but its camera has {width} x {height}; export it at the camera's size"
+        )
+    in_file = 1 if values.ndim == 2 else values.shape[2]
+    if camera.mosaic != "none" and in_file != 1:
+        raise ValueError(f'has {in_file} channels, but its camera\'s files hold a mosaic of one; set mosaic = "none"')
+    if camera.mosaic == "none" and in_file != len(camera.channels):
+        hint = "name its mosaic" if in_file == 1 else "correct the camera's channels"
+        raise ValueError(
+            f"has {in_file} channels, but its camera has {len(camera.channels)}; {hint}, or export it again"
+        )
+    return values if camera.mosaic != "none" else values.reshape(height, width, in_file)
+
+
+def _significant(values: NDArray[np.generic], camera: RawCamera) -> Counts:
+    """Counts without the bits that carry nothing."""
+    if np.issubdtype(values.dtype, np.floating) and values.dtype.itemsize <= 4:
+        numbers = np.array(values, dtype=np.float32)
+        if broken := int(np.count_nonzero(~np.isfinite(numbers))):
+            raise ValueError(f"has {broken} values that are no finite numbers; export it again")
+        return numbers
+    if values.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise ValueError(
+            f"holds numbers of type {values.dtype}; export whole numbers of 8 or 16 bits, or single precision"
+        )
+    if camera.bits is None:
+        raise ValueError("holds whole numbers, and how many of their bits count is not said; give the camera its bits")
+    held = 8 * values.dtype.itemsize
+    if camera.bits + camera.shift > held:
+        raise ValueError(
+            f"has {held} bits a count, but its camera has {camera.bits}{f' moved up by {camera.shift}' if camera.shift else ''}; "
+            "export it at the camera's depth, or correct bits and shift"
+        )
+    counts = values.astype(np.uint16) >> np.uint16(camera.shift)
+    most = int(counts.max())
+    if most >= 2**camera.bits:
+        raise ValueError(
+            f"holds a count of {most}, more than the {camera.bits} bits of its camera; correct bits, "
+            "or set shift where they lie in the high bits"
+        )
+    return counts
+
+
+def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> None:
+    """Refuse a mosaic that starts at another colour than the camera's."""
+    if camera.mosaic == "none":
+        if decoded.pattern is not None:
+            raise ValueError(f"is a mosaic that begins {decoded.pattern}, but its camera has none; set mosaic")
+        return
+    if decoded.pattern is not None:
+        if decoded.pattern != camera.mosaic:
+            raise ValueError(
+                f"is a mosaic that begins {decoded.pattern}, but its camera's begins {camera.mosaic}; correct mosaic"
+            )
+        return
+    if min(counts.shape) < 2:
+        raise ValueError("is too small to hold a mosaic; correct mosaic")
+    # Both greens see the same light; where they differ and the other two agree, the pattern begins one pixel further.
+    means = [float(counts[k // 2 :: 2, k % 2 :: 2].mean()) for k in range(4)]
+    greens = [mean for mean, letter in zip(means, camera.mosaic, strict=True) if letter == "G"]
+    others = [mean for mean, letter in zip(means, camera.mosaic, strict=True) if letter != "G"]
+    apart, expected = abs(greens[0] - greens[1]), abs(others[0] - others[1])
+    if apart > GREENS_APART * expected and apart > CLEARLY_APART * sum(greens):
+        raise ValueError(
+            f"has green pixels that differ by {apart / (0.5 * sum(greens)):.0%}, so it does not begin {camera.mosaic}; correct mosaic"
+        )

@@ -1,0 +1,36 @@
+"""Colours of a mosaic's pixels."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.raw.records import Mosaic
+
+N = TypeVar("N", bound=np.generic)
+CHANNEL_OF = {"R": 0, "G": 1, "B": 2}
+
+
+def site_channels(mosaic: Mosaic) -> NDArray[np.intp]:
+    """Channel (0 red, 1 green, 2 blue) of each pixel of the pattern, (2, 2), row by row."""
+    return np.array([CHANNEL_OF[letter] for letter in mosaic], dtype=np.intp).reshape(2, 2)
+
+
+def sites(counts: NDArray[N], mosaic: Mosaic) -> list[tuple[int, NDArray[N]]]:
+    """Each of the four pixels of the pattern: its channel, and a view (H/2, W/2) of all pixels in its place."""
+    channels = site_channels(mosaic)
+    return [(int(channels[y, x]), counts[y::2, x::2]) for y in range(2) for x in range(2)]
+
+
+def binned(counts: NDArray[Any], mosaic: Mosaic) -> NDArray[np.float32]:
+    """Image of half the size (H // 2, W // 2, 3), each channel the mean of its pixels in each 2 x 2; nothing is interpolated.
+
+    Red and blue are sampled a quarter of a binned pixel beside its centre, in opposite directions.
+    """
+    height, width = (length // 2 * 2 for length in counts.shape)
+    image = np.zeros((height // 2, width // 2, 3), dtype=np.float32)
+    for channel, view in sites(counts[:height, :width], mosaic):
+        image[..., channel] += view.astype(np.float32) * np.float32(0.5 if channel == 1 else 1.0)
+    return image
