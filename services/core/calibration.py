@@ -8,8 +8,9 @@ from typing import Literal
 
 from pydantic import Field
 
+from services.core.calibrated import CalibratedCamera, CalibratedLight, CameraColour, is_absent
 from services.core.errors import CaptureInputError
-from services.core.geometry import Camera, Light, Record
+from services.core.geometry import Camera, Record
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
 from services.core.uncertainty import CalibrationUncertainty, require_known_names
@@ -27,15 +28,31 @@ MIN_INTENSITY, MAX_INTENSITY = 1e-12, 1e24
 
 
 class Calibration(Record):
-    """The part of ``capture.json`` that a rig is calibrated for."""
+    """``calibration.json``: cameras and lights of a rig. The part of ``capture.json`` that a rig is calibrated for is one, too."""
 
     units: Literal["mm"]
     channels: tuple[str, ...] = Field(fail_fast=True)
-    cameras: tuple[Camera, ...] = Field(fail_fast=True)
-    lights: tuple[Light, ...] = Field(fail_fast=True)
+    cameras: tuple[CalibratedCamera, ...] = Field(fail_fast=True)
+    lights: tuple[CalibratedLight, ...] = Field(fail_fast=True)
     uncertainty: CalibrationUncertainty | None = Field(
         default=None, description="how wrong the calibration may be; null where that was not measured"
     )
+    made: str | None = Field(
+        default=None, exclude_if=is_absent, description="date and time of the calibration, ISO 8601"
+    )
+    valid_days: float | None = Field(default=None, exclude_if=is_absent, gt=0, description="for how long it holds")
+    inputs: dict[str, str] | None = Field(
+        default=None, exclude_if=is_absent, description="SHA-256 of each file that it was made from"
+    )
+    colour: dict[str, CameraColour] | None = Field(
+        default=None, exclude_if=is_absent, description="colours of each camera by its name; they apply to the asset"
+    )
+
+    @classmethod
+    def of_capture(cls, description: FolderCapture) -> Calibration:
+        """What a capture says of its cameras and lights."""
+        parts = {"units", "channels", "cameras", "lights", "uncertainty"}
+        return cls.model_validate(description.model_dump(include=parts))
 
 
 def published_capture(capture: Path) -> tuple[Path, str] | None:
@@ -87,6 +104,8 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
         )
     for camera in description.cameras:
         _require_possible(camera, origin)
+        if isinstance(camera, CalibratedCamera):
+            _require_each_channel(camera, len(description.channels), origin)
     for light in description.lights:
         if len(light.intensity) != len(description.channels):
             raise CaptureInputError(
@@ -106,6 +125,15 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
                 f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm."
             )
     require_known_names(description.uncertainty, description.channels, description.cameras, description.lights, origin)
+
+
+def _require_each_channel(camera: CalibratedCamera, channels: int, origin: str) -> None:
+    for key in ("radiance_per_count", "crosstalk"):
+        told = getattr(camera, key)
+        if told is not None and len(told) != channels:
+            raise CaptureInputError(
+                f"{origin}: camera {camera.name} has {key} of {len(told)} channels, and there are {channels}; give one per channel."
+            )
 
 
 def _require_possible(camera: Camera, origin: str) -> None:

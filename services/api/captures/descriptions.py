@@ -86,5 +86,5 @@ def describe(capture: Path) -> Described:
             )
     pixels: Mapping[str, int] = {camera.name: camera.size[0] * camera.size[1] for camera in description.cameras}
     seen = [image.camera for image in description.images] or [name for name in pixels for _ in description.lights]
-    calibration = Calibration(**{part: getattr(description, part) for part in Calibration.model_fields})
+    calibration = Calibration.of_capture(description)
     return Described(calibration=calibration, image_px=sum(pixels.get(name, 0) for name in seen))

@@ -1,0 +1,89 @@
+"""Cameras and lights with what a calibration has measured of them beside where they are.
+
+A camera's radiance from its counts, with q the squared distance of the pixel from the principal point, in units of half the
+image's diagonal and in the image as it was taken:
+
+    radiance = (counts - black_counts) / (exposure_s * gain * (1 + a q + b q² + c q³)) * radiance_per_count
+
+Only the product of intensity and radiance can be measured, so the lights' intensities have a mean of 1 in every channel.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from services.core.geometry import Camera, Light, Matrix3, Record, Vector3
+
+DISTORTION_LENGTHS = frozenset({4, 5, 8, 12, 14})
+"""How many coefficients OpenCV's lens models have."""
+Positive = Annotated[float, Field(gt=0)]
+
+
+def is_absent(value: object) -> bool:
+    """Keeps the stored form of what an earlier version wrote, whose digest is its name."""
+    return value is None
+
+
+class CalibratedCamera(Camera):
+    """A camera with its lens and the way from its counts to radiance."""
+
+    distortion: tuple[float, ...] | None = Field(
+        default=None, exclude_if=is_absent, description="of the lens, in OpenCV's order; null for a pinhole"
+    )
+    vignetting: Vector3 | None = Field(
+        default=None, exclude_if=is_absent, description="a, b, c of the fall of light; null where there is none"
+    )
+    radiance_per_count: tuple[Positive, ...] | None = Field(
+        default=None, exclude_if=is_absent, description="at 1 s and gain 1, one number a channel"
+    )
+    black_counts: float | None = Field(default=None, exclude_if=is_absent, ge=0, description="counts without light")
+    read_noise_counts: float | None = Field(
+        default=None, exclude_if=is_absent, ge=0, description="standard deviation without light, before rounding"
+    )
+    counts_per_electron: Positive | None = Field(default=None, exclude_if=is_absent, description="at gain 1")
+    crosstalk: tuple[tuple[float, ...], ...] | None = Field(
+        default=None,
+        exclude_if=is_absent,
+        description="what each channel (row) reads of each channel's own light (column); its diagonal is 1",
+    )
+
+    @model_validator(mode="after")
+    def _possible_lens(self) -> CalibratedCamera:
+        if self.distortion is not None and len(self.distortion) not in DISTORTION_LENGTHS:
+            lengths = ", ".join(map(str, sorted(DISTORTION_LENGTHS)))
+            raise ValueError(f"distortion has {len(self.distortion)} numbers, and OpenCV's models have {lengths}")
+        if self.vignetting is not None and min(self.fall_of_light(k / 100) for k in range(201)) <= 0:
+            raise ValueError("vignetting leaves no light at some distance from the principal point; fit it again")
+        if self.crosstalk is not None and {len(row) for row in self.crosstalk} != {len(self.crosstalk)}:
+            raise ValueError("crosstalk has not as many columns as rows; give one row and one column a channel")
+        return self
+
+    def fall_of_light(self, q: float) -> float:
+        """How bright an even source is at squared relative distance q from the principal point; 1 at q = 0."""
+        a, b, c = self.vignetting or (0.0, 0.0, 0.0)
+        return 1 + q * (a + q * (b + q * c))
+
+
+class Lobe(Record):
+    """How a light's intensity falls beside its axis: as the cosine to a power."""
+
+    axis: Vector3 = Field(description="unit vector along which it is brightest")
+    exponent: float = Field(ge=0)
+
+
+class CalibratedLight(Light):
+    """A light with its lobe. Its intensity is that towards the teeth, with the lobe evaluated there."""
+
+    lobe: Lobe | None = Field(default=None, exclude_if=is_absent, description="null for a light that is even")
+
+
+class CameraColour(Record):
+    """From a camera's radiance, divided by that of a perfect diffuser in the same light, to XYZ with Y = 1 for that diffuser."""
+
+    xyz_from_rgb: Matrix3
+    root_polynomial: tuple[tuple[float, ...], ...] | None = Field(
+        default=None,
+        description="of three rows, on the terms of degree 2 after Finlayson 2015; null for the matrix alone",
+    )
