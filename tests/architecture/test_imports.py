@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("mitsuba", "drjit", "cv2", "pymodbus", "scipy", "trimesh", "PIL")
-SERVICES = ("services.capture", "services.preprocess", "services.fit")
+SERVICES = ("services.calibrate", "services.capture", "services.preprocess", "services.fit")
 
 
 def modules_after(code: str) -> set[str]:

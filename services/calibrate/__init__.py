@@ -1,0 +1,1 @@
+"""From photographs of boards, spheres and charts to a calibration that knows its own errors."""

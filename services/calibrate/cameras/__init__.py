@@ -1,0 +1,1 @@
+"""Boards in photographs, lenses, and where all cameras of a rig stand."""

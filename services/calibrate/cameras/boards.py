@@ -1,0 +1,137 @@
+"""Boards: where their corners lie on the plate, and where a photograph shows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.lens import HALF_PIXEL
+from services.core.errors import CaptureInputError
+
+Floats = NDArray[np.float64]
+BoardType = Literal["charuco", "chessboard", "aruco"]
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat plate of squares or markers.
+
+    Attributes:
+        name: as the raw folder calls it.
+        type: ``charuco`` (a chessboard with markers in its white squares), ``chessboard``, or ``aruco`` (markers with gaps).
+        squares: columns and rows, of squares or of markers.
+        square_mm: edge of a square; of an ArUco board the distance from one marker's edge to the next one's.
+        marker_mm: edge of a marker; none on a chessboard.
+        dictionary: OpenCV's name of the markers' dictionary.
+        legacy_pattern: ChArUco with an even number of rows as OpenCV printed it before version 4.6.
+    """
+
+    name: str
+    type: BoardType
+    squares: tuple[int, int]
+    square_mm: float
+    marker_mm: float = 0.0
+    dictionary: str = ""
+    legacy_pattern: bool = False
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Corners of a board in one photograph: numbers (N,), places on the board (N, 3) mm, pixels (N, 2), and markers found (M,)."""
+
+    ids: NDArray[np.int64]
+    corners_mm: Floats
+    pixels: Floats
+    markers: NDArray[np.int64]
+
+
+def corners_on_board(board: Board) -> Floats:
+    """All corners of a board (N, 3) in mm by their numbers, as OpenCV counts them; z = 0."""
+    columns, rows = board.squares
+    if board.type == "chessboard":
+        x, y = np.meshgrid(np.arange(columns - 1), np.arange(rows - 1))
+        flat = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+        return np.asarray(flat * board.square_mm, dtype=np.float64)
+    made = opencv_board(board)
+    if board.type == "charuco":
+        return np.asarray(made.getChessboardCorners(), dtype=np.float64)
+    return np.asarray(made.getObjPoints(), dtype=np.float64).reshape(-1, 3)
+
+
+def opencv_board(board: Board) -> Any:
+    """OpenCV's own board of a ChArUco or ArUco board.
+
+    Raises:
+        CaptureInputError: unknown dictionary, or markers that do not fit.
+    """
+    import cv2
+
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or number is None:
+        known = ", ".join(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+        raise CaptureInputError(
+            f"Board {board.name} names dictionary {board.dictionary or 'none'}, which OpenCV lacks; it has {known}."
+        )
+    if not 0 < board.marker_mm < board.square_mm:
+        raise CaptureInputError(
+            f"Board {board.name} has markers of {board.marker_mm:g} mm in squares of {board.square_mm:g} mm; measure both again."
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    if board.type == "aruco":
+        return cv2.aruco.GridBoard(board.squares, board.marker_mm, board.square_mm - board.marker_mm, dictionary)
+    made = cv2.aruco.CharucoBoard(board.squares, board.square_mm, board.marker_mm, dictionary)
+    made.setLegacyPattern(board.legacy_pattern)
+    return made
+
+
+def detect(image: NDArray[np.uint8], board: Board) -> Detection:
+    """Find a board's corners in a grey 8-bit photograph (H, W).
+
+    A board that is not there gives no corners. A chessboard has no numbers on its squares, so it is found whole or not at all,
+    and a board that looks the same turned by 180° must be photographed less than 90° turned between cameras.
+    """
+    find = {"charuco": _detect_charuco, "chessboard": _detect_chessboard, "aruco": _detect_aruco}[board.type]
+    ids, pixels, markers = find(image, board)
+    return Detection(ids, corners_on_board(board)[ids], pixels + HALF_PIXEL, markers)
+
+
+def _detect_charuco(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
+    import cv2
+
+    # Markers only say which corner is which, so theirs are not refined; the squares' corners always are.
+    detector = cv2.aruco.CharucoDetector(opencv_board(board))
+    pixels, ids, _, markers = detector.detectBoard(image)
+    return _numbers(ids), _pixels(pixels), _numbers(markers)
+
+
+def _detect_aruco(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
+    import cv2
+
+    made = opencv_board(board)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    quads, ids, _ = cv2.aruco.ArucoDetector(made.getDictionary(), parameters).detectMarkers(image)
+    row = {int(number): place for place, number in enumerate(np.ravel(made.getIds()))}
+    found = [(row[number], quad) for number, quad in zip(_numbers(ids).tolist(), quads, strict=True) if number in row]
+    corners = np.array([4 * place + corner for place, _ in found for corner in range(4)], dtype=np.int64)
+    return corners, _pixels(np.array([quad for _, quad in found])), _numbers(ids)
+
+
+def _detect_chessboard(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
+    import cv2
+
+    inner = (board.squares[0] - 1, board.squares[1] - 1)
+    found, pixels = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_ACCURACY)
+    count = inner[0] * inner[1] if found else 0
+    return np.arange(count, dtype=np.int64), _pixels(pixels if found else None), np.empty(0, dtype=np.int64)
+
+
+def _numbers(found: Any) -> NDArray[np.int64]:
+    return np.empty(0, dtype=np.int64) if found is None else np.ravel(found).astype(np.int64)
+
+
+def _pixels(found: Any) -> Floats:
+    return np.empty((0, 2)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 2)

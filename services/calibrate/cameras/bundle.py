@@ -1,0 +1,297 @@
+"""Bundle adjustment: lenses, camera poses and board poses that together draw the corners where they were seen.
+
+The world's frame is that of the board at place 0, so that place has no parameters. A camera draws a corner c of the board at
+place p at π(R (R_p c + t_p) + t). Corners' errors are independent and of one σ a camera. A fit with Huber's loss comes first;
+corners that it leaves far outside are left out, and a plain fit of the others gives value and covariance σ² (JᵀJ)⁻¹, with σ²
+from the residuals and their degrees of freedom (Triggs et al., Bundle Adjustment, 2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.lens import Lens
+from services.calibrate.cameras.rotations import cross_matrix, left_jacobian, pose_matrix, rotation_matrix
+from services.calibrate.cameras.sightings import Corners, View, joined
+
+Floats = NDArray[np.float64]
+HUBER_SIGMAS = 1.345
+"""Huber's constant: 95 % as efficient as least squares where all errors are normal."""
+OUTLIER_SIGMAS = 5.0
+"""A good session has 10⁴ corners, and 2·10⁴ normal coordinates exceed 5 σ once in a hundred sessions."""
+SIGMA_FLOOR_PX = 1e-6
+"""Exact synthetic corners have no scatter; the whitening must not divide by it."""
+ROBUST_ROUNDS = 3
+SETTLED_SCALE = 0.1
+"""Of the robust scale between two rounds: outliers lie far beyond a tenth of σ."""
+STEP_PRECISION = 1e-10
+"""Of the linear solver within a step: with less the steps are no Gauss–Newton steps and a hundred of them are needed."""
+MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Parameters of a bundle: K lenses, K poses camera_from_world (K, 6), and P poses world_from_board (P, 6), the first zero."""
+
+    lenses: tuple[Lens, ...]
+    cameras: Floats
+    places: Floats
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each parameter stands in the vector: lenses, camera poses, then the poses of places 1 to P − 1."""
+
+    sizes: tuple[tuple[int, int], ...]
+    lens_lengths: tuple[int, ...]
+    n_places: int
+    lenses_fixed: bool = False
+
+    @property
+    def lens_starts(self) -> list[int]:
+        """First column of each lens."""
+        return [0, *np.cumsum(self.lens_lengths).tolist()]
+
+    @property
+    def first_pose(self) -> int:
+        """First column of the camera poses."""
+        return 0 if self.lenses_fixed else sum(self.lens_lengths)
+
+    @property
+    def length(self) -> int:
+        """Number of parameters."""
+        return self.first_pose + 6 * (len(self.sizes) + self.n_places - 1)
+
+    def camera_columns(self, camera: int) -> NDArray[np.int64]:
+        """Columns of a camera's pose."""
+        return self.first_pose + 6 * camera + np.arange(6)
+
+    def lens_columns(self, camera: int) -> NDArray[np.int64]:
+        """Columns of a camera's lens; none where lenses are fixed."""
+        count = 0 if self.lenses_fixed else self.lens_lengths[camera]
+        return self.lens_starts[camera] + np.arange(count)
+
+    def place_columns(self, place: int) -> NDArray[np.int64]:
+        """Columns of a board's pose; place 0 has none."""
+        return self.first_pose + 6 * (len(self.sizes) + place - 1) + np.arange(6)
+
+    def pack(self, rig: Rig) -> Floats:
+        """The parameters of a rig, (length,)."""
+        lenses = [] if self.lenses_fixed else [lens.values for lens in rig.lenses]
+        return np.concatenate([*lenses, rig.cameras.ravel(), rig.places[1:].ravel()])
+
+    def unpack(self, values: Floats, template: Rig) -> Rig:
+        """The rig of parameters; what is fixed comes from the template."""
+        starts = self.lens_starts
+        lenses = template.lenses
+        if not self.lenses_fixed:
+            lenses = tuple(Lens(size, values[starts[k] : starts[k + 1]]) for k, size in enumerate(self.sizes))
+        poses = values[self.first_pose :].reshape(-1, 6)
+        count = len(self.sizes)
+        return Rig(lenses, poses[:count], np.concatenate([template.places[:1], poses[count:]]))
+
+
+@dataclass(frozen=True)
+class BundleFit:
+    """What bundle adjustment found.
+
+    Attributes:
+        rig: lenses and poses.
+        layout: the order of the covariance.
+        covariance: of all parameters (length, length), in the frame of place 0.
+        sigma_px: standard deviation of one coordinate of a corner, by camera (K,); the common scale is from the residuals.
+        residuals_px: seen minus drawn (N, 2), of all corners in the order of the views, outliers too.
+        inliers: which corners the final fit used (N,).
+        corners: the corners.
+        converged: whether the solver met its tolerance.
+    """
+
+    rig: Rig
+    layout: Layout
+    covariance: Floats
+    sigma_px: Floats
+    residuals_px: Floats
+    inliers: NDArray[np.bool_]
+    corners: Corners
+    converged: bool
+
+    def rms_px(self, camera: int | None = None) -> float:
+        """Root mean square distance between seen and drawn corners, of the inliers of one camera or of all."""
+        chosen = self.inliers if camera is None else self.inliers & (self.corners.camera == camera)
+        return float(np.sqrt((self.residuals_px[chosen] ** 2).sum(axis=1).mean()))
+
+
+def layout_of(rig: Rig, *, lenses_fixed: bool = False) -> Layout:
+    """The layout of a rig's parameters."""
+    return Layout(
+        tuple(lens.size for lens in rig.lenses),
+        tuple(len(lens.values) for lens in rig.lenses),
+        len(rig.places),
+        lenses_fixed,
+    )
+
+
+def draw(rig: Rig, corners: Corners) -> Floats:
+    """Pixels (N, 2) at which a rig draws corners."""
+    pixels = np.empty_like(corners.pixels)
+    local = pose_apply(rig.places[corners.place], corners.corners_mm)
+    for camera, lens in enumerate(rig.lenses):
+        chosen = corners.camera == camera
+        if chosen.any():
+            pixels[chosen] = lens.project(pose_apply(rig.cameras[camera], local[chosen]))
+    return pixels
+
+
+def derivative_blocks(
+    rig: Rig, corners: Corners, camera: int
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats, Floats]:
+    """What moves the drawn corners of one camera.
+
+    Returns:
+        Which rows it sees (M,), their pixels (M, 2), and derivatives to its lens (M, 2, 4 + D), its pose (M, 2, 6) and the
+        pose of each corner's place (M, 2, 6).
+    """
+    rows = np.flatnonzero(corners.camera == camera)
+    place = rig.places[corners.place[rows]]
+    turned = np.einsum("nij,nj->ni", rotation_matrix(place[:, :3]), corners.corners_mm[rows])
+    world = turned + place[:, 3:]
+    pose = rig.cameras[camera]
+    R = rotation_matrix(pose[:3])
+    pixels, by_point, by_lens = rig.lenses[camera].project_with_derivatives(world @ R.T + pose[3:])
+    # A rotation vector's change dw turns a rotated point y by J dw × y = −[y]× J dw.
+    by_camera = np.concatenate([-by_point @ cross_matrix(world @ R.T) @ left_jacobian(pose[:3]), by_point], axis=2)
+    by_world = by_point @ R
+    by_place = np.concatenate([-by_world @ cross_matrix(turned) @ left_jacobian(place[:, :3]), by_world], axis=2)
+    return rows, pixels, by_lens, by_camera, by_place
+
+
+def fit_bundle(
+    views: Sequence[View],
+    start: Rig,
+    *,
+    sigma_px: Floats | None = None,
+    lenses_fixed: bool = False,
+    robust: bool = True,
+) -> BundleFit:
+    """Adjust a rig to corners.
+
+    Args:
+        views: photographs of boards; every camera and every place must be linked to place 0 by shared views.
+        start: a first guess, as from ``services.calibrate.cameras.start``.
+        sigma_px: how the cameras' corners scatter against each other (K,), as single cameras' fits tell; all alike by default.
+            It is not estimated here: in a joint fit the camera of the smallest residuals would draw all weight to itself.
+        lenses_fixed: keep the guess's intrinsics.
+        robust: look for outliers.
+    """
+    corners, layout = joined(views), layout_of(start, lenses_fixed=lenses_fixed)
+    weights = np.ones(len(start.lenses)) if sigma_px is None else np.maximum(sigma_px, SIGMA_FLOOR_PX)
+    values, inliers = layout.pack(start), np.ones(len(corners.pixels), dtype=bool)
+    if robust:
+        values, inliers = _without_outliers(layout, start, corners, values, weights)
+    kept = corners.kept(inliers)
+    values, converged = _solve(layout, start, kept, values, weights)
+    rig = layout.unpack(values, start)
+    residuals = corners.pixels - draw(rig, corners)
+    whitened = residuals[inliers] / weights[kept.camera, None]
+    freedom = max(whitened.size - layout.length, 1)
+    sigma = np.maximum(weights * np.sqrt((whitened**2).sum() / freedom), SIGMA_FLOOR_PX)
+    return BundleFit(
+        rig=rig,
+        layout=layout,
+        covariance=_covariance(jacobian(layout, rig, kept, sigma)),
+        sigma_px=sigma,
+        residuals_px=residuals,
+        inliers=inliers,
+        corners=corners,
+        converged=converged,
+    )
+
+
+def _without_outliers(
+    layout: Layout, start: Rig, corners: Corners, values: Floats, weights: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """A robust fit, and the corners that are no outliers of it."""
+    scale = 1.0
+    for _ in range(ROBUST_ROUNDS):
+        off = np.abs(corners.pixels - draw(layout.unpack(values, start), corners)) / weights[corners.camera, None]
+        before, scale = scale, max(MAD_TO_SIGMA * float(np.median(off)), SIGMA_FLOOR_PX)
+        if abs(scale - before) < SETTLED_SCALE * before:
+            break
+        values, _ = _solve(layout, start, corners, values, scale * weights, huber=True)
+    off = np.abs(corners.pixels - draw(layout.unpack(values, start), corners)) / weights[corners.camera, None]
+    return values, off.max(axis=1) <= OUTLIER_SIGMAS * scale
+
+
+def jacobian(layout: Layout, rig: Rig, corners: Corners, sigma_px: Floats) -> object:
+    """Sparse derivative (2N, length) of the drawn corners, each divided by its camera's σ, to the parameters."""
+    from scipy.sparse import csr_array
+
+    entries, rows, columns = [], [], []
+    for camera in range(len(rig.lenses)):
+        seen, _, by_lens, by_camera, by_place = derivative_blocks(rig, corners, camera)
+        row = np.stack([2 * seen, 2 * seen + 1], axis=1)[:, :, None]
+        places = corners.place[seen]
+        moved = places > 0
+        place_columns = layout.place_columns(0)[None, :] + 6 * places[:, None]
+        everywhere = np.ones(len(seen), dtype=bool)
+        blocks = [(by_camera, np.broadcast_to(layout.camera_columns(camera), (len(seen), 6)), everywhere)]
+        blocks.append((by_place, place_columns, moved))
+        if not layout.lenses_fixed:
+            lens_columns = layout.lens_columns(camera)
+            blocks.append((by_lens, np.broadcast_to(lens_columns, (len(seen), len(lens_columns))), everywhere))
+        for block, column, chosen in blocks:
+            part = block[chosen] / sigma_px[camera]
+            entries.append(part.ravel())
+            rows.append(np.broadcast_to(row[chosen], part.shape).ravel())
+            columns.append(np.broadcast_to(column[chosen][:, None, :], part.shape).ravel())
+    shape = (2 * len(corners.pixels), layout.length)
+    return csr_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+
+
+def pose_apply(pose: Floats, points: Floats) -> Floats:
+    """Points (N, 3) moved by one pose (6,) or each by its own (N, 6)."""
+    matrix = pose_matrix(pose)
+    moved = np.einsum("...ij,...j->...i", matrix[..., :3, :3], points) + matrix[..., :3, 3]
+    return np.asarray(moved, dtype=np.float64)
+
+
+def _solve(
+    layout: Layout, template: Rig, corners: Corners, values: Floats, sigma: Floats, *, huber: bool = False
+) -> tuple[Floats, bool]:
+    """Least squares over all parameters by SciPy's trust region on the sparse derivative."""
+    from scipy.optimize import least_squares
+
+    def residuals(x: Floats) -> Floats:
+        off = draw(layout.unpack(x, template), corners) - corners.pixels
+        return (off / sigma[corners.camera, None]).ravel()
+
+    answer = least_squares(
+        residuals,
+        values,
+        jac=lambda x: jacobian(layout, layout.unpack(x, template), corners, sigma),
+        method="trf",
+        tr_solver="lsmr",
+        tr_options={"atol": STEP_PRECISION, "btol": STEP_PRECISION, "maxiter": 10 * layout.length},
+        x_scale="jac",
+        loss="huber" if huber else "linear",
+        f_scale=HUBER_SIGMAS,
+        ftol=1e-10,
+        xtol=1e-10,
+        gtol=1e-10,
+        max_nfev=100,
+    )
+    return np.asarray(answer.x), bool(answer.success)
+
+
+def _covariance(whitened: object) -> Floats:
+    """(JᵀJ)⁻¹ through columns of one length, so that pixels, radians and millimetres lose no digits to each other."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    normal = np.asarray((whitened.T @ whitened).todense())  # type: ignore[attr-defined]
+    scale = 1 / np.sqrt(np.diag(normal))
+    factor = cho_factor(normal * np.outer(scale, scale))
+    return np.asarray(cho_solve(factor, np.eye(len(normal)))) * np.outer(scale, scale)

@@ -1,0 +1,120 @@
+"""First guesses for bundle adjustment: each camera's lens from its own boards, then poses by cameras that see one board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.bundle import Rig
+from services.calibrate.cameras.lens import HALF_PIXEL, MODELS, Lens
+from services.calibrate.cameras.rotations import pose_matrix, pose_vector
+from services.calibrate.cameras.sightings import View
+from services.core.errors import CaptureInputError
+
+Floats = NDArray[np.float64]
+MIN_CORNERS = 6
+"""Of a view: four fix a pose without any check, and six still outvote one bad corner."""
+MIN_VIEWS = 3
+"""A plane's views fix five intrinsic values from three on (Zhang 2000)."""
+
+
+def usable(views: Sequence[View]) -> list[View]:
+    """Views with enough corners that do not lie on one line."""
+    return [view for view in views if len(view.pixels) >= MIN_CORNERS and _spans_a_plane(view.corners_mm)]
+
+
+def first_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> Lens:
+    """A camera's intrinsics by OpenCV from its own views (Zhang 2000).
+
+    Raises:
+        CaptureInputError: it has too few views.
+    """
+    import cv2
+
+    good = usable(views)
+    if len(good) < MIN_VIEWS:
+        raise CaptureInputError(
+            f"Camera {name} shows {len(good)} boards with at least {MIN_CORNERS} corners, and {MIN_VIEWS} are needed; "
+            "photograph the board there in more places and tilts."
+        )
+    flags = _flags(model)
+    points = [np.ascontiguousarray(view.corners_mm, dtype=np.float32) for view in good]
+    pixels = [np.ascontiguousarray(view.pixels - HALF_PIXEL, dtype=np.float32) for view in good]
+    _, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
+    count = MODELS[model]
+    focal = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
+    return Lens(size, np.concatenate([focal, np.ravel(distortion)[:count]]))
+
+
+def board_pose(view: View, lens: Lens) -> Floats:
+    """The pose (6,) camera_from_board of one view, its squared pixel errors least."""
+    import cv2
+
+    flat = np.ascontiguousarray(lens.undistort(view.pixels)[:, :2])
+    eye = np.eye(3)
+    found, turn, shift = cv2.solvePnP(view.corners_mm, flat, eye, None, flags=cv2.SOLVEPNP_IPPE)
+    if not found:
+        raise CaptureInputError(f"The board in {view.name} has no pose that draws its corners; photograph it again.")
+    turn, shift = cv2.solvePnPRefineLM(
+        view.corners_mm, view.pixels, lens.matrix, lens.distortion if len(lens.distortion) else None, turn, shift
+    )
+    return np.concatenate([np.ravel(turn), np.ravel(shift)])
+
+
+def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str]) -> Rig:
+    """Poses of all cameras and boards: from place 0 on, always through the pair of camera and board that shares most corners.
+
+    Raises:
+        CaptureInputError: a camera or a place shares no board with the others.
+    """
+    n_places = max(view.place for view in views) + 1
+    cameras: dict[int, Floats] = {}
+    places: dict[int, Floats] = {0: np.eye(4)}
+    good = {id(view) for view in usable(views)}
+    poses = {
+        number: pose_matrix(board_pose(view, lenses[view.camera]))
+        for number, view in enumerate(views)
+        if id(view) in good
+    }
+    waiting = sorted(poses, key=lambda number: -len(views[number].pixels))
+    while waiting:
+        linked = [n for n in waiting if views[n].place in places or views[n].camera in cameras]
+        if not linked:
+            break
+        view, camera_from_board = views[linked[0]], poses[linked[0]]
+        if view.place in places:
+            cameras.setdefault(view.camera, camera_from_board @ np.linalg.inv(places[view.place]))
+        else:
+            places[view.place] = np.linalg.inv(cameras[view.camera]) @ camera_from_board
+        waiting.remove(linked[0])
+    if alone := next((name for number, name in enumerate(names) if number not in cameras), None):
+        raise CaptureInputError(
+            f"Camera {alone} sees no board together with the other cameras; photograph a board where both see it."
+        )
+    if len(places) < n_places:
+        missing = next(place for place in range(n_places) if place not in places)
+        raise CaptureInputError(f"No camera sees the board at place {missing}; leave it out or photograph it again.")
+    return Rig(
+        tuple(lenses),
+        np.array([pose_vector(cameras[number]) for number in range(len(names))]),
+        np.array([np.zeros(6), *(pose_vector(places[place]) for place in range(1, n_places))]),
+    )
+
+
+def _spans_a_plane(corners_mm: Floats) -> bool:
+    spread = np.linalg.svd(corners_mm - corners_mm.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > 0.05 * spread[0])
+
+
+def _flags(model: str) -> int:
+    import cv2
+
+    fixed = {
+        "pinhole": cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+        "radial-tangential-4": cv2.CALIB_FIX_K3,
+        "radial-tangential-5": 0,
+        "rational-8": cv2.CALIB_RATIONAL_MODEL,
+    }
+    return int(fixed[model])

@@ -1,0 +1,92 @@
+"""Sessions of boards: drawn from known cameras with noise, or read from others' tables."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.boards import Board, corners_on_board
+from services.calibrate.cameras.bundle import Rig, draw
+from services.calibrate.cameras.lens import Lens
+from services.calibrate.cameras.rotations import pose_matrix, pose_vector
+from services.calibrate.cameras.sightings import View, joined
+
+CHESSBOARD = Board("plate", "chessboard", (9, 7), 12.0)
+SIZE = (1600, 1200)
+
+
+def looking(position_mm: NDArray[np.float64], target_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pose (6,) camera_from_world of a camera that looks at a target, its y axis down along the world's −y."""
+    z = target_mm - position_mm
+    z = z / np.linalg.norm(z)
+    x = np.cross(np.array([0.0, -1.0, 0.0]), z)
+    x = x / np.linalg.norm(x)
+    rotation = np.array([x, np.cross(z, x), z])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position_mm
+    return pose_vector(matrix)
+
+
+def true_rig(random: np.random.Generator, n_places: int = 12) -> Rig:
+    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth."""
+    lenses, cameras = [], []
+    for azimuth in np.deg2rad([-35.0, 0.0, 35.0]):
+        distortion = np.array([-0.12, 0.08, 0.0006, -0.0004]) * random.uniform(0.7, 1.3, 4)
+        focal = 3200 * random.uniform(0.95, 1.05)
+        lenses.append(Lens(SIZE, np.array([focal, focal * 1.002, 805.0, 590.0, *distortion])))
+        cameras.append(looking(450 * np.array([np.sin(azimuth), 0.2, np.cos(azimuth)]), np.zeros(3)))
+    centre = corners_on_board(CHESSBOARD).mean(axis=0)
+    places = []
+    for _ in range(n_places):
+        # Turned by π about x the plate faces the cameras; tilts of up to 35° tell focal length from distance.
+        turn = np.array([np.pi, 0, 0]) + random.uniform(-0.6, 0.6, 3)
+        matrix = pose_matrix(np.concatenate([turn, np.zeros(3)]))
+        matrix[:3, 3] = random.uniform(-25, 25, 3) - matrix[:3, :3] @ centre
+        places.append(matrix)
+    # The world is that of the board at place 0.
+    to_first = np.linalg.inv(places[0])
+    moved = [pose_vector(pose_matrix(camera) @ places[0]) for camera in cameras]
+    return Rig(tuple(lenses), np.array(moved), np.array([pose_vector(to_first @ place) for place in places]))
+
+
+def photographed(rig: Rig, noise_px: float, random: np.random.Generator) -> list[View]:
+    """Every place from every camera, with normal errors of the corners; corners outside the image are missing."""
+    corners = corners_on_board(CHESSBOARD)
+    ids = np.arange(len(corners))
+    views = []
+    for place in range(len(rig.places)):
+        for camera in range(len(rig.lenses)):
+            blank = View(camera, place, corners, np.zeros((len(corners), 2)), ids, f"camera {camera}, place {place}")
+            drawn = draw(rig, joined([blank]))
+            inside = ((drawn > 0) & (drawn < np.array(rig.lenses[camera].size))).all(axis=1)
+            seen = drawn + random.normal(0, noise_px, drawn.shape)
+            view = View(camera, place, corners, seen, ids, blank.name).kept(inside)
+            if inside.sum() >= 6:
+                views.append(view)
+    return views
+
+
+def table_views(path: Path) -> list[View]:
+    """Views of a table of ChArUco corners with metres and OpenCV's pixels; views of fewer than four corners are left out."""
+    rows = defaultdict(list)
+    with path.open() as stream:
+        for row in csv.DictReader(stream):
+            corner = [float(row[key]) for key in ("keypoint_id", "obj_loc_x", "obj_loc_y", "img_loc_x", "img_loc_y")]
+            rows[int(row["cam_id"]), int(row["sync_index"])].append(corner)
+    kept = {key: np.array(corners) for key, corners in sorted(rows.items()) if len(corners) >= 4}
+    times = sorted({time for _, time in kept})
+    return [
+        View(
+            camera,
+            times.index(time),
+            1e3 * np.column_stack([corners[:, 1:3], np.zeros(len(corners))]),
+            corners[:, 3:] + 0.5,
+            corners[:, 0].astype(np.int64),
+            f"camera {camera}, time {time}",
+        )
+        for (camera, time), corners in kept.items()
+    ]
