@@ -91,7 +91,8 @@ class FitReport(Record):
         default={}, description="per channel: one standard error of each by the calibration, before the fit"
     )
     assumed: tuple[str, ...] = Field(
-        default=(), description="kinds of the instrument's errors whose size no calibration states"
+        default=(),
+        description="the instrument's errors whose size no calibration states, by name; teeth and dome of their moves",
     )
     instrument_told: tuple[str, ...] = Field(
         default=(),

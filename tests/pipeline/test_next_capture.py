@@ -11,7 +11,7 @@ import pytest
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera
 from services.fit.checks.next_capture import LIGHTS, VIEWS, Candidate, Sensor, advice, probes_of, sentence, turned
-from services.fit.execution.blocks import Block, read_recipe, write_block, write_recipe
+from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block, write_recipe
 from services.fit.execution.engine_host import InProcessHost
 from services.fit.execution.executors import LocalExecutor
 from services.fit.execution.passes import Passes, StackProblem
@@ -114,6 +114,23 @@ def test_where_nothing_helps_that_is_said(
     assert sentence(TRUTH, PARTS, known, [Candidate("A light above", (nothing, nothing))]).startswith(
         "None of the 1 further lights and views"
     )
+
+
+def test_new_images_have_the_errors_that_are_known_and_one_of_their_own(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, scene((-300.0, 300.0, -700.0)))
+    (block,) = problem.passes.read_blocks()
+    known = BlockInstrument("gain.green", ("light_gain.a",), "flare.c0.green", 1.3)
+    blocks = (write_block(tmp_path, replace(block, instrument=known)),)
+    problem = replace(problem, passes=replace(problem.passes, blocks=blocks))
+    lights, *views = probes_of(problem, tmp_path)[1]
+    # A new light under the fit's camera has that camera's flare, and a gain of its own; a new camera the old lights' gains, and a flare.
+    acting = read_block(lights.block).instrument
+    assert acting is not None
+    assert (acting.flare, acting.lights[:2], lights.own_error) == (known.flare, ("light_gain.a", ""), "light_gain")
+    for view in views:
+        acting = read_block(view.block).instrument
+        assert acting is not None
+        assert (acting.flare, acting.lights[0], view.own_error) == ("", "light_gain.a", "flare")
 
 
 def test_a_turned_camera_keeps_its_distance_and_looks_at_the_tooth() -> None:

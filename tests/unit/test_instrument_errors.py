@@ -18,10 +18,10 @@ from services.core.store import read_record
 from services.core.uncertainty import CalibrationUncertainty
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.columns import columns, taken
+from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, errors_of
 from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
-from services.fit.instrument.told import assumed_kinds, instrument_told
+from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.solve.covariance import _prior_parts, estimates, instrument_estimates, uncertainty
@@ -53,11 +53,11 @@ def test_columns_are_the_derivatives_of_what_the_instrument_takes() -> None:
         dict(zip(NAMES, (0.01, -0.02, 0.03, 0.004), strict=True)),
     )
     for name, column in zip(NAMES, columns(image, whole, NAMES), strict=True):
-        high, low = (taken(image, whole, at | {name: at[name] + step}) for step in (1e-3, -1e-3))
+        high, low = (photographed(image, whole, at | {name: at[name] + step}) for step in (1e-3, -1e-3))
         # Exactly linear, so but for rounding.
         np.testing.assert_allclose((high - low).reshape(-1) / 2e-3, column, rtol=1e-9, atol=1e-12)
     gains = np.array([[1.0 + 0.01 - 0.02], [1.0 + 0.01 + 0.03]])
-    np.testing.assert_allclose(taken(image, whole, at), gains * image + 0.004 * 1.3, rtol=1e-12)
+    np.testing.assert_allclose(photographed(image, whole, at), gains * image + 0.004 * 1.3, rtol=1e-12)
     assert not columns(image, whole, ("gain.red", "flare.c1.green")).any()
 
 
@@ -188,18 +188,29 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     spec = JobSpec.model_validate({"capture": "c"})
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), None)}
     found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
-    kinds = assumed_kinds(errors, None)
-    assert kinds == ("gain", "light_gain", "flare", "teeth", "dome")
-    (assumed,) = instrument_told(spec, errors, found, kinds)
+    kinds = assumed_names(errors, None, {"teeth", "dome"})
+    assert kinds == (*errors["green"].names, "teeth", "dome")
+    (assumed,) = instrument_sentences(spec, errors, found, kinds)
     assert assumed.startswith("Assumed, as the calibration does not state")
     assert "1 % for the gain, 1 % for each light, 0.3 % for flare, 0.05 mm and 0.1° for where the scan lies" in assumed
     found["green"]["light_gain.b"] = -0.05
-    _, fault = instrument_told(spec, errors, found, kinds)
+    _, fault = instrument_sentences(spec, errors, found, kinds)
     assert fault.startswith("In green the images put light_gain.b off by -5.0 %, 5.0 times its ± of 1 %")
     off = spec.model_copy(update={"instrument": "off"})
-    assert instrument_told(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(
+    assert instrument_sentences(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(
         "The ± take the instrument for perfect"
     )
+
+
+def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
+    stated = CalibrationUncertainty(names=("gain.green", "light_gain.b"), covariance=((1e-4, 0.0), (0.0, 1e-4)))
+    errors = {"green": errors_of("green", ("a", "b"), ("c0",), stated)}
+    # No move was measured, so what was assumed of moves is in no ±.
+    names = assumed_names(errors, stated, ())
+    assert names == ("light_gain.a", "flare.c0.green")
+    found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
+    (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, found, names, stated)
+    assert "may be: 1 % for light_gain.a and 0.3 % for flare. The ±" in told
 
 
 def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path: Path) -> None:
@@ -208,7 +219,7 @@ def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path
     covariance, assumed = move_covariance(None)
     assert assumed == ("teeth", "dome")
     moves = write_moves(tmp_path, recipe, covariance, lights.mean(axis=0))
-    assert sorted(move.thing for move in moves) == ["dome"] * 6 + ["teeth"] * 6
+    assert sorted(move.body for move in moves) == ["dome"] * 6 + ["teeth"] * 6
     assert len(by_scene(moves)) == 1
     stored = read_recipe(moves[0].recipe)
     np.testing.assert_allclose(stored.light_positions_mm[:2], lights)
@@ -216,7 +227,7 @@ def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path
     for move in moves:
         moved = stored.light_positions_mm[move.first : move.first + 2]
         seen, depth = move.seen_by(camera("c0")).project(points)
-        if move.thing == "dome":
+        if move.body == "dome":
             np.testing.assert_allclose(seen, camera("c0").project(points)[0], atol=1e-9)
             continue
         # Where the moved tooth's points appear, and how far they are from the lights.
@@ -289,7 +300,7 @@ def test_a_gain_that_goes_with_a_light_is_known_twice_as_well_when_it_is_said_so
 def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     stated = CalibrationUncertainty(names=("camera.c0.rx", "light.a.x"), covariance=((1e-6, 0.0), (0.0, 1.0)))
     found = {"green": dict.fromkeys(NAMES, 0.0)}
-    told = instrument_told(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, found, (), stated)
+    told = instrument_sentences(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, found, (), stated)
     assert told == (
         "The calibration states how wrong camera.c0.rx and 1 more may be, which the ± do not know: no fit moves single cameras and lights.",
     )

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from services.fit.instrument.errors import InstrumentErrors
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.closing import ClosingSums, closing_sums, response
-from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
+from services.fit.solve.covariance import ClosingModel, Uncertainty, Whitening, closing_model, uncertainty, whitening
 from services.fit.solve.normal_equations import NormalEquations, normal_equations
 from tests.support.z_scores import rms_bounds
 
@@ -214,3 +215,22 @@ def test_the_measurement_survives_the_journal() -> None:
     sums = problem.closing(problem.truth, problem.photograph(0.0), np.eye(3))
     assert ClosingSums.of(sums.record()).record() == sums.record()
     assert (sums + sums).response == pytest.approx(2 * sums.response)
+
+
+def test_errors_follow_the_step_that_the_tissue_takes_and_not_the_one_it_asked_for() -> None:
+    # The tissue asks for more than one scale and may not go there; errors are best for where it goes.
+    rng, errors = np.random.default_rng(8), InstrumentErrors(("gain.green",), ((1e-2,),))
+    domain = Domain(DOMAIN.coordinates, errors)
+    root = rng.standard_normal((4, 4))
+    transform = np.tril(rng.uniform(0.2, 1.0, (4, 4)))
+    transform[:3, :3] = np.diag([0.5, 0.7, 0.9])
+    known = Whitening(transform, np.zeros((4, 0)))
+    gradient = np.array([9.0, -7.0, 5.0, 3.0])
+    model = ClosingModel(
+        domain, np.array([1.0, 2.0, 2.0, 0.0]), known, np.eye(4) + 0.1 * root, gradient, np.zeros((4, 4))
+    )
+    step = model.step()
+    whole = -transform @ model.inverse @ gradient
+    assert np.linalg.norm(step[:3] / domain.scale[:3]) < 0.5 * np.linalg.norm(whole[:3] / domain.scale[:3])
+    for change in (-1e-3, 1e-3):
+        assert model.promise(step + np.array([0.0, 0.0, 0.0, change]))[0] > model.promise(step)[0]

@@ -37,3 +37,19 @@ def test_noise_that_looks_like_negative_information_is_none() -> None:
     assert known.sandwich is not None
     nothing = Addition(-0.5 * np.eye(3), np.zeros((3, 3)))
     np.testing.assert_allclose(covariance_with(known.sandwich, nothing), known.covariance, rtol=1e-9)
+
+
+def test_a_new_light_of_unknown_gain_teaches_what_a_fit_with_that_gain_states() -> None:
+    rng = np.random.default_rng(3)
+    first, second, image = 0.1 * rng.standard_normal((3, 40)), 0.1 * rng.standard_normal((3, 15)), rng.uniform(1, 2, 15)
+    known = uncertainty(DOMAIN, X, _equations(first))
+    assert known.sandwich is not None
+    zero, error = np.zeros(15), 0.03 * image[None]
+    measured = (second, second), (zero, zero), np.full(15, NOISE**2), NOISE**-2
+    found = covariance_with(known.sandwich, addition(known.sandwich, *measured, error))
+    # The same with the light's gain, of prior 1 in units of its ±, among the unknowns.
+    rows = np.block([[first, second], [np.zeros((1, 40)), error]]) / NOISE
+    whole = rows @ rows.T + np.diag([*DOMAIN.prior[1], 1.0])
+    np.testing.assert_allclose(found, np.linalg.inv(whole)[:3, :3], rtol=1e-6)
+    exact = covariance_with(known.sandwich, addition(known.sandwich, *measured))
+    assert (np.diag(found) > 1.01 * np.diag(exact)).any()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.columns import taken
+from services.fit.instrument.columns import photographed
 from services.fit.optics.parameters import Mouth, Tissue
 
 Array = NDArray[np.float64]
@@ -144,7 +144,7 @@ def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], sho
         host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed)
         for seed in seeds
     ]
-    first, second = (taken(stack.mean, block, dict(task.errors)) for stack in stacks)
+    first, second = (photographed(stack.mean, block, dict(task.errors)) for stack in stacks)
 
     def sums(pixels: NDArray[np.bool_]) -> tuple[ErrorSums, ErrorSums]:
         fitted, held_out = (

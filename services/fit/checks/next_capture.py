@@ -27,6 +27,8 @@ from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.instrument.columns import columns
+from services.fit.instrument.errors import DEFAULT_SE
+from services.fit.instrument.moves import rigid
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_after
@@ -82,6 +84,8 @@ class Probe:
     words: tuple[str, ...]
     """Candidate that each light belongs to, '' for those that do not count."""
     ratio: float
+    own_error: str = ""
+    """Kind of the error that such images have of their own: a new light's gain, a new camera's flare; '' where the instrument counts as perfect."""
 
 
 def advice(
@@ -183,15 +187,21 @@ def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) 
     light_words = tuple(f"A light {words}" for words in LIGHTS)
     probes = []
     for name, camera in cameras.items():
-        pixels = np.concatenate([block.view.pixels for block in blocks if block.view.camera.name == name])
-        probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words, blocks[0].instrument))
+        own = [block for block in blocks if block.view.camera.name == name]
+        pixels = np.concatenate([block.view.pixels for block in own])
+        probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words, own[0].instrument, "light_gain"))
     for words, axis in VIEWS.items():
         camera = turned(first, centre, np.asarray(axis, dtype=float) @ axes)
         pixels = seen_pixels(camera, more, pixel_step)
         if len(pixels):
             probes.append(
                 _probe(
-                    folder, camera, pixels, (f"A camera {words}",) * lights + ("",) * len(added), blocks[0].instrument
+                    folder,
+                    camera,
+                    pixels,
+                    (f"A camera {words}",) * lights + ("",) * len(added),
+                    blocks[0].instrument,
+                    "flare",
                 )
             )
     return write_recipe(folder, more), tuple(probes)
@@ -203,6 +213,7 @@ def _probe(
     pixels: NDArray[np.int32],
     words: tuple[str, ...],
     known: BlockInstrument | None,
+    own_error: str,
 ) -> Probe:
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
     shape = (len(words), len(chosen))
@@ -213,26 +224,21 @@ def _probe(
         np.ones(shape),
         np.where(counted[:, None], np.ones(shape), 0.0),
         np.zeros(shape, dtype=bool),
-        instrument=None if known is None else _of_new_images(known, len(words)),
+        instrument=None if known is None else _of_new_images(known, len(words), own_error),
     )
-    return Probe(write_block(folder, block), words, len(pixels) / len(chosen))
+    return Probe(write_block(folder, block), words, len(pixels) / len(chosen), "" if known is None else own_error)
 
 
-def _of_new_images(known: BlockInstrument, lights: int) -> BlockInstrument:
-    # Gains that the fit knows act on them too; what a new light or camera has wrong of its own counts as nothing.
-    return replace(known, lights=known.lights + ("",) * (lights - len(known.lights)), flare="")
+def _of_new_images(known: BlockInstrument, lights: int, own_error: str) -> BlockInstrument:
+    # Errors that the fit knows act on them too: gains of lights that it has, and the flare of a camera that it has.
+    flare = "" if own_error == "flare" else known.flare
+    return replace(known, lights=known.lights + ("",) * (lights - len(known.lights)), flare=flare)
 
 
 def turned(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
     """The camera carried around a point about an axis, still looking at it as before."""
-    # Rodrigues' formula.
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation = np.eye(3) + np.sin(VIEW_ANGLE) * cross + (1 - np.cos(VIEW_ANGLE)) * cross @ cross
-    pose = np.asarray(camera.camera_from_world)
-    moved = np.eye(4)
-    moved[:3, :3] = pose[:3, :3] @ rotation.T
-    moved[:3, 3] = pose[:3, 3] + pose[:3, :3] @ centre_mm - moved[:3, :3] @ centre_mm
+    turn = rigid(np.concatenate([VIEW_ANGLE * axis, np.zeros(3)]), centre_mm)
+    moved = np.asarray(camera.camera_from_world) @ np.linalg.inv(turn)
     return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, moved.tolist()))})
 
 
@@ -280,11 +286,26 @@ def advice_task(
             first, second = (rows[:, lights, odd::2].reshape(len(rows), -1) for rows in slopes)
             renders = [image[lights, odd::2].reshape(-1) for image in images]
             one = addition(
-                known, (first, second), (renders[0], renders[1]), variance[lights, odd::2].reshape(-1), weight
+                known,
+                (first, second),
+                (renders[0], renders[1]),
+                variance[lights, odd::2].reshape(-1),
+                weight,
+                _own_errors(probe, expected, block.instrument, how.errors)[:, lights, odd::2].reshape(
+                    -1, renders[0].size
+                ),
             )
             halves.append(one.scaled(probe.ratio))
         out[words] = (halves[0], halves[1])
     return out, trace_row("advice", task, start)
+
+
+def _own_errors(probe: Probe, image: Array, acting: BlockInstrument | None, fitted: tuple[str, ...]) -> Array:
+    """What one ± of the error that new images have of their own changes them by (K, L, N); none where the fit knows no errors."""
+    if not probe.own_error or acting is None or not fitted:
+        return np.zeros((0, *image.shape))
+    changed = image if probe.own_error == "light_gain" else np.full(image.shape, acting.brightest)
+    return np.asarray(DEFAULT_SE[probe.own_error] * changed[None])
 
 
 def in_percent(fraction: float) -> str:

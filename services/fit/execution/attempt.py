@@ -180,7 +180,7 @@ def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> st
             *(f.digest for f in (channel.recipe, channel.evaluation_recipe, *channel.blocks, *channel.search_blocks)),
             *channel.errors.names,
             *(json.dumps(row) for row in channel.errors.covariance),
-            *(f"{move.recipe.digest} {move.first} {move.camera_move} {move.thing}" for move in channel.moves),
+            *(f"{move.recipe.digest} {move.first} {move.camera_move} {move.body}" for move in channel.moves),
         ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

@@ -291,7 +291,7 @@ class Stages(ABC, Generic[Optics]):
         entry, _ = self.journal.once(f"{self.scope}/closing", compute)
         step = np.array(entry["step"])
         measured = uncertainty(
-            domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.thing for m in moves]
+            domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.body for m in moves]
         )
         return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
 

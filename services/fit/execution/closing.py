@@ -14,7 +14,7 @@ from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
-from services.fit.instrument.columns import columns, taken
+from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.moves import Move, by_scene, moves_task
 from services.fit.optics.domain import Domain, similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
@@ -114,13 +114,14 @@ def closing_task(
     size = renders[0].size
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
 
+    seen = [columns(render.reshape(block.reference.shape), block, slopes.errors) for render in renders]
+
     def derivatives(of: Differentiation, of_task: BlockTask, pair: tuple[int, int]) -> list[Array]:
         rows = of.render(host, of_task, view, pair, block.parts)
-        seen = (columns(render.reshape(block.reference.shape), block, of.errors) for render in renders)
         return [np.concatenate([own, more]) for own, more in zip(rows, seen, strict=True)]
 
     def residual(render: Array) -> Array:
-        return (taken(render.reshape(block.reference.shape), block, errors) - block.reference).reshape(-1)
+        return (photographed(render.reshape(block.reference.shape), block, errors) - block.reference).reshape(-1)
 
     believed = derivatives(how, replace(task, tissue=similar), similar_seeds)
     exact = believed if borrowed.all() else derivatives(slopes, task, seeds)

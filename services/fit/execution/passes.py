@@ -25,7 +25,7 @@ from services.fit.execution.derivatives import Differentiation, differentiation,
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import Executor
 from services.fit.execution.seeds import Seeds
-from services.fit.instrument.columns import columns, taken
+from services.fit.instrument.columns import columns, photographed
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
@@ -79,7 +79,7 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     stacks: list[StackEstimate] = [
         host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds
     ]
-    first, second = (taken(stack.mean, block, dict(task.errors)) - block.reference for stack in stacks)
+    first, second = (photographed(stack.mean, block, dict(task.errors)) - block.reference for stack in stacks)
     images = (stacks[0].mean, stacks[1].mean) if task.errors else None
     return Residual(first, second, trace_row("image", task, start), images)
 
@@ -149,7 +149,7 @@ def compare_task(
             host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed)
             for seed in seeds
         ]
-        first, second = ((taken(one.mean, block, dict(errors)) - block.reference).reshape(-1) for one in stacks)
+        first, second = ((photographed(one.mean, block, dict(errors)) - block.reference).reshape(-1) for one in stacks)
         return first, second
 
     changed = task.errors if new_errors is None else new_errors

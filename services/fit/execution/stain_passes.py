@@ -23,7 +23,7 @@ from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.instrument.columns import taken
+from services.fit.instrument.columns import photographed
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.normal_equations import LossChange
@@ -55,7 +55,7 @@ def stain_task(
         assert texels is not None
         return texels
 
-    seen = taken(image.mean, block, dict(task.errors))
+    seen = photographed(image.mean, block, dict(task.errors))
     squares = float((weight * ((seen - block.reference) ** 2 - image.variance)).sum())
     return gradient(weight * block.reference), gradient(weight * seen), squares, trace_row("stain", task, start)
 

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from services.core.results import Estimate, FitReport
-from services.fit.instrument.errors import kind_of_error
-from services.fit.instrument.told import FAULT
+from services.fit.instrument.sentences import FAULT
 
 SOURCES = {
     "photographs": "photographs",
@@ -58,7 +57,7 @@ def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
                     "found": f"{100 * one.value:+.2f}".replace("-", "−"),
                     "se": f"{100 * (one.se or 0.0):.2f}",
                     "before": f"{100 * before:.2g}",
-                    "assumed": kind_of_error(name) in report.assumed,
+                    "assumed": name in report.assumed,
                     "fault": abs(one.value) > FAULT * before,
                 }
             )

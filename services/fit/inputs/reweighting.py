@@ -13,7 +13,7 @@ from services.fit.execution.blocks import BlockTask, StoredFile, read_block, wri
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.columns import taken
+from services.fit.instrument.columns import photographed
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.losses import weights
 from services.fit.transport.scene.recipe import StackEstimate
@@ -35,7 +35,9 @@ def residual_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
         "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed
     )
     return Residual(
-        taken(stack.mean, block, dict(task.errors)) - block.reference, stack.variance, trace_row("weights", task, start)
+        photographed(stack.mean, block, dict(task.errors)) - block.reference,
+        stack.variance,
+        trace_row("weights", task, start),
     )
 
 

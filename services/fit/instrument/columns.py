@@ -12,7 +12,7 @@ from services.fit.execution.blocks import Block
 Array = NDArray[np.float64]
 
 
-def taken(image: Array, block: Block, errors: Mapping[str, float]) -> Array:
+def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Array:
     """The photographs (L, N) that the instrument would take of an image (L, N) with these errors."""
     acting = block.instrument
     if not errors or acting is None:

@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 DEFAULT_SE: Mapping[str, float] = MappingProxyType({"gain": 0.01, "light_gain": 0.01, "flare": 0.003})
 """One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest valid pixel in that channel.
 A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens shade leaves about 0.3 % of veiling glare."""
-KINDS = tuple(DEFAULT_SE)
 _DEGREE = math.radians(1)
 DEFAULT_MOVE_SE: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {"teeth": (0.1 * _DEGREE,) * 3 + (0.05,) * 3, "dome": (0.1 * _DEGREE,) * 3 + (2.0,) * 3}

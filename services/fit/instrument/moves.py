@@ -38,7 +38,7 @@ MAX_LIGHTS = 80
 class Move:
     """One standard deviation of a move, as lights and cameras see it."""
 
-    thing: str
+    body: str
     """``teeth`` or ``dome``."""
     recipe: StoredFile
     """The scene whose first lights are where they are said to be, and which has them again where the move puts them."""
@@ -65,15 +65,15 @@ def rigid(twist: Array, centre_mm: Array) -> Array:
 
 
 def move_covariance(stated: CalibrationUncertainty | None) -> tuple[Array, tuple[str, ...]]:
-    """Covariance (12, 12) of the moves of teeth and dome, and the things of which some part took its default."""
-    names = [f"{thing}.{axis}" for thing in MOVED for axis in TWIST]
-    covariance = np.diag([se**2 for thing in MOVED for se in DEFAULT_MOVE_SE[thing]])
+    """Covariance (12, 12) of the moves of teeth and dome, and those of them of which some part took its default."""
+    names = [f"{body}.{axis}" for body in MOVED for axis in TWIST]
+    covariance = np.diag([se**2 for body in MOVED for se in DEFAULT_MOVE_SE[body]])
     own = [name for name in names if stated is not None and name in stated.names]
     if stated is not None:
         here, there = [names.index(name) for name in own], [stated.names.index(name) for name in own]
         covariance[np.ix_(here, here)] = stated.matrix[np.ix_(there, there)]
     assumed = {name.partition(".")[0] for name in names if name not in own}
-    return covariance, tuple(thing for thing in MOVED if thing in assumed)
+    return covariance, tuple(body for body in MOVED if body in assumed)
 
 
 def write_moves(folder: Path, recipe: SceneRecipe, covariance: Array, dome_centre_mm: Array) -> tuple[Move, ...]:
@@ -83,10 +83,10 @@ def write_moves(folder: Path, recipe: SceneRecipe, covariance: Array, dome_centr
     values, vectors = np.linalg.eigh(covariance)
     for value, vector in zip(values, vectors.T, strict=True):
         twist = REACH * np.sqrt(max(value, 0.0)) * vector
-        thing = MOVED[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
+        body = MOVED[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
         back = np.linalg.inv(rigid(twist[:6], teeth_centre_mm))
         both = back @ rigid(twist[6:], dome_centre_mm)
-        moves.append((thing, lights @ both[:3, :3].T + both[:3, 3], np.linalg.inv(back)))
+        moves.append((body, lights @ both[:3, :3].T + both[:3, 3], np.linalg.inv(back)))
     found, count = list[Move](), max(MAX_LIGHTS // len(lights) - 1, 1)
     for start in range(0, len(moves), count):
         part = moves[start : start + count]
@@ -94,8 +94,8 @@ def write_moves(folder: Path, recipe: SceneRecipe, covariance: Array, dome_centr
         intensities = np.tile(recipe.light_intensities, len(part) + 1)
         stored = write_recipe(folder, replace(recipe, light_positions_mm=positions, light_intensities=intensities))
         found += [
-            Move(thing, stored, (k + 1) * len(lights), tuple(map(tuple, camera.tolist())))
-            for k, (thing, _, camera) in enumerate(part)
+            Move(body, stored, (k + 1) * len(lights), tuple(map(tuple, camera.tolist())))
+            for k, (body, _, camera) in enumerate(part)
         ]
     return tuple(found)
 

@@ -165,7 +165,7 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
         t.T @ equations.gradient + correction,
         t.T @ equations.gradient_noise @ t + np.outer(correction, correction),
     )
-    first, second = (max(float(np.trace(_positive(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
+    first, second = (max(float(np.trace(positive_part(noise))), 1e-300) for noise in (known_noise, sums.gradient_noise))
     share = first / (first + second)
     return Pooled(
         (1 - share) * known + share * sums.gradient,
@@ -186,19 +186,29 @@ class ClosingModel:
     noise: Array
 
     def step(self, part_count: int = 1) -> Array:
-        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things, inside the bounds."""
-        domain, open_directions = self.domain, self.known.open_directions
+        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things, inside the bounds.
+
+        The instrument's errors go where they are best for the tissue as the step leaves it, which is not where a whole one would.
+        """
+        domain, open_directions, count = self.domain, self.known.open_directions, self.domain.tissue_count
         scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
         scaled = scaled - open_directions @ (open_directions.T @ scaled)
         low, high = domain.bounds
-        return np.asarray(
-            np.clip(
-                self.x + domain.scale * scaled / max(1.0, float(np.linalg.norm(scaled)) / np.sqrt(part_count)),
-                low,
-                high,
-            )
-            - self.x
-        )
+        length = float(np.linalg.norm(scaled[:count])) / np.sqrt(part_count)
+        step = np.clip(self.x + domain.scale * scaled / max(1.0, length), low, high) - self.x
+        return np.asarray(np.concatenate([step[:count], self._errors_after(step[:count])]))
+
+    def _errors_after(self, tissue: Array) -> Array:
+        # Change of the errors (K,) at which F = g'z + z'z / 2, z = M y, is least after a step of the tissue, which alone moves its part of y.
+        count = len(tissue)
+        if count == len(self.x):
+            return np.zeros(0)
+        whole = np.linalg.inv(self.inverse)
+        y = np.linalg.solve(self.known.transform[:count, :count], tissue)
+        own = np.linalg.lstsq(whole[:, count:], -(self.gradient + whole[:, :count] @ y))[0]
+        low, high = (bound[count:] for bound in self.domain.bounds)
+        change = self.known.transform[count:] @ np.concatenate([y, own])
+        return np.asarray(np.clip(self.x[count:] + change, low, high) - self.x[count:])
 
     def slope(self, step: Array) -> float:
         """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what noise alone would give."""
@@ -224,7 +234,7 @@ def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: Cl
     solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
     pooled = _pooled(t, equations, sums, solved)
     return ClosingModel(
-        domain, x, known, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), _positive(pooled.noise)
+        domain, x, known, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), positive_part(pooled.noise)
     )
 
 
@@ -247,11 +257,11 @@ def uncertainty(
     known = whitening(domain, equations)
     t, count = known.transform, len(x)
     prior = t.T @ domain.precision @ t
-    parts = {"photographs": misfit * _positive(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
+    parts = {"photographs": misfit * positive_part(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
     meat = parts["photographs"] + prior
     if sums is None:
         inverse = np.eye(count)
-        parts["rendering"] = _positive(t.T @ equations.gradient_noise @ t)
+        parts["rendering"] = positive_part(t.T @ equations.gradient_noise @ t)
         meat = meat + parts["rendering"]
         left = t.T @ (equations.gradient + domain.prior_slope(x))
     else:
@@ -260,7 +270,7 @@ def uncertainty(
             np.linalg.solve(t, np.zeros(count) if step is None else step),
         )
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
-        rendered, unsure = _positive(pooled.noise), np.diag(solved.variance @ (gone + pooled.carried) ** 2)
+        rendered, unsure = positive_part(pooled.noise), np.diag(solved.variance @ (gone + pooled.carried) ** 2)
         kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
         parts |= {"rendering": rendered + unsure}
         parts |= {
@@ -386,7 +396,7 @@ def instrument_estimates(known: Uncertainty) -> dict[str, Estimate]:
     return found
 
 
-def _positive(matrix: Array) -> Array:
-    # A covariance estimated from products of two seeds may have slightly negative eigenvalues; a variance has none.
+def positive_part(matrix: Array) -> Array:
+    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have, and a variance has not."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

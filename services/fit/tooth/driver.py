@@ -36,7 +36,8 @@ from services.fit.inputs.observations import (
 )
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.instrument.capture import instrument_of
-from services.fit.instrument.told import assumed_kinds, instrument_told
+from services.fit.instrument.moves import MOVED
+from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, estimates, instrument_estimates
 from services.fit.tooth.schedule import ChannelSchedule
@@ -161,7 +162,8 @@ class FitDriver:
         errors = {c: known[c].domain.errors for c in fits}
         instrument = {c: found for c in fits if (found := instrument_estimates(known[c]))}
         stated = observations.manifest.uncertainty
-        assumed = assumed_kinds(errors, stated)
+        moved = {body for body in MOVED if any(body in one.parts for one in known.values())}
+        assumed = assumed_names(errors, stated, moved)
         values = {c: {name: one.value for name, one in found.items()} for c, found in instrument.items()}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
@@ -183,7 +185,7 @@ class FitDriver:
             instrument=instrument,
             instrument_prior={c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in instrument},
             assumed=assumed,
-            instrument_told=instrument_told(self.attempt.spec, errors, values, assumed, stated),
+            instrument_told=instrument_sentences(self.attempt.spec, errors, values, assumed, stated),
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
         )

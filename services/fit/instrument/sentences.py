@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from services.core.records import JobSpec
 from services.core.uncertainty import CalibrationUncertainty
-from services.fit.instrument.errors import DEFAULT_SE, KINDS, InstrumentErrors, kind_of_error
+from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, kind_of_error
 from services.fit.instrument.moves import move_covariance
 
 FAULT = 3.0
@@ -25,14 +25,19 @@ REMEDY = {
 }
 
 
-def assumed_kinds(errors: Mapping[str, InstrumentErrors], stated: CalibrationUncertainty | None) -> tuple[str, ...]:
-    """Kinds of which some error took its default, over all channels, and what moves as one; none where no error counts."""
-    found = {kind_of_error(name) for own in errors.values() for name in own.assumed}
-    moved = move_covariance(stated)[1] if any(own.names for own in errors.values()) else ()
-    return (*(kind for kind in KINDS if kind in found), *moved)
+def assumed_names(
+    errors: Mapping[str, InstrumentErrors], stated: CalibrationUncertainty | None, moved: Collection[str]
+) -> tuple[str, ...]:
+    """Errors that took their default, over all channels, and ``teeth`` or ``dome`` where some part of their move did.
+
+    Args:
+        moved: those of the moves that some channel's ± know.
+    """
+    names = dict.fromkeys(name for own in errors.values() for name in own.names if name in own.assumed)
+    return (*names, *(body for body in move_covariance(stated)[1] if body in moved))
 
 
-def instrument_told(
+def instrument_sentences(
     spec: JobSpec,
     errors: Mapping[str, InstrumentErrors],
     found: Mapping[str, Mapping[str, float]],
@@ -43,7 +48,7 @@ def instrument_told(
 
     Args:
         stated: by the calibration.
-        assumed: kinds, as ``assumed_kinds`` gives them.
+        assumed: names, as ``assumed_names`` gives them.
         errors: by channel, as they were known before the fit.
         found: by channel and name, what the images make of them.
     """
@@ -59,17 +64,27 @@ def instrument_told(
         if spec.lobes == 2
         else ()
     )
-    return (*_assumed(assumed), *_unused(stated), *unmoved, *_faults(errors, found))
+    return (*_assumed(assumed, errors), *_unused(stated), *unmoved, *_faults(errors, found))
 
 
-def _assumed(kinds: tuple[str, ...]) -> Iterator[str]:
-    if kinds:
-        sizes = [SIZES[kind] for kind in kinds]
+def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
+    if names:
+        sizes = list(_sizes(names, {name for own in errors.values() for name in own.names}))
         listed = sizes[0] if len(sizes) == 1 else f"{', '.join(sizes[:-1])} and {sizes[-1]}"
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
             "The ± depend on these; give uncertainty in capture.json."
         )
+
+
+def _sizes(names: tuple[str, ...], every: Collection[str]) -> Iterator[str]:
+    # A kind as a whole, or the few of it that no calibration states.
+    for kind, size in SIZES.items():
+        own = [name for name in names if kind_of_error(name) == kind]
+        if own and len(own) < sum(kind_of_error(name) == kind for name in every):
+            yield f"{100 * DEFAULT_SE[kind]:g} % for {' and '.join([', '.join(own[:-1]), own[-1]] if own[1:] else own)}"
+        elif own:
+            yield size
 
 
 def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
