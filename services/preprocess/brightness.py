@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from services.core.errors import CaptureInputError
-from services.core.geometry import Camera, Light
+from services.core.geometry import Camera, Light, Record
 from services.preprocess.projection import Footprint
-from services.preprocess.source import LightImage
+from services.preprocess.source import LightImage, View
 
 PLAUSIBLE = (1e-3, 10.0)
 """Radiance of teeth over that of a white diffuser. Real teeth give 0.1 to 1; a unit that is wrong by 1000 moves this by 1e6."""
@@ -19,8 +20,42 @@ ODD_LIGHT = 30.0
 """A light this much brighter or dimmer than the others, against what its calibration says, is told."""
 NAMED = 3
 """Dark images that are named."""
+COMPARED_PIXELS = 50_000
 CERTAIN = 4.0
 """Standard errors above which an image's light counts as seen."""
+
+
+class ImageLight(Record):
+    """How much light one image shows: sums over its pixels, or over an even share of them."""
+
+    measured: float = Field(description="radiance over all channels")
+    white: float = Field(description="the same of a white diffuser in the teeth's place")
+    cosine: float = Field(description="of the angle at which light falls in")
+    dark: bool = Field(default=False, description="no tooth is above the noise; the sums are then zero")
+
+
+def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.bool_]) -> ImageLight | None:
+    """What the chosen pixels (H, W) of an image show; None where there are none."""
+    import cv2
+
+    mask = chosen.astype(np.uint8)
+    count = int(np.count_nonzero(chosen))
+    if not count:
+        return None
+    measured, variance = (
+        count * sum(cv2.mean(values[..., c], mask)[0] for c in range(values.shape[-1]))
+        for values in (image.radiance, image.variance)
+    )
+    if measured <= CERTAIN * np.sqrt(variance):
+        return ImageLight(measured=0.0, white=0.0, cosine=0.0, dark=True)
+    # A plausibility needs no more than every n-th pixel in x and y
+    step = max(1, int(np.sqrt(count / COMPARED_PIXELS)))
+    cosine, distance_mm = _incidence(view.footprint, view.camera, light, chosen, step)
+    if not len(cosine):
+        return None
+    share = len(cosine) / count
+    white = float((cosine / distance_mm**2).sum()) / np.pi * sum(light.intensity)
+    return ImageLight(measured=measured * share, white=white, cosine=float(cosine.sum()))
 
 
 @dataclass
@@ -43,24 +78,17 @@ class Brightness:
     """(camera, light) of images in which no tooth is above the noise."""
     _lights: dict[str, _Sums] = field(default_factory=lambda: defaultdict(_Sums))
 
-    def add(
-        self, image: LightImage, footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]
-    ) -> bool:
-        """Count the chosen pixels (H, W) of an image; returns False where there are some and no light is seen in them."""
-        if not chosen.any():
-            return True
-        measured, variance = (
-            float(values[chosen].sum(dtype=np.float64)) for values in (image.radiance, image.variance)
-        )
-        if measured <= CERTAIN * np.sqrt(variance):
-            self.dark.append((camera.name, light.name))
-            return False
-        cosine, distance_mm = _incidence(footprint, camera, light, chosen)
-        sums = self._lights[light.name]
-        sums.measured += measured
-        sums.white += float((cosine / distance_mm**2).sum()) / np.pi * sum(light.intensity)
-        sums.cosine += float(cosine.sum())
-        return True
+    def add(self, camera: str, light: str, shown: ImageLight | None) -> None:
+        """Count what an image shows."""
+        if shown is None:
+            return
+        if shown.dark:
+            self.dark.append((camera, light))
+            return
+        sums = self._lights[light]
+        sums.measured += shown.measured
+        sums.white += shown.white
+        sums.cosine += shown.cosine
 
     def require_plausible(self) -> None:
         """Refuse a capture whose brightness no tooth has.
@@ -98,11 +126,11 @@ class Brightness:
 
 
 def _incidence(
-    footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_]
+    footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_], step: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows are not looked for.
-    rows = np.flatnonzero(chosen.any(axis=1))
-    band = slice(int(rows[0]), int(rows[-1]) + 1)
-    towards = np.asarray(light.position_mm) - footprint.points_mm(camera, band)[chosen[band]].astype(np.float64)
+    y, x = np.nonzero(chosen[::step, ::step])
+    y, x = y * step, x * step
+    towards = np.asarray(light.position_mm) - footprint.points_at(camera, y, x)
     distance_mm = np.linalg.norm(towards, axis=-1)
-    return np.maximum((towards * footprint.normal[chosen]).sum(axis=-1) / distance_mm, 0), distance_mm
+    return np.maximum((towards * footprint.normal[y, x]).sum(axis=-1) / distance_mm, 0), distance_mm

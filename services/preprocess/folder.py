@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from services.core.errors import CaptureInputError
 from services.core.files.arrays import as_float32, map_radiance
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
-from services.preprocess.projection import Footprint
-from services.preprocess.source import LightImage
+from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.window import bands
 
 # Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
 NOT_FINITE_LIMIT = 0.5
@@ -84,28 +84,58 @@ class FolderSource:
         name = self.description.cameras[camera].name
         return tuple(k for k, light in enumerate(self.description.lights) if (name, light.name) in self._entries)
 
-    def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
+    def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
+        """See ``Source``; images of a folder are taken to show the subject unmoved."""
+        return ()
+
+    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:  # noqa: ARG002
+        """See ``Source``."""
+        return iter(())
+
+    def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:  # noqa: ARG002
         """See ``Source``. A variance file is the variance of the pixel's value and used as it is."""
-        name = self.description.cameras[camera].name
-        for light in self.lights_of(camera):
-            entry = self._entries[name, self.description.lights[light].name]
-            radiance = self._read(entry, entry.file, camera)
-            finite = np.isfinite(radiance)
-            broken = int(np.count_nonzero(~finite.all(axis=-1) & footprint.covered))
-            if broken > max(1, NOT_FINITE_LIMIT * int(np.count_nonzero(footprint.covered))):
-                raise CaptureInputError(
-                    f"Image file {self.root / entry.file} (camera {name}, light {entry.light}) is not finite at {broken} tooth pixels; export it again."
-                )
-            radiance = np.where(finite, radiance, 0)
-            if entry.variance_file is not None:
-                variance = self._read(entry, entry.variance_file, camera)
-            else:
-                relative, floor = self._noise
-                variance = (relative * radiance) ** 2 + np.float32((floor * float(np.abs(radiance).max())) ** 2)
+        for light in lights:
+            yield light, self._image(self._entries[view.whole.name, self.description.lights[light].name], view)
+
+    def _image(self, entry: ImageEntry, view: View) -> LightImage:
+        covered = view.footprint.covered
+        radiance = self._read(entry, entry.file, view)
+        variance = None if entry.variance_file is None else self._read(entry, entry.variance_file, view)
+        peak, broken = 0.0, 0
+        bits = np.zeros(covered.shape, dtype=np.uint16)
+        for rows in bands(covered.shape):
+            values = radiance[rows]
+            finite = np.isfinite(values)
+            if not finite.all():
+                lost = ~finite.all(axis=-1)
+                broken += int(np.count_nonzero(lost & covered[rows]))
+                bits[rows][lost] = MaskBit.NOT_FINITE
+                values[~finite] = 0
+            peak = max(peak, float(np.abs(values).max(initial=0)))
+        if broken > max(1, NOT_FINITE_LIMIT * int(np.count_nonzero(covered))):
+            raise CaptureInputError(
+                f"Image file {self.root / entry.file} (camera {entry.camera}, light {entry.light}) is not finite at {broken} tooth pixels; export it again."
+            )
+        if variance is None:
+            variance = self._assumed(radiance, peak)
+        for rows in bands(covered.shape):
+            spread = variance[rows]
             # A weight is 1/variance, so a variance of zero is as unusable as NaN
-            usable = (finite & np.isfinite(variance) & (variance > 0)).all(axis=-1)
-            bits = np.where(usable, 0, MaskBit.NOT_FINITE).astype(np.uint16)
-            yield light, LightImage(radiance, np.where(np.isfinite(variance), variance, 0), bits)
+            usable = np.isfinite(spread) & (spread > 0)
+            if not usable.all():
+                bits[rows][~usable.all(axis=-1)] = MaskBit.NOT_FINITE
+                spread[~np.isfinite(spread)] = 0
+        return LightImage(radiance, variance, bits)
+
+    def _assumed(self, radiance: Image, peak: float) -> Image:
+        """The variance (H, W, C) that the job's options assume where none is given; ``peak`` is the brightest value."""
+        relative, floor = self._noise
+        variance = np.empty_like(radiance)
+        for rows in bands(radiance.shape[:2]):
+            np.multiply(radiance[rows], np.float32(relative), out=variance[rows])
+            variance[rows] *= variance[rows]
+            variance[rows] += np.float32((floor * peak) ** 2)
+        return variance
 
     def _path(self, file: str) -> Path:
         path = (self.root / file).resolve()
@@ -113,8 +143,9 @@ class FolderSource:
             raise CaptureInputError(f"Image file {file} lies outside the capture folder {self.root}; put it inside.")
         return path
 
-    def _read(self, entry: ImageEntry, file: str, camera: int) -> NDArray[np.float32]:
-        return as_float32(*self._map(entry, file, camera))
+    def _read(self, entry: ImageEntry, file: str, view: View) -> NDArray[np.float32]:
+        image, place = self._map(entry, file, view.number)
+        return as_float32(image[view.window.rows, view.window.columns], place)
 
     def _map(self, entry: ImageEntry, file: str, camera: int) -> tuple[NDArray[np.floating[Any]], str]:
         place = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"

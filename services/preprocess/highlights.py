@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
 from services.preprocess.projection import Footprint
+from services.preprocess.window import bands
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -37,21 +38,62 @@ class HighlightOptions:
     shading_error: float = 0.15  # how far shading strays from a quadratic in the normal
 
 
-def half_angles(camera: Camera, light: Light, footprint: Footprint, band_rows: int = 512) -> Image:
-    """Angle (H, W) in rad between the surface normal and the half vector of light and view; π where no surface is."""
-    pose = np.asarray(camera.camera_from_world)
+def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
+    """Cosine (H, W) of the angle between the surface normal and the half vector of light and view; -1 where no surface is.
+
+    A pixel's ray is a + b x + c y from the camera's eye, so all that is needed are products of the normal with a few fixed vectors and
+    polynomials of the pixel's place.
+    """
+    pose, inverse_K = np.asarray(camera.camera_from_world), np.linalg.inv(np.asarray(camera.K))
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    angles = np.full(footprint.mesh.shape, np.pi, dtype=np.float32)
-    for top in range(0, len(angles), band_rows):
-        rows = slice(top, top + band_rows)
-        points = footprint.points_mm(camera, rows)
-        to_light, to_eye = np.asarray(light.position_mm) - points, eye - points
-        half = to_light / np.linalg.norm(to_light, axis=-1, keepdims=True) + to_eye / np.linalg.norm(
-            to_eye, axis=-1, keepdims=True
-        )
-        cosine = (half * footprint.normal[rows]).sum(axis=-1) / np.maximum(np.linalg.norm(half, axis=-1), 1e-12)
-        angles[rows] = np.where(footprint.mesh[rows] >= 0, np.arccos(np.clip(cosine, -1, 1)), np.pi)
-    return angles
+    # Directions in the world of the camera's pixel (0, 0), of a step in x and of a step in y; the depth is along the camera's axis
+    start, step_x, step_y = (
+        pose[:3, :3].T @ inverse_K @ vector
+        for vector in (np.array([0.5, 0.5, 1]), np.array([1, 0, 0]), np.array([0, 1, 0]))
+    )
+    to_light = np.asarray(light.position_mm) - eye
+    vectors = np.stack([start, step_x, step_y, to_light], axis=1).astype(np.float32)
+    height, width = footprint.mesh.shape
+    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    ray_row = (start + step_y * np.arange(height)[:, None]).astype(np.float32)
+    ray_squared = np.stack(
+        [
+            (ray_row**2).sum(axis=1),
+            2 * ray_row @ step_x.astype(np.float32),
+            np.full(height, step_x @ step_x, np.float32),
+        ],
+        axis=1,
+    ).astype(np.float32)
+    powers = np.stack([np.ones_like(x), x, x * x])
+    towards = np.stack([ray_row @ to_light.astype(np.float32), np.full(height, step_x @ to_light)], axis=1).astype(
+        np.float32
+    )
+    cosines = np.full(footprint.mesh.shape, -1, dtype=np.float32)
+    for rows in bands(footprint.mesh.shape):
+        seen = footprint.mesh[rows] >= 0
+        if not seen.any():
+            continue
+        first, last = (int(one) for one in np.flatnonzero(seen.any(axis=0))[[0, -1]])
+        columns = slice(first, last + 1)
+        seen = seen[:, columns]
+        depth = np.where(seen, footprint.depth_mm[rows, columns], np.float32(1))
+        by_normal = footprint.normal[rows, columns].reshape(-1, 3) @ vectors
+        at_start, by_x, by_y, light_cosine = (by_normal[:, k].reshape(depth.shape) for k in range(4))
+        ray_cosine = at_start + by_x * x[columns]
+        ray_cosine += by_y * y[rows]
+        # Of the ray, and of the vector from the surface to the light
+        ray_length = np.sqrt(ray_squared[rows] @ powers[:, columns])
+        along = towards[rows] @ powers[:2, columns]
+        depth_squared = depth * ray_length
+        depth_squared *= depth_squared
+        dot = depth_squared - depth * along
+        distance = np.sqrt(np.maximum(dot - depth * along + np.float32(to_light @ to_light), np.float32(1e-12)))
+        light_cosine = (light_cosine - depth * ray_cosine) / distance
+        ray_cosine /= ray_length
+        between = dot / (distance * depth * ray_length)
+        half = np.sqrt(np.maximum(2 + 2 * between, np.float32(1e-12)))
+        np.copyto(cosines[rows, columns], (light_cosine - ray_cosine) / half, where=seen)
+    return cosines
 
 
 def highlight_mask(
@@ -59,7 +101,7 @@ def highlight_mask(
     variance: Image,
     usable: BoolArray,
     saturated: BoolArray,
-    angles: Image,
+    cosines: Image,
     normal: Image,
     light_colour: tuple[float, ...],
     options: HighlightOptions | None = None,
@@ -70,65 +112,161 @@ def highlight_mask(
         radiance, variance: (H, W, C), linear, and its variance.
         usable: (H, W), pixels whose whole footprint is tooth and whose value is good.
         saturated: (H, W), tooth pixels without a value because too bright; near the mirror direction they are a highlight's core.
-        angles: (H, W) from ``half_angles``.
+        cosines: (H, W) from ``half_cosines``.
         normal: (H, W, 3), outward.
         light_colour: the light's intensity per channel.
     """
     import cv2
 
     o = options or HighlightOptions()
-    near = usable & (angles < np.radians(o.cone_deg))
-    burnt = saturated & (angles < np.radians(o.cone_deg))
+    cone = np.float32(np.cos(np.radians(o.cone_deg)))
+    is_near = cosines > cone
+    near, burnt = usable & is_near, saturated & is_near
+    mask = np.zeros(usable.shape, dtype=bool)
     if not (near | burnt).any():
-        return np.zeros(usable.shape, dtype=bool)
+        return mask
     axis = np.asarray(light_colour, dtype=np.float64)
     axis /= np.linalg.norm(axis)
-    brightness = (radiance @ axis.astype(np.float32)).astype(np.float32)
-    far = usable & (angles > np.radians(o.lobe_deg)) & (brightness > 0)
+    brightness = along_axis(radiance, axis)
+    far = usable & (cosines < np.float32(np.cos(np.radians(o.lobe_deg)))) & (brightness > 0)
+    shading = _fit_shading(brightness, far, normal, o)
+    colour = _fit_colour(radiance, brightness, usable, far, axis) if radiance.shape[-1] >= 3 else None
 
-    # Combine both estimates of the reflected part by their inverse variances
-    estimate, weight = _by_shading(brightness, variance @ (axis**2).astype(np.float32), usable, far, normal, o)
-    if radiance.shape[-1] >= 3:
-        by_colour, colour_weight = _by_colour(radiance, variance, brightness, usable, far, axis, o)
-        estimate = (estimate * weight + by_colour * colour_weight) / np.maximum(weight + colour_weight, 1e-30)
-        weight = weight + colour_weight
-    sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
-    fraction = estimate / np.maximum(brightness, 1e-30)
+    # A few rows at a time: both estimates of the reflected part joined by their inverse variances, and what they say of each pixel
+    weak, strong = burnt.astype(np.uint8), burnt
+    sums = _LobeSums()
+    for rows in bands(usable.shape):
+        own = near[rows]
+        if not own.any():
+            continue
+        estimate, weight = _reflected(
+            radiance[rows], variance[rows], brightness[rows], normal[rows], rows, axis, shading, colour, o
+        )
+        bright = brightness[rows]
+        fraction = estimate / np.maximum(bright, np.float32(1e-30))
+        significance = estimate * np.sqrt(weight)
+        is_weak = own & (fraction > np.float32(o.weak)) & (significance > np.float32(o.weak_sigma))
+        weak[rows] |= is_weak
+        strong[rows] |= is_weak & (fraction > np.float32(o.strong)) & (significance > np.float32(o.strong_sigma))
+        sums.add(cosines[rows][own], bright[own], estimate[own], weight[own])
+    if not strong.any():
+        return mask
 
     # Hysteresis: a strong core, continued through weak neighbours, and one pixel of bloom
-    weak = near & (fraction > o.weak) & (estimate > o.weak_sigma * sigma)
-    strong = weak & (fraction > o.strong) & (estimate > o.strong_sigma * sigma)
-    weak, strong = weak | burnt, strong | burnt
-    labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=8)[1]
-    core = np.isin(labels, np.unique(labels[strong])) & weak
-    bloom = cv2.dilate(core.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    count, labels = cv2.connectedComponents(weak, connectivity=8)
+    of_core = np.zeros(count, dtype=np.uint8)
+    of_core[labels[strong]] = 1
+    of_core[0] = 0
+    core = of_core[labels]
+    bloom = cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0
+    lobe = cosines > np.float32(np.cos(sums.angle(o)))
+    return np.asarray((usable | saturated) & (bloom | lobe))
 
-    lobe = angles < _lobe_angle(estimate, weight, brightness, usable, angles, o)
-    return (usable | saturated) & (bloom | lobe) if core.any() else np.zeros(usable.shape, dtype=bool)
+
+def along_axis(image: Image, axis: NDArray[np.float64]) -> Image:
+    """Product (H, W) of every pixel (H, W, C) with a vector (C,)."""
+    return np.asarray(image.reshape(-1, image.shape[-1]) @ axis.astype(np.float32), dtype=np.float32).reshape(
+        image.shape[:2]
+    )
 
 
-def _by_shading(
-    brightness: Image, variance: Image, usable: BoolArray, far: BoolArray, normal: Image, o: HighlightOptions
+@dataclass(frozen=True)
+class _Shading:
+    """Diffuse shading as a quadratic in the normal.
+
+    Attributes:
+        quadratic: (3, 3) symmetric, linear: (3,), constant: its coefficients.
+        misfit: standard deviation of what it leaves, as a fraction.
+    """
+
+    quadratic: NDArray[np.float32]
+    linear: NDArray[np.float32]
+    constant: np.float32
+    misfit: float
+
+    def at(self, normal: Image) -> Image:
+        """Shading (h, w) of normals (h, w, 3)."""
+        flat = normal.reshape(-1, 3)
+        product = flat @ self.quadratic
+        product += self.linear
+        product *= flat
+        return np.asarray(product @ np.ones(3, dtype=np.float32) + self.constant).reshape(normal.shape[:2])
+
+
+@dataclass(frozen=True)
+class _Colour:
+    """Diffuse chroma: its direction (C,), and the inverse (H, W) of its ratio to the brightness in the neighbourhood."""
+
+    direction: NDArray[np.float64]
+    inverse_ratio: Image
+
+
+def _reflected(
+    radiance: Image,
+    variance: Image,
+    brightness: Image,
+    normal: Image,
+    rows: slice,
+    axis: NDArray[np.float64],
+    shading: _Shading | None,
+    colour: _Colour | None,
+    o: HighlightOptions,
 ) -> tuple[Image, Image]:
-    """Reflected part and inverse variance, taking diffuse shading as a quadratic in the normal (nine coefficients)."""
-    lit = far & (brightness > 0.1 * np.quantile(brightness[far], 0.95)) if far.any() else far
-    chosen = np.flatnonzero(lit)
-    if len(chosen) < 90:
-        return np.zeros_like(brightness), np.zeros_like(brightness)
+    """Reflected part and inverse variance (h, w) by shading and by colour together; weight 0 where neither says anything.
+
+    With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance grows as 1/ρ².
+    """
+    tiny = np.float32(1e-30)
+    flat = variance.reshape(-1, variance.shape[-1])
+    total, weight = np.zeros_like(brightness), np.zeros_like(brightness)
+    if shading is not None:
+        expected = shading.at(normal)
+        spread = (flat @ (axis**2).astype(np.float32)).reshape(brightness.shape)
+        own = 1 / np.maximum(spread + (np.float32(shading.misfit) * expected) ** 2, tiny)
+        total += own * (brightness - expected)
+        weight += own
+    if colour is not None:
+        inverse = colour.inverse_ratio[rows]
+        estimate = brightness - along_axis(radiance, colour.direction) * inverse
+        spread = np.zeros_like(brightness)
+        for c in range(radiance.shape[-1]):
+            factor = np.float32(axis[c]) - np.float32(colour.direction[c]) * inverse
+            factor *= factor
+            factor *= variance[..., c]
+            spread += factor
+        own = 1 / np.maximum(spread + (np.float32(o.colour_error) * brightness) ** 2, tiny)
+        total += own * estimate
+        weight += own
+    return np.divide(total, np.maximum(weight, tiny), out=total), weight
+
+
+def _fit_shading(brightness: Image, far: BoolArray, normal: Image, o: HighlightOptions) -> _Shading | None:
+    """Shading (nine coefficients) of diffuse pixels; None where too few are lit."""
+    chosen = _strided(far, FITTED_PIXELS)
+    if not len(chosen):
+        return None
     # Nine coefficients need no more than evenly strided pixels
-    chosen = chosen[:: -(-len(chosen) // FITTED_PIXELS)]
+    level = brightness.ravel()[chosen]
+    lit = level > 0.1 * np.quantile(level, 0.95)
+    chosen, level = chosen[lit], level[lit].astype(np.float64)
+    if len(chosen) < 90:
+        return None
     terms = np.stack(tuple(_quadratic(normal.reshape(-1, 3)[chosen].astype(np.float64))), axis=-1)
-    level = brightness.ravel()[chosen].astype(np.float64)
     # A small ridge keeps directions that the visible normals do not span at zero
     matrix = terms.T @ terms
-    coefficients = np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), terms.T @ level)
-    shading = np.zeros_like(brightness)
-    for coefficient, term in zip(coefficients, _quadratic(normal), strict=True):
-        shading += np.float32(coefficient) * term
+    c = np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), terms.T @ level)
     # The fit's own misfit says how far to trust it
-    misfit = max(o.shading_error, float(np.sqrt(np.mean((level - terms @ coefficients) ** 2)) / level.mean()))
-    weight = usable / np.maximum(variance + (misfit * shading) ** 2, 1e-30)
-    return brightness - shading, weight.astype(np.float32)
+    misfit = max(o.shading_error, float(np.sqrt(np.mean((level - terms @ c) ** 2)) / level.mean()))
+    quadratic = np.array(
+        [[c[7], c[4] / 2, c[6] / 2], [c[4] / 2, -c[7], c[5] / 2], [c[6] / 2, c[5] / 2, 3 * c[8]]], dtype=np.float32
+    )
+    return _Shading(quadratic, c[1:4].astype(np.float32), np.float32(c[0] - c[8]), misfit)
+
+
+def _strided(mask: BoolArray, most: int) -> NDArray[np.intp]:
+    """Flat indices of at most so many of a mask's pixels, evenly strided."""
+    inside = np.flatnonzero(mask)
+    return inside[:: max(1, -(-len(inside) // most))]
 
 
 def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
@@ -143,76 +281,73 @@ def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
     yield 3 * z * z - 1
 
 
-def _wide_blur(image: Image, sigma_px: float) -> Image:
-    """Gaussian blur; a wide one is made on a reduced image, which it cannot tell apart."""
+def _fit_colour(
+    radiance: Image, brightness: Image, usable: BoolArray, far: BoolArray, axis: NDArray[np.float64]
+) -> _Colour | None:
+    """Chroma of diffuse light, and its ratio to the brightness around each pixel; None where there is none to learn from."""
     import cv2
 
-    factor = max(1, int(sigma_px / 6))
-    height, width = image.shape
-    small = (
-        image
-        if factor == 1
-        else cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
-    )
-    blurred = cv2.GaussianBlur(small, (0, 0), sigma_px / factor)
-    return np.asarray(
-        blurred if factor == 1 else cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR),
-        dtype=np.float32,
-    )
-
-
-def _by_colour(
-    radiance: Image,
-    variance: Image,
-    brightness: Image,
-    usable: BoolArray,
-    far: BoolArray,
-    axis: NDArray[np.float64],
-    o: HighlightOptions,
-) -> tuple[Image, Image]:
-    """Reflected part and inverse variance from S against UV.
-
-    With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance grows as 1/ρ².
-    """
     if np.count_nonzero(far) < 20:
-        return np.zeros_like(brightness), np.zeros_like(brightness)
-    chroma = radiance[far].sum(axis=0, dtype=np.float64)
+        return None
+    far_map = far.astype(np.float32)
+    chroma = np.zeros(len(axis))
+    for rows in bands(far.shape):
+        chroma += far_map[rows].ravel() @ radiance[rows].reshape(-1, len(axis))
     chroma -= (chroma @ axis) * axis
     length = float(np.linalg.norm(chroma))
     if length <= 0:
-        return np.zeros_like(brightness), np.zeros_like(brightness)
+        return None
     direction = chroma / length
     # Diffuse ratio in the neighbourhood, falling back to the image's where no diffuse pixel is near
-    along = (radiance @ direction.astype(np.float32)).astype(np.float32)
+    along = along_axis(radiance, direction)
+    mean_along, mean_brightness = (float(cv2.mean(image, far.astype(np.uint8))[0]) for image in (along, brightness))
     reach = max(2.0, 0.15 * float(np.sqrt(np.count_nonzero(usable))))
-    mean_along, mean_brightness = float(along[far].mean()), float(brightness[far].mean())
-    known = _wide_blur(far.astype(np.float32), reach) + 0.05
-    local_along = (_wide_blur(along * far, reach) + 0.05 * mean_along) / known
-    local_brightness = (_wide_blur(brightness * far, reach) + 0.05 * mean_brightness) / known
+    along *= far_map
+    factor = max(1, int(reach / 6))
+    # A wide blur is made on a reduced image, which it cannot tell apart
+    known = _wide_blur(far_map, reach, factor) + 0.05
+    local_along = (_wide_blur(along, reach, factor) + 0.05 * mean_along) / known
+    np.multiply(brightness, far_map, out=far_map)
+    local_brightness = (_wide_blur(far_map, reach, factor) + 0.05 * mean_brightness) / known
     ratio = np.maximum(local_along / np.maximum(local_brightness, 1e-30), 0.1 * mean_along / mean_brightness)
-    estimate = brightness - along / ratio
-    spread = np.zeros_like(brightness)
-    for c in range(radiance.shape[-1]):
-        spread += ((axis[c] - direction[c] / ratio) ** 2 * variance[..., c]).astype(np.float32)
-    weight = usable / np.maximum(spread + (o.colour_error * brightness) ** 2, 1e-30)
-    return estimate.astype(np.float32), weight.astype(np.float32)
+    inverse = (1 / ratio).astype(np.float32)
+    if factor > 1:
+        inverse = np.asarray(cv2.resize(inverse, usable.shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    return _Colour(direction, inverse)
 
 
-def _lobe_angle(
-    estimate: Image, weight: Image, brightness: Image, usable: BoolArray, angles: Image, o: HighlightOptions
-) -> float:
-    """Half-angle in rad within which the mean reflected fraction exceeds ``tolerated``: averaging sees tails that single pixels hide."""
-    degrees = np.degrees(angles[usable])
-    bins = np.minimum(degrees.astype(np.int64), 179)
-    total = np.bincount(bins, brightness[usable], minlength=180)
-    reflected = np.bincount(bins, estimate[usable], minlength=180)
-    noise = np.sqrt(np.bincount(bins, 1 / np.maximum(weight[usable], 1e-30), minlength=180))
-    # What remains outside the lobe is the method's own bias
-    outside = slice(int(o.lobe_deg), int(o.cone_deg))
-    bias = reflected[outside].sum() / max(total[outside].sum(), 1e-30)
-    cone = 0
-    for degree in np.flatnonzero(total[: int(o.cone_deg)] > 0):
-        if reflected[degree] - bias * total[degree] < max(o.tolerated * total[degree], 2 * noise[degree]):
-            break
-        cone = int(degree) + 1
-    return float(np.radians(cone))
+def _wide_blur(image: Image, sigma_px: float, factor: int) -> Image:
+    """Gaussian blur of an image reduced by ``factor``."""
+    import cv2
+
+    height, width = image.shape
+    if factor > 1:
+        image = cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px / factor), dtype=np.float32)
+
+
+class _LobeSums:
+    """Light and its reflected part by whole degrees from the mirror direction."""
+
+    def __init__(self) -> None:
+        self._total, self._reflected, self._variance = (np.zeros(180) for _ in range(3))
+
+    def add(self, cosines: Image, brightness: Image, estimate: Image, weight: Image) -> None:
+        """Add pixels (N,)."""
+        degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1))).astype(np.int64)
+        self._total += np.bincount(degrees, brightness, minlength=180)
+        self._reflected += np.bincount(degrees, estimate, minlength=180)
+        self._variance += np.bincount(degrees, 1 / np.maximum(weight, np.float32(1e-30)), minlength=180)
+
+    def angle(self, o: HighlightOptions) -> float:
+        """Half-angle in rad within which the mean reflected fraction exceeds ``tolerated``: averaging sees tails that single pixels hide."""
+        total, reflected, noise = self._total, self._reflected, np.sqrt(self._variance)
+        # What remains outside the lobe is the method's own bias
+        outside = slice(int(o.lobe_deg), int(o.cone_deg))
+        bias = reflected[outside].sum() / max(total[outside].sum(), 1e-30)
+        cone = 0
+        for degree in np.flatnonzero(total[: int(o.cone_deg)] > 0):
+            if reflected[degree] - bias * total[degree] < max(o.tolerated * total[degree], 2 * noise[degree]):
+                break
+            cone = int(degree) + 1
+        return float(np.radians(cone))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.records import FrameRecord
 from services.preprocess.projection import Footprint
-from services.preprocess.stabilise import TERMS, Aligner, FloatArray, SurfaceFlow, interpolate
+from services.preprocess.source import Motions, View
+from services.preprocess.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
+from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
 # Beyond this share of a jaw's shorter side the coarse-to-fine alignment may lock on to the wrong edge
 LIMIT_OF_EXTENT = 1 / 6
+# Room around the teeth for the largest motion that is accepted, whose median is limited and not its maximum
+REACH_OF_LIMIT, REACH_PX = 1.25, 8
 STORED_PIXELS = 250_000
-BAND_ROWS = 256
+MEDIAN_PIXELS = 20_000
 
 
 def stored_step(shape: tuple[int, int]) -> int:
@@ -29,6 +33,12 @@ def jaws(fdi: Sequence[int]) -> list[list[int]]:
     """Positions of the upper and of the lower teeth in a list of FDI numbers; each jaw moves as one body."""
     upper = [k for k, number in enumerate(fdi) if number // 10 in {1, 2, 5, 6}]
     return [group for group in (upper, [k for k in range(len(fdi)) if k not in upper]) if group]
+
+
+def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
+    """Tracking frames, which share one light; with fewer than two of them every light frame is matched to the first by its edges."""
+    tracking = tuple(frame for frame in frames if frame.kind == "tracking")
+    return tracking if len(tracking) >= 2 else tuple(frame for frame in frames if frame.kind == "light")
 
 
 @dataclass(frozen=True)
@@ -49,57 +59,78 @@ class Displacement:
 class ViewMotion:
     """Measures motion against the first frame and gives it for every light frame.
 
-    Between tracking frames, which share one light, it is measured and then interpolated over the frame number: frames are triggered evenly,
-    and the number is free of the host's clock. With fewer than two of them every light frame is matched to the first by its edges.
+    Between tracking frames it is measured and then interpolated over the frame number: frames are triggered evenly, and the number is free of
+    the host's clock.
     """
 
-    def __init__(
-        self,
-        footprint: Footprint,
-        bodies: Sequence[Sequence[int]],
-        frames: Sequence[FrameRecord],
-        brightness: Callable[[FrameRecord], Image],
-        view: str,
-    ) -> None:
-        """Measure.
+    def __init__(self, view: View, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord]) -> None:
+        """Lay out what each body can do.
 
         Args:
             bodies: the footprint's mesh numbers of each rigid body.
-            brightness: (H, W) linear image of a frame; called once per frame used.
-            view: name of the camera, for messages.
+            frames: all of the capture.
+        """
+        self._view = view
+        self._used = frames_to_match(frames)
+        self._interpolated = self._used[0].kind == "tracking"
+        seen = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
+        sides = [_shorter_side(one) for one in seen if one.any()]
+        reach = int(np.ceil(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides))) + REACH_PX
+        self.window: Window = view.window.grown(reach, view.whole.size)
+        """Where a pixel of the view may come from: as many pixels larger as a jaw may move."""
+        self._inner = view.window.within(self.window)
+        around = _placed(view.footprint, self.window.shape, self._inner)
+        self._bodies = [body for body in (SurfaceFlow(around, meshes) for meshes in bodies) if body.seen.any()]
+        # Medians need no more than evenly strided pixels
+        self._step = max(1, int(np.sqrt(np.prod(view.window.shape) / MEDIAN_PIXELS)))
+
+    def measure(
+        self,
+        frames: Sequence[int],
+        picture: Callable[[FrameRecord], NDArray[np.generic]],
+        level: float = 0.0,
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """Frame number and coefficients (bodies, TERMS, 2), one at a time.
+
+        Args:
+            frames: numbers of some of ``frames_to_match``.
+            picture: values (H, W) or (H, W, C) of a frame in ``window``, linear in light above ``level``.
 
         Raises:
             CaptureInputError: moved too far to be aligned; names the frame and the camera.
         """
-        tracking = [frame for frame in frames if frame.kind == "tracking"]
-        self._interpolated = len(tracking) >= 2
-        used = tracking if self._interpolated else [frame for frame in frames if frame.kind == "light"]
-        self._shape = footprint.mesh.shape
-        self._bodies = [body for body in (SurfaceFlow(footprint, meshes) for meshes in bodies) if body.seen.any()]
-        self._step = stored_step(footprint.mesh.shape)
-
-        reference = brightness(used[0])
-        aligners = [Aligner(body, reference, "texture" if self._interpolated else "edges") for body in self._bodies]
-        knots = [np.zeros((len(self._bodies), TERMS, 2))]
-        for frame in used[1:]:
-            image = brightness(frame)
-            knots.append(np.asarray([aligner.solve(image) for aligner in aligners]).reshape(-1, TERMS, 2))
-            for body, coefficients in zip(self._bodies, knots[-1], strict=True):
+        if not frames:
+            return
+        first = self._used[0]
+        feature: Feature = "texture" if self._interpolated else "edges"
+        reference = picture(first)
+        aligners = [Aligner(body, reference, feature, level) for body in self._bodies]
+        for frame in self._used:
+            if frame.index not in frames:
+                continue
+            if frame.index == first.index:
+                yield frame.index, np.zeros((len(self._bodies), TERMS, 2))
+                continue
+            image = picture(frame)
+            found = np.asarray([aligner.solve(image) for aligner in aligners]).reshape(-1, TERMS, 2)
+            for body, coefficients in zip(self._bodies, found, strict=True):
                 moved, limit = self._median(body, coefficients), LIMIT_OF_EXTENT * body.extent_px
                 if moved > limit:
                     raise CaptureInputError(
-                        f"The subject moved {moved:.1f} px by frame {frame.index} (camera {view}, light {frame.light or 'all'}), more than the "
-                        f"{limit:.1f} px that can be aligned; capture again with the head supported."
+                        f"The subject moved {moved:.1f} px by frame {frame.index} (camera {self._view.whole.name}, "
+                        f"light {frame.light or 'all'}), more than the {limit:.1f} px that can be aligned; "
+                        "capture again with the head supported."
                     )
-        self._index = np.array([frame.index for frame in used], dtype=np.float64)
-        self._knots: FloatArray = np.asarray(knots)
+            yield frame.index, found
 
-    def at(self, frame: FrameRecord) -> Displacement:
-        """Motion of one frame."""
+    def at(self, frame: FrameRecord, motions: Motions) -> Displacement:
+        """Motion of one frame, from those of all ``frames_to_match``."""
+        index = np.array([used.index for used in self._used], dtype=np.float64)
         if self._interpolated:
-            coefficients, error = interpolate(self._index, self._knots, float(frame.index))
+            knots = np.stack([motions[used.index] for used in self._used])
+            coefficients, error = interpolate(index, knots, float(frame.index))
         else:
-            coefficients = self._knots[int(np.flatnonzero(self._index == frame.index)[0])]
+            coefficients = motions[frame.index]
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # The shift's error stands for the field's: the other terms are small beside it
@@ -107,24 +138,54 @@ class ViewMotion:
             coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
         )
 
-    def field(self, displacement: Displacement, step: int = 1) -> Image:
-        """Displacement (H, W, 2) in pixels at every ``step``-th pixel; pixels beside all teeth move with the first jaw."""
-        height, width = self._shape
-        field = np.zeros((-(-height // step), -(-width // step), 2), dtype=np.float32)
-        for number, (body, coefficients) in enumerate(zip(self._bodies, displacement.coefficients, strict=True)):
-            # Bands of rows, since the basis has several times the size of the field
-            for top in range(0, height, BAND_ROWS * step):
-                rows = slice(top, min(top + BAND_ROWS * step, height))
-                own = body.field(coefficients, rows, step)
-                target = field[top // step : top // step + len(own)]
-                target[:] = own if number == 0 else np.where(body.seen[rows][::step, ::step, None], own, target)
-        return field
+    def places(self, displacement: Displacement, rows: slice) -> Image:
+        """Where some rows of the view are found in a frame: x and y (2, rows, width) as indices into ``window``."""
+        own_rows, columns = self._rows(rows), self._inner[1]
+        places = self._bodies[0].places(displacement.coefficients[0], own_rows, columns)
+        for body, coefficients in zip(self._bodies[1:], displacement.coefficients[1:], strict=True):
+            seen = body.seen[own_rows, columns]
+            if seen.any():
+                np.copyto(places, body.places(coefficients, own_rows, columns), where=seen)
+        return places
 
     def stored(self, displacement: Displacement) -> Image:
-        """Displacement at every ``stored_step``-th pixel."""
-        return self.field(displacement, self._step)
+        """Displacement (h, w, 2) at every ``stored_step``-th pixel of the whole image that lies in the view.
+
+        Pixels beside all teeth move with the first jaw.
+        """
+        width, height = self._view.whole.size
+        step = stored_step((height, width))
+        window = self._view.window
+        rows, columns = (
+            slice(start + -whole % step, stop, step)
+            for (start, stop), whole in zip(
+                ((own.start, own.stop) for own in self._inner), (window.top, window.left), strict=True
+            )
+        )
+        field = self._bodies[0].field(displacement.coefficients[0], rows, columns)
+        for body, coefficients in zip(self._bodies[1:], displacement.coefficients[1:], strict=True):
+            field = np.where(body.seen[rows, columns, None], body.field(coefficients, rows, columns), field)
+        return field
+
+    def _rows(self, rows: slice) -> slice:
+        top = self._inner[0].start
+        return slice(top + rows.start, top + rows.stop)
 
     def _median(self, body: SurfaceFlow, coefficients: FloatArray) -> float:
-        lengths = np.linalg.norm(body.field(coefficients, step=self._step), axis=-1)
-        seen = body.seen[:: self._step, :: self._step]
-        return float(np.median(lengths[seen])) if seen.any() else 0.0
+        rows, columns = (slice(own.start, own.stop, self._step) for own in self._inner)
+        seen = body.seen[rows, columns]
+        if not seen.any():
+            return 0.0
+        return float(np.median(np.linalg.norm(body.field(coefficients, rows, columns)[seen], axis=-1)))
+
+
+def _shorter_side(seen: NDArray[np.bool_]) -> int:
+    return min(int(np.ptp(np.flatnonzero(seen.any(axis=axis)))) + 1 for axis in (0, 1))
+
+
+def _placed(footprint: Footprint, shape: tuple[int, int], inner: tuple[slice, slice]) -> Footprint:
+    """A footprint in a larger window, where nothing is seen around it."""
+    mesh, covered = np.full(shape, -1, dtype=np.int16), np.zeros(shape, dtype=bool)
+    depth_mm = np.full(shape, np.inf, dtype=np.float32)
+    mesh[inner], covered[inner], depth_mm[inner] = footprint.mesh, footprint.covered, footprint.depth_mm
+    return Footprint(mesh, depth_mm, footprint.normal, covered)

@@ -12,8 +12,10 @@ from services.core.geometry import Camera, Mesh
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-# Candidate (triangle, sample) pairs held at once; 64 bytes each, so about 130 MB
-BATCH = 2_000_000
+# Candidate (triangle, sample) pairs held at once; about 200 bytes each, so 40 MB, near a processor's cache
+BATCH = 200_000
+# Least barycentric coordinate of a sample inside a triangle: an edge belongs to both of its triangles, rounding included
+EDGE = -1e-9
 
 
 @dataclass(frozen=True)
@@ -29,12 +31,16 @@ class Footprint:
         """World positions (rows, width, 3) of the visible surface; NaN where nothing is hit."""
         height, width = self.mesh.shape
         y, x = np.mgrid[0:height, 0:width][:, rows]
+        points = self.points_at(camera, y, x)
+        points[self.mesh[rows] < 0] = np.nan
+        return points.astype(np.float32)
+
+    def points_at(self, camera: Camera, y: NDArray[np.intp], x: NDArray[np.intp]) -> FloatArray:
+        """World positions (..., 3) of the surface that the pixels of these rows and columns (...) see."""
         pose = np.asarray(camera.camera_from_world)
-        local = (
-            np.stack([x + 0.5, y + 0.5, np.ones_like(x, dtype=float)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
-        )
-        local *= np.where(self.mesh[rows] >= 0, self.depth_mm[rows], np.nan)[..., None]
-        return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float32)
+        local = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
+        local *= np.where(self.mesh[y, x] >= 0, self.depth_mm[y, x], 0)[..., None]
+        return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
 
 
 def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()) -> Footprint:
@@ -46,7 +52,7 @@ def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = (
     meshes = (*teeth, *occluders)
     mesh, depth, normal = _rasterise(camera, meshes, (height, width), 0.5)
     mesh[mesh >= len(teeth)] = -1
-    corner = _rasterise(camera, meshes, (height + 1, width + 1), 0.0)[0]
+    corner = _rasterise(camera, meshes, (height + 1, width + 1), 0.0, with_normals=False)[0]
     corners = (corner >= 0) & (corner < len(teeth))
     covered = corners[:-1, :-1] & corners[:-1, 1:] & corners[1:, :-1] & corners[1:, 1:] & (mesh >= 0)
     return Footprint(mesh, depth, normal, covered)
@@ -64,13 +70,13 @@ def vertex_normals(mesh: Mesh) -> FloatArray:
 
 
 def _rasterise(
-    camera: Camera, meshes: Sequence[Mesh], shape: tuple[int, int], offset_px: float
+    camera: Camera, meshes: Sequence[Mesh], shape: tuple[int, int], offset_px: float, *, with_normals: bool = True
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]:
-    """Nearest mesh, its depth and its smooth normal at sample points (column + offset, row + offset)."""
+    """Nearest mesh, its depth and, where asked for, its smooth normal at sample points (column + offset, row + offset)."""
     rows, columns = shape
     nearness = np.zeros(rows * columns)
     label = np.full(rows * columns, -1, dtype=np.int16)
-    normal = np.zeros((rows * columns, 3), dtype=np.float32)
+    normal = np.zeros((rows * columns if with_normals else 0, 3), dtype=np.float32)
     for index, mesh in enumerate(meshes):
         image, depth = camera.project(mesh.vertices_mm)
         if not (depth > 0).all():
@@ -91,12 +97,13 @@ def _rasterise(
             step = np.arange(len(triangle)) - np.repeat(np.cumsum(count[batch]) - count[batch], count[batch])
             x, y = low[triangle, 0] + step % span[triangle, 0], low[triangle, 1] + step // span[triangle, 0]
             # Barycentric coordinates; edges count as inside so that neighbours leave no gap
-            to_sample = np.stack([x, y], axis=1) - corners[triangle, 0]
-            b1 = (to_sample[:, 0] * edge2[triangle, 1] - to_sample[:, 1] * edge2[triangle, 0]) / area[triangle]
-            b2 = (edge1[triangle, 0] * to_sample[:, 1] - edge1[triangle, 1] * to_sample[:, 0]) / area[triangle]
-            barycentric = np.stack([1 - b1 - b2, b1, b2], axis=1)
-            inside = (barycentric >= -1e-9).all(axis=1)
-            triangle, barycentric, sample = triangle[inside], barycentric[inside], (y * columns + x)[inside]
+            x_from, y_from = x - corners[triangle, 0, 0], y - corners[triangle, 0, 1]
+            b1 = (x_from * edge2[triangle, 1] - y_from * edge2[triangle, 0]) / area[triangle]
+            b2 = (edge1[triangle, 0] * y_from - edge1[triangle, 1] * x_from) / area[triangle]
+            b0 = 1 - b1 - b2
+            inside = np.flatnonzero((b0 >= EDGE) & (b1 >= EDGE) & (b2 >= EDGE))
+            triangle, sample = triangle[inside], (y * columns + x)[inside]
+            barycentric = np.stack([b0[inside], b1[inside], b2[inside]], axis=1)
             # 1/depth is linear on the image, so weights over depth are perspective-correct
             weights = barycentric / depth[mesh.faces[triangle]]
             inverse = weights.sum(axis=1)
@@ -106,11 +113,12 @@ def _rasterise(
             sample = sample[nearer]
             nearness[sample] = inverse[nearer]
             label[sample] = index
-            normal[sample] = np.einsum("nk,nkd->nd", weights[nearer], normals[mesh.faces[triangle[nearer]]])
+            if with_normals:
+                normal[sample] = np.einsum("nk,nkd->nd", weights[nearer], normals[mesh.faces[triangle[nearer]]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     with np.errstate(divide="ignore"):
         depth_mm = (1 / nearness).astype(np.float32)
-    return label.reshape(shape), depth_mm.reshape(shape), normal.reshape(rows, columns, 3)
+    return label.reshape(shape), depth_mm.reshape(shape), normal.reshape(*(shape if with_normals else (0, 0)), 3)
 
 
 def _batches(triangles: NDArray[np.intp], count: NDArray[np.int64]) -> list[NDArray[np.intp]]:

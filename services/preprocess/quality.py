@@ -47,8 +47,11 @@ def assess(
 ) -> ImageQuality:
     """Count what was masked among the tooth's pixels."""
     pixels = int(np.count_nonzero(covered))
+    # How many pixels have each combination of bits
+    counts = np.bincount(bits[covered], minlength=1)
+    combinations = np.arange(len(counts))
     masked = {
-        bit.name.lower(): float(np.count_nonzero(bits[covered] & np.uint16(bit)) / max(pixels, 1))
+        bit.name.lower(): float(counts[combinations & bit > 0].sum() / max(pixels, 1))
         for bit in MaskBit
         if bit.name is not None
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ class Radiometry:
     black_frames: int
     manifest: CaptureManifest
 
+    def at(self, rows: slice, columns: slice) -> Radiometry:
+        """That of some of the pixels."""
+        return replace(self, black=self.black[rows, columns])
+
     def radiance(self, counts: NDArray[np.uint16], frame: FrameRecord) -> tuple[Image, Image, BoolArray]:
         """Radiance at level 1 and 1 s, its variance, both (H, W, C), and where a channel is saturated (H, W).
 
@@ -35,14 +39,17 @@ class Radiometry:
         """
         m = self.manifest
         full_scale = 2**m.bits - 1
-        signal = counts.astype(np.float32) - self.black
-        floor = (m.sensor_noise_floor * full_scale) ** 2 + 1 / 12
-        variance = (m.sensor_noise_relative * np.maximum(signal, 0)) ** 2 + np.float32(
-            floor * (1 + 1 / self.black_frames)
-        )
         gain = np.float32(m.radiance_per_count / (frame.level * frame.exposure_s))
-        saturated: BoolArray = (counts >= full_scale).any(axis=-1)
-        return (signal * gain).astype(np.float32), (variance * gain**2).astype(np.float32), saturated
+        floor = ((m.sensor_noise_floor * full_scale) ** 2 + 1 / 12) * (1 + 1 / self.black_frames)
+        radiance = np.subtract(counts, self.black, dtype=np.float32)
+        radiance *= gain
+        variance = np.maximum(radiance, np.float32(0))
+        variance *= np.float32(m.sensor_noise_relative)
+        variance *= variance
+        variance += np.float32(floor) * gain**2
+        if counts.max(initial=0) < full_scale:
+            return radiance, variance, np.zeros(counts.shape[:2], dtype=bool)
+        return radiance, variance, (counts >= full_scale).any(axis=-1)
 
 
 class Merge:
@@ -51,22 +58,28 @@ class Merge:
     Where every exposure is saturated there is no value: radiance 0, flagged (never 0/0).
     """
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        self._weighted = np.zeros(shape, dtype=np.float32)
-        self._weight = np.zeros(shape, dtype=np.float32)
+    def __init__(self) -> None:
+        self._exposures: list[tuple[Image, Image, BoolArray]] = []
 
     def add(self, radiance: Image, variance: Image, saturated: BoolArray) -> None:
-        """Add one exposure, aligned with the others."""
-        weight = np.where(saturated[..., None], 0, 1 / np.maximum(variance, 1e-30)).astype(np.float32)
-        self._weighted += weight * radiance
-        self._weight += weight
+        """Add one exposure, aligned with the others. What is given may be overwritten."""
+        self._exposures.append((radiance, variance, saturated))
 
     def result(self) -> tuple[Image, Image, BoolArray]:
         """Radiance and variance (H, W, C), and where no exposure was usable (H, W)."""
-        weight = np.maximum(self._weight, 1e-30)
-        lost: BoolArray = (self._weight == 0).any(axis=-1)
-        return (
-            (self._weighted / weight).astype(np.float32),
-            np.where(lost[..., None], 0, 1 / weight).astype(np.float32),
-            lost,
-        )
+        if len(self._exposures) == 1:
+            radiance, variance, lost = self._exposures[0]
+            lost = lost.copy()
+        else:
+            weighted, weight = np.zeros_like(self._exposures[0][0]), np.zeros_like(self._exposures[0][0])
+            for one, its_variance, saturated in self._exposures:
+                own = np.where(saturated[..., None], np.float32(0), 1 / np.maximum(its_variance, np.float32(1e-30)))
+                weight += own
+                own *= one
+                weighted += own
+            lost = (weight == 0).any(axis=-1)
+            np.maximum(weight, np.float32(1e-30), out=weight)
+            radiance, variance = np.divide(weighted, weight, out=weighted), np.divide(1, weight, out=weight)
+        if lost.any():
+            radiance[lost], variance[lost] = 0, 0
+        return radiance, variance, lost

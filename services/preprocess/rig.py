@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,18 @@ from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
 from services.core.store import StoredArray
-from services.preprocess.motion import ViewMotion, jaws
-from services.preprocess.projection import Footprint
+from services.preprocess.motion import Displacement, ViewMotion, frames_to_match, jaws
 from services.preprocess.radiometry import Merge, Radiometry
-from services.preprocess.source import Image, LightImage
-from services.preprocess.stabilise import warp
+from services.preprocess.scratch import write_array
+from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.window import Window, bands
 
 # Below this, resampling would blur more than it aligns
 STILL_PX = 0.1
 # A frame whose interpolated motion is less certain than this is not used
 UNCERTAIN_PX = 0.5
-# A sample that takes less than this share from inside the image is dimmed by the black around it
-WHOLLY_SEEN = 1 - 1e-3
+# A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as much
+BEYOND_PX = 1e-3
 BLACK_FRAMES = 8
 # A cubic in time has four coefficients
 MIN_TRACKING = 4
@@ -72,49 +73,118 @@ class RigSource:
         """See ``Source``; every camera sees every light."""
         return tuple(range(len(self._frames)))
 
-    def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
-        """See ``Source``: one frame at a time, its radiance and its variance."""
-        width, height = self.description.cameras[camera].size
+    def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
+        """See ``Source``."""
+        return tuple(frame.index for frame in frames_to_match(self._manifest.frames))
+
+    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+        """See ``Source``."""
+        motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
+        # Without the black image, whose noise would be the same in every frame and speak for no motion at all
+        level = float(np.median(self._black_image(view, array, motion.window)))
+
+        def picture(frame: FrameRecord) -> NDArray[np.uint16]:
+            return array[view.number, frame.index, motion.window.rows, motion.window.columns]
+
+        return motion.measure(frames, picture, level)
+
+    def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
+        """See ``Source``: one frame at a time, its radiance and its variance."""
+        motion = self._motion(view)
+        array = StoredArray(self.root / "capture.zarr")
+        black = self._black_image(view, array, motion.window)
+        radiometry = Radiometry(black, len(self._black), self._manifest)
 
         def counts(frame: FrameRecord) -> NDArray[np.uint16]:
-            return array[camera, frame.index, :height, :width]
+            return array[view.number, frame.index, motion.window.rows, motion.window.columns]
 
-        black = np.zeros((height, width, len(self.description.channels)), dtype=np.float32)
+        for light in lights:
+            frames = self._frames[light]
+            moves = [motion.at(frame, motions) for frame in frames]
+            yield light, _image(frames, moves, radiometry, motion, counts, view.window)
+
+    def _motion(self, view: View) -> ViewMotion:
+        return ViewMotion(view, jaws(sorted(self._manifest.fdi)), self._manifest.frames)
+
+    def _black_image(self, view: View, array: StoredArray, window: Window) -> Image:
+        """Mean (H, W, C) of the black frames, counts; made once for a view that keeps it."""
+        kept = None if view.scratch is None else view.scratch / "black.npy"
+        if kept is not None and kept.exists():
+            return np.asarray(np.load(kept, mmap_mode="r"))
+        black = np.zeros((*window.shape, len(self.description.channels)), dtype=np.float32)
         for frame in self._black:
-            black += counts(frame) / np.float32(len(self._black))
-        radiometry = Radiometry(black, len(self._black), self._manifest)
-        # Without the black image, whose noise would be the same in every frame and speak for no motion at all
-        level = np.float32(np.median(black))
-
-        def brightness(frame: FrameRecord) -> Image:
-            return np.asarray(counts(frame).mean(axis=-1, dtype=np.float32) - level, dtype=np.float32)
-
-        view = self.description.cameras[camera].name
-        motion = ViewMotion(footprint, jaws(sorted(self._manifest.fdi)), self._manifest.frames, brightness, view)
-        for light, frames in enumerate(self._frames):
-            yield light, _image(frames, radiometry, motion, counts)
+            counts = array[view.number, frame.index, window.rows, window.columns]
+            for rows in bands(window.shape):
+                black[rows] += counts[rows] / np.float32(len(self._black))
+        if kept is not None:
+            write_array(kept, black)
+        return black
 
 
-def _image(frames: list[FrameRecord], radiometry: Radiometry, motion: ViewMotion, counts: Counts) -> LightImage:
-    merged = Merge(radiometry.black.shape)
-    moves = [motion.at(frame) for frame in frames]
-    warped, beyond = False, np.zeros(radiometry.black.shape[:2], dtype=bool)
-    for frame, move in zip(frames, moves, strict=True):
-        radiance, variance, saturated = radiometry.radiance(counts(frame), frame)
-        if move.median_px > STILL_PX:
-            # Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right
-            field = motion.field(move)
-            of_saturated, of_image = np.moveaxis(
-                warp(np.stack([saturated, np.ones_like(saturated)], axis=-1), field), -1, 0
-            )
-            radiance, variance, saturated = warp(radiance, field), warp(variance, field), of_saturated > 0
-            beyond |= of_image < WHOLLY_SEEN
-            warped = True
-        merged.add(radiance, variance, saturated)
-    radiance, variance, lost = merged.result()
-    bits = (np.where(lost & ~beyond, MaskBit.SATURATED, 0) | np.where(beyond, MaskBit.MOTION, 0)).astype(np.uint16)
+def _image(
+    frames: Sequence[FrameRecord],
+    moves: Sequence[Displacement],
+    radiometry: Radiometry,
+    motion: ViewMotion,
+    counts: Counts,
+    window: Window,
+) -> LightImage:
+    """One light's frames, each as if nothing had moved, joined; a few rows at a time."""
+    read = [counts(frame) for frame in frames]
+    height, width = window.shape
+    channels = read[0].shape[-1]
+    radiance, variance = (np.empty((height, width, channels), dtype=np.float32) for _ in range(2))
+    bits = np.zeros((height, width), dtype=np.uint16)
+    is_warped = [move.median_px > STILL_PX for move in moves]
+    inner = window.within(motion.window)
+    for rows in bands((height, width * channels)):
+        merged, beyond = Merge(), None
+        for frame, move, taken, warped in zip(frames, moves, read, is_warped, strict=True):
+            if warped:
+                one, outside = _resampled(taken, motion.places(move, rows), radiometry, frame)
+                beyond = outside if beyond is None else beyond | outside
+            else:
+                own = slice(inner[0].start + rows.start, inner[0].start + rows.stop), inner[1]
+                one = radiometry.at(*own).radiance(taken[own], frame)
+            merged.add(*one)
+        radiance[rows], variance[rows], lost = merged.result()
+        if beyond is not None:
+            lost &= ~beyond
+            bits[rows][beyond] = MaskBit.MOTION
+        bits[rows][lost] |= np.uint16(MaskBit.SATURATED)
     if max(move.error_px for move in moves) > UNCERTAIN_PX:
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)
-    return LightImage(radiance, variance, bits, motion.stored(farthest), farthest.median_px, warped)
+    return LightImage(radiance, variance, bits, motion.stored(farthest), farthest.median_px, any(is_warped))
+
+
+def _resampled(
+    counts: NDArray[np.uint16], places: Image, radiometry: Radiometry, frame: FrameRecord
+) -> tuple[tuple[Image, Image, NDArray[np.bool_]], NDArray[np.bool_]]:
+    """Radiance, variance and saturation where the pixels have gone to, and which of them mix in what lies beyond the frame.
+
+    Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right.
+
+    Args:
+        places: x and y (2, H, W) as indices into ``counts``.
+    """
+    import cv2
+
+    height, width = counts.shape[:2]
+    x, y = places
+    beyond = (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
+    # Only the rows that are sampled, and one more on each side
+    top = int(np.clip(np.floor(y.min()), 1, height) - 1)
+    source = slice(top, max(int(np.clip(np.ceil(y.max()), 0, height - 2) + 2), top + 1))
+    y -= np.float32(source.start)
+    radiance, variance, saturated = radiometry.at(source, slice(None)).radiance(counts[source], frame)
+
+    def sampled(image: NDArray[Any]) -> Image:
+        shape = (*x.shape, *image.shape[2:])
+        return np.asarray(
+            cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32
+        ).reshape(shape)
+
+    lost = sampled(saturated.astype(np.float32)) > 0 if saturated.any() else np.zeros(x.shape, dtype=bool)
+    return (sampled(radiance), sampled(variance), lost), beyond

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,21 +10,46 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.geometry import Camera
 from services.core.records import FolderCapture
 from services.preprocess.projection import Footprint
+from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
 Bits = NDArray[np.uint16]
+Motions = Mapping[int, NDArray[np.float64]]
+"""Frame number -> coefficients (bodies, TERMS, 2) of its displacement, as ``stabilise`` defines them."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is prepared of one camera's images: the window that shows the subject, (H, W) in all that follows.
+
+    Attributes:
+        number: place of the camera in the capture.
+        whole: the camera as it is.
+        window: rows and columns of the whole image.
+        camera: the camera whose whole image is the window.
+        footprint: what it sees of the subject.
+        scratch: folder in which what the camera's images share may be kept; None where nothing is kept.
+    """
+
+    number: int
+    whole: Camera
+    window: Window
+    camera: Camera
+    footprint: Footprint
+    scratch: Path | None = None
 
 
 @dataclass(frozen=True)
 class LightImage:
-    """One camera's view under one light.
+    """One camera's view under one light; arrays hold the view's window.
 
     Attributes:
         radiance, variance: (H, W, C); where a value is not finite it is 0 and flagged.
         bits: (H, W), what the source knows: saturated, moved, not finite.
-        displacement: (h, w, 2), pixels, every ``motion_step``-th; None where motion is not measured.
+        displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not measured.
         motion_px: median over the teeth; None where motion is not measured.
         warped: whether the pixels were resampled.
     """
@@ -63,8 +88,21 @@ class Source(Protocol):
     def lights_of(self, camera: int) -> tuple[int, ...]:
         """Indices of the lights this camera has an image of."""
 
-    def images(self, camera: int, footprint: Footprint) -> Iterator[tuple[int, LightImage]]:
+    def matched(self, camera: int) -> tuple[int, ...]:
+        """Numbers of the frames whose motion is to be measured; none where motion is not measured."""
+
+    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+        """Frame number and coefficients (bodies, TERMS, 2) of its motion since the first frame, one at a time.
+
+        Raises:
+            CaptureInputError: moved too far to be aligned; names the frame and the camera.
+        """
+
+    def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """Light index and image, one at a time.
+
+        Args:
+            motions: of all that ``matched`` names.
 
         Raises:
             CaptureInputError: names the file or frame, camera and light.

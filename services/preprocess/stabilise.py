@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.preprocess.projection import Footprint
+from services.preprocess.window import bands
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -69,26 +70,47 @@ class SurfaceFlow:
         x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
         return np.stack([np.ones_like(relief), x, y, relief, x * x, x * y, y * y], axis=-1).astype(np.float32)
 
-    def field(self, coefficients: FloatArray, rows: slice = slice(None), step: int = 1) -> Image:
-        """Displacement (rows, width, 2) in pixels from the reference to the frame, every ``step`` pixels."""
-        height, width = self._relief.shape
-        y, x = np.mgrid[0:height, 0:width][:, rows][:, ::step, ::step].astype(np.float32)
-        return np.asarray(
-            self.terms(self._relief[rows][::step, ::step], x, y) @ coefficients.astype(np.float32), dtype=np.float32
-        )
+    def field(
+        self, coefficients: FloatArray, rows: slice = slice(None), columns: slice = slice(None), step: int = 1
+    ) -> Image:
+        """Displacement (rows, columns, 2) in pixels from the reference to the frame, every ``step`` pixels."""
+        if step > 1:
+            rows, columns = (slice(one.start, one.stop, step) for one in (rows, columns))
+        return np.moveaxis(self._planes(coefficients, rows, columns, moved=0), 0, -1)
+
+    def places(self, coefficients: FloatArray, rows: slice, columns: slice) -> Image:
+        """Where reference pixels are in the frame: x and y (2, rows, columns) in pixels."""
+        return self._planes(coefficients, rows, columns, moved=1)
+
+    def _planes(self, coefficients: FloatArray, rows: slice, columns: slice, moved: int) -> Image:
+        # Displacements, plus ``moved`` times the pixel's own place. The polynomial is a product of (rows, 3) and (3, columns).
+        relief = self._relief[rows, columns]
+        y_px, x_px = (np.arange(n)[cut] for n, cut in zip(self._relief.shape, (rows, columns), strict=True))
+        x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
+        planes = np.empty((2, *relief.shape), dtype=np.float32)
+        for plane, c, own_x, own_y in zip(
+            planes, coefficients.T, (moved * x_px, 0 * x_px), (0 * y_px, moved * y_px), strict=True
+        ):
+            of_row = np.stack([c[0] + c[2] * y + c[6] * y * y + own_y, c[1] + c[5] * y, np.ones_like(y)], axis=1)
+            of_column = np.stack([np.ones_like(x), x, c[4] * x * x + own_x])
+            np.matmul(of_row.astype(np.float32), of_column.astype(np.float32), out=plane)
+            np.add(plane, np.float32(c[3]) * relief, out=plane)
+        return planes
 
     def reduced(self, factor: int) -> tuple[BoolArray, Image]:
         """Region used for matching and basis (h, w, TERMS), both reduced by ``factor``."""
         import cv2
 
-        height, width = self._relief.shape
-        size = (max(1, width // factor), max(1, height // factor))
-        relief = self._relief if factor == 1 else cv2.resize(self._relief, size, interpolation=cv2.INTER_AREA)
+        size = (max(1, self._relief.shape[1] // factor), max(1, self._relief.shape[0] // factor))
+        whole = np.s_[: size[1] * factor, : size[0] * factor]
+        relief, seen = self._relief[whole], self.seen[whole].astype(np.uint8)
+        if factor > 1:
+            relief = cv2.resize(relief, size, interpolation=cv2.INTER_AREA)
+            seen = cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BAND_PX + 1, 2 * BAND_PX + 1))
-        seen = self.seen.astype(np.uint8)
-        region = cv2.dilate(seen if factor == 1 else cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST), disc) > 0
+        region = cv2.dilate(seen, disc) > 0
         y, x = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float32)
-        return region, self.terms(relief, (x + 0.5) * (width / size[0]) - 0.5, (y + 0.5) * (height / size[1]) - 0.5)
+        return region, self.terms(relief, (x + 0.5) * factor - 0.5, (y + 0.5) * factor - 0.5)
 
 
 @dataclass(frozen=True)
@@ -104,16 +126,18 @@ class Aligner:
 
     Args:
         flow: the body's possible displacements.
-        reference: (H, W) linear brightness of the reference frame.
+        reference: (H, W) or (H, W, C), the reference frame, linear in light.
         feature: ``texture`` between frames under the same light, ``edges`` between different lights.
+        level: what a frame holds without light.
     """
 
-    def __init__(self, flow: SurfaceFlow, reference: Image, feature: Feature) -> None:
+    def __init__(self, flow: SurfaceFlow, reference: NDArray[np.generic], feature: Feature, level: float = 0.0) -> None:
         self._feature: Feature = feature
-        self._factor = int(np.ceil(np.sqrt(reference.size / SOLVE_PIXELS)))
+        self._zero = level
+        self._factor = int(np.ceil(np.sqrt(reference.shape[0] * reference.shape[1] / SOLVE_PIXELS)))
         region, terms = flow.reduced(self._factor)
         self._levels = []
-        for number, image in enumerate(_pyramid(reference, self._factor, feature)):
+        for number, image in enumerate(_pyramid(reduce_grey(reference, self._factor, level), feature)):
             if number:
                 region, terms = (
                     _halve(region.astype(np.float32)) > 0.5,
@@ -123,15 +147,14 @@ class Aligner:
             matched = inside[:: -(-len(inside) // MATCHED_PIXELS) or 1]
             self._levels.append(_Level(image, matched, terms, float(self._factor * 2**number)))
 
-    def solve(self, frame: Image, iterations: int = 30) -> FloatArray:
+    def solve(self, frame: NDArray[np.generic], iterations: int = 30) -> FloatArray:
         """Coefficients (TERMS, 2) of the displacement from the reference to the frame, coarse to fine."""
         import cv2
 
         coefficients = np.zeros((TERMS, 2))
         ridge = np.tile(RIDGE[self._feature], 2)
-        for level, moving in reversed(
-            list(zip(self._levels, _pyramid(frame, self._factor, self._feature), strict=True))
-        ):
+        grey = reduce_grey(frame, self._factor, self._zero)
+        for level, moving in reversed(list(zip(self._levels, _pyramid(grey, self._feature), strict=True))):
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
             basis = level.terms.reshape(-1, TERMS)[level.matched] / level.pixel_px
             fixed_x, fixed_y = _gradient(level.feature)
@@ -213,15 +236,24 @@ def _features(image: Image, feature: Feature) -> Image:
     return np.asarray(detail / contrast, dtype=np.float32)
 
 
-def _pyramid(image: Image, factor: int, feature: Feature) -> list[Image]:
-    """Features of the image reduced by ``factor``, then halved while their shorter side has 40 pixels."""
+def reduce_grey(image: NDArray[np.generic], factor: int, level: float = 0.0) -> Image:
+    """Mean over the channels of (H, W) or (H, W, C) and over squares of ``factor`` pixels, above ``level``; what is left of a square is dropped."""
     import cv2
 
-    if factor > 1:
-        image = cv2.resize(
-            image, (max(1, image.shape[1] // factor), max(1, image.shape[0] // factor)), interpolation=cv2.INTER_AREA
-        )
-    levels = [_features(np.asarray(image, dtype=np.float32), feature)]
+    height, width = (max(1, n // factor) for n in image.shape[:2])
+    grey = np.empty((height, width), dtype=np.float32)
+    # Some rows at a time, so that whole numbers are never held as floating-point ones all at once
+    for band in bands((height, width * factor * factor)):
+        rows = image[band.start * factor : band.stop * factor, : width * factor].astype(np.float32)
+        small = rows if factor == 1 else cv2.resize(rows, (width, band.stop - band.start), interpolation=cv2.INTER_AREA)
+        grey[band] = small.reshape(*grey[band].shape, -1).mean(axis=-1)
+    grey -= np.float32(level)
+    return grey
+
+
+def _pyramid(image: Image, feature: Feature) -> list[Image]:
+    """Features of the image, then halved while their shorter side has 40 pixels."""
+    levels = [_features(image, feature)]
     while min(levels[-1].shape) >= 40:
         levels.append(_halve(levels[-1]))
     return levels

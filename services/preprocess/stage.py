@@ -47,8 +47,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     """
     import numpy as np
 
-    from services.preprocess.brightness import Brightness
+    from services.preprocess.brightness import Brightness, light_of
     from services.preprocess.masks import HandMasks
+    from services.preprocess.motion import stored_step
     from services.preprocess.quality import QualityReport, assess, unusable_note, write_picture
     from services.preprocess.subject import NOTHING, read_subject
     from services.preprocess.valid import require_plausible_scale, require_seen, valid_bits
@@ -85,32 +86,43 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     brightness, reports, done, seen = Brightness(), [], 0, np.zeros(len(teeth), dtype=np.int64)
     for k, camera in enumerate(cameras):
         context.raise_if_cancelled()
-        w, h = camera.size
-        footprint = subject.seen_by(camera)
+        view = subject.view_of(k, camera)
+        window, footprint = view.window, view.footprint
         require_seen(footprint, len(teeth), camera)
         glossy = subject.glossy(footprint)
         labels = np.full((height, width), NOTHING, dtype=np.int16)
-        labels[:h, :w] = footprint.mesh
+        labels[window.rows, window.columns] = footprint.mesh
         surface[k] = labels
         for j in set(range(len(lights))) - set(source.lights_of(k)):
             valid[k, j] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
-        for j, image in source.images(k, footprint):
+        motions_of = dict(source.match(view, source.matched(k)))
+        for j, image in source.images(view, source.lights_of(k), motions_of):
             context.raise_if_cancelled()
-            bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
-            bits[:h, :w] = valid_bits(image, footprint, camera, lights[j], glossy)
-            bits[:h, :w] |= masks.bits(camera.name, lights[j].name, camera.size)
-            of_teeth = (bits[:h, :w] == 0) & (footprint.mesh < len(teeth))
-            if not brightness.add(image, footprint, camera, lights[j], of_teeth):
-                bits[:h, :w] |= np.uint16(MaskBit.UNLIT)
-            seen += subject.pixels_of_teeth(footprint, bits[:h, :w])
-            radiance[k, j, :h, :w], variance[k, j, :h, :w], valid[k, j] = image.radiance, image.variance, bits
+            bits = valid_bits(image, footprint, view.camera, lights[j], glossy)
+            bits |= masks.bits(camera.name, lights[j].name, camera.size)[window.rows, window.columns]
+            of_teeth = (bits == 0) & (footprint.mesh < len(teeth))
+            shown = light_of(image, view, lights[j], of_teeth)
+            brightness.add(camera.name, lights[j].name, shown)
+            if shown is not None and shown.dark:
+                bits |= np.uint16(MaskBit.UNLIT)
+            seen += subject.pixels_of_teeth(footprint, bits)
+            radiance[k, j, window.rows, window.columns] = image.radiance
+            variance[k, j, window.rows, window.columns] = image.variance
+            all_bits = np.full((height, width), MaskBit.OUTSIDE, dtype=np.uint16)
+            all_bits[window.rows, window.columns] = bits
+            valid[k, j] = all_bits
             if motion is not None and image.displacement is not None:
-                motion[k, j, : image.displacement.shape[0], : image.displacement.shape[1]] = image.displacement
-            quality = assess(camera.name, lights[j].name, bits[:h, :w], footprint.covered, image.motion_px)
+                step = stored_step((height, width))
+                first = (-(-window.top // step), -(-window.left // step))
+                motion[
+                    k,
+                    j,
+                    first[0] : first[0] + image.displacement.shape[0],
+                    first[1] : first[1] + image.displacement.shape[1],
+                ] = image.displacement
+            quality = assess(camera.name, lights[j].name, bits, footprint.covered, image.motion_px)
             reports.append(quality)
-            write_picture(
-                writer.folder / "quality" / f"{camera.name}_{lights[j].name}.png", image.radiance, bits[:h, :w]
-            )
+            write_picture(writer.folder / "quality" / f"{camera.name}_{lights[j].name}.png", image.radiance, bits)
             done += 1
             context.report(
                 StageEvent(

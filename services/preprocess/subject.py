@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.preprocess.projection import Footprint, project
+from services.preprocess.source import View
+from services.preprocess.window import window_of
 
 NOTHING = -1
 
@@ -35,6 +37,17 @@ class Subject:
     def cavity_number(self) -> int:
         """Of the wall in a footprint."""
         return len(self.teeth) + 1
+
+    def fitted_meshes(self) -> list[Mesh]:
+        """What a camera's window is to hold."""
+        around = [mesh for mesh in (self.gums, self.cavity) if mesh is not None and self.whole]
+        return [tooth.outer for tooth in self.teeth] + around
+
+    def view_of(self, number: int, camera: Camera) -> View:
+        """What is prepared of a camera's images."""
+        window = window_of(camera, self.fitted_meshes())
+        cropped = window.cropped(camera)
+        return View(number, camera, window, cropped, self.seen_by(cropped))
 
     def seen_by(self, camera: Camera) -> Footprint:
         """What a camera sees of all that is to be fitted."""

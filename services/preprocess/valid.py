@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
 from services.core.records import MaskBit
-from services.preprocess.highlights import half_angles, highlight_mask
+from services.preprocess.highlights import half_cosines, highlight_mask
 from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage
 
@@ -36,16 +36,32 @@ def valid_bits(
             cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
             > 0
         )
-    bits = image.bits | np.where(inside, 0, MaskBit.OUTSIDE).astype(np.uint16)
+    bits = image.bits.copy()
+    bits[~inside] |= np.uint16(MaskBit.OUTSIDE)
     saturated = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED) > 0)
     usable = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE) == 0)
-    angles = half_angles(camera, light, footprint)
-    highlight = np.zeros(bits.shape, dtype=bool)
+    cosines = half_cosines(camera, light, footprint)
     for part in (footprint.covered,) if glossy is None else glossy:
-        highlight |= highlight_mask(
-            image.radiance, image.variance, usable & part, saturated & part, angles, footprint.normal, light.intensity
+        # Nothing above and below a surface is looked at
+        rows = _span(np.asarray(part.any(axis=1)))
+        own = part[rows]
+        highlight = highlight_mask(
+            image.radiance[rows],
+            image.variance[rows],
+            usable[rows] & own,
+            saturated[rows] & own,
+            cosines[rows],
+            footprint.normal[rows],
+            light.intensity,
         )
-    return np.asarray(bits | np.where(highlight, MaskBit.HIGHLIGHT, 0).astype(np.uint16), dtype=np.uint16)
+        bits[rows][highlight] |= np.uint16(MaskBit.HIGHLIGHT)
+    return bits
+
+
+def _span(used: NDArray[np.bool_]) -> slice:
+    """From the first to the last that is used."""
+    found = np.flatnonzero(used)
+    return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
 
 
 def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ...], teeth: tuple[Tooth, ...]) -> None:

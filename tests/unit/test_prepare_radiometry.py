@@ -79,7 +79,7 @@ def test_merge_of_two_exposures_is_better_than_either_and_survives_saturation() 
     truth[:100] = 500.0  # beyond the long exposure's range of 322, within the short one's
     truth[:, :50] = 2000.0  # beyond both
     black = np.full(truth.shape, BLACK, dtype=np.float32)
-    merged, single = Merge(truth.shape), {}
+    merged, single = Merge(), {}
     exact = 10**9  # black frames averaged, so that the zero carries no noise of its own
     for exposure_s in (0.05, 0.025):
         seen = Radiometry(black, exact, manifest()).radiance(expose(truth, frame(exposure_s), rng), frame(exposure_s))

@@ -10,6 +10,7 @@ from services.core.records import CaptureManifest, FolderCapture, FrameRecord, M
 from services.preprocess.motion import Displacement
 from services.preprocess.radiometry import Radiometry
 from services.preprocess.rig import _image
+from services.preprocess.window import Window
 
 SHAPE = (6, 12)
 BLACK, COUNTS = 64, 1064
@@ -26,26 +27,34 @@ CAPTURE = CaptureManifest(
 )
 
 
+WINDOW = Window(0, SHAPE[0], 0, SHAPE[1])
+
+
 class Shifted:
     """In place of a measured motion: every pixel moved by the same."""
+
+    window = WINDOW
 
     def __init__(self, x_px: float, y_px: float) -> None:
         self._shift = np.array([x_px, y_px], dtype=np.float32)
 
-    def at(self, _: FrameRecord) -> Displacement:
+    def move(self) -> Displacement:
         return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), 0.0)
 
-    def field(self, _: Displacement) -> np.ndarray:
-        return np.broadcast_to(self._shift, (*SHAPE, 2))
+    def places(self, _: Displacement, rows: slice) -> np.ndarray:
+        y, x = np.mgrid[rows, : SHAPE[1]].astype(np.float32)
+        return np.stack([x + self._shift[0], y + self._shift[1]])
 
-    stored = field
+    def stored(self, _: Displacement) -> np.ndarray:
+        return np.broadcast_to(self._shift, (*SHAPE, 2))
 
 
 def test_pixels_that_mix_in_the_black_beyond_the_border_are_not_valid() -> None:
     radiometry = Radiometry(np.full((*SHAPE, 1), BLACK, np.float32), 4, CAPTURE)
+    counts = np.full((*SHAPE, 1), COUNTS, np.uint16)
     for x_px, y_px in ((-3.5, 0.0), (2.25, 0.0), (0.0, -1.5), (0.0, 0.75), (-2.0, 1.0)):
-        motion = cast(Any, Shifted(x_px, y_px))
-        image = _image([FRAME], radiometry, motion, lambda _: np.full((*SHAPE, 1), COUNTS, np.uint16))
+        motion = Shifted(x_px, y_px)
+        image = _image([FRAME], [motion.move()], radiometry, cast(Any, motion), lambda _: counts, WINDOW)
         y, x = np.indices(SHAPE)
         inside = (x + x_px >= 0) & (x + x_px <= SHAPE[1] - 1) & (y + y_px >= 0) & (y + y_px <= SHAPE[0] - 1)
         np.testing.assert_array_equal(image.bits, np.where(inside, 0, MaskBit.MOTION))

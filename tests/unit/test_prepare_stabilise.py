@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from services.core.errors import CaptureInputError
+from services.core.geometry import Camera
 from services.core.records import FrameRecord
 from services.preprocess.motion import ViewMotion, jaws, stored_step
 from services.preprocess.projection import Footprint
+from services.preprocess.source import View
 from services.preprocess.stabilise import TERMS, Aligner, SurfaceFlow, interpolate, warp
+from services.preprocess.window import Window
 from tests.support.shared_data import shared_path
 
 
@@ -21,6 +24,13 @@ def footprint(seen: np.ndarray, depth_mm: np.ndarray | None = None) -> Footprint
     return Footprint(
         np.where(seen, 0, -1).astype(np.int16), depth.astype(np.float32), np.zeros((*seen.shape, 3), np.float32), seen
     )
+
+
+def view_of(seen: Footprint) -> View:
+    height, width = seen.mesh.shape
+    pose = np.eye(4).tolist()
+    camera = Camera(name="front", size=(width, height), K=((1, 0, 0), (0, 1, 0), (0, 0, 1)), camera_from_world=pose)
+    return View(0, camera, Window(0, height, 0, width), camera, seen)
 
 
 def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -144,8 +154,10 @@ def test_each_jaw_gets_its_own_motion() -> None:
     for rows, shift in ((slice(0, 45), upper), (slice(45, 90), lower)):
         field = np.broadcast_to(-shift.astype(np.float32), (90, 120, 2))
         moved[rows] = warp(texture, field)[rows]
-    motion = ViewMotion(seen, [[0], [1]], frames(2), lambda frame: moved if frame.index else texture, "front")
-    found = motion.field(motion.at(frames(2)[1]))
+    motion = ViewMotion(view_of(seen), [[0], [1]], frames(2))
+    found = motion.stored(
+        motion.at(frames(2)[1], dict(motion.measure([0, 1], lambda frame: moved if frame.index else texture)))
+    )
     # Whole-pixel shifts of a noise-free texture; what is left is the seam between the jaws
     assert np.median(np.linalg.norm(found[15:35, 25:95] - upper, axis=-1)) < 0.1
     assert np.median(np.linalg.norm(found[55:75, 25:95] - lower, axis=-1)) < 0.1
@@ -156,10 +168,11 @@ def test_too_much_motion_is_refused_by_name() -> None:
     seen = np.zeros((90, 120), dtype=bool)
     seen[20:70, 30:90] = True
     moved = warp(texture, np.broadcast_to(np.array([-11, 0], np.float32), (90, 120, 2)))
+    motion = ViewMotion(view_of(footprint(seen)), [[0]], frames(2))
     with pytest.raises(
         CaptureInputError, match=r"moved 1\d\.\d px by frame 1 \(camera front, light all\).*head supported\.$"
     ):
-        ViewMotion(footprint(seen), [[0]], frames(2), lambda frame: moved if frame.index else texture, "front")
+        dict(motion.measure([0, 1], lambda frame: moved if frame.index else texture))
 
 
 def test_coefficients_and_grid() -> None:
