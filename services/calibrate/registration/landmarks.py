@@ -1,0 +1,180 @@
+"""First pose of a scan: clicked points in the scan and in photographs, over all cameras at once.
+
+A start comes from one camera's points by perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal
+Solution to the Perspective-n-Point Problem", ECCV 2020), from all of them and from drawn triples, so that a wrong click spoils
+only some starts. The start that most clicks of all cameras agree with is refined by robust least squares over all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.calibrate.registration.pose import Floats, PoseStep, RigidPose, millimetres_a_pixel, pixel_derivatives
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera
+
+CLICK_MM = 0.3
+"""Standard error of a click: people place the tip of a cusp, in a scan and in a photograph together, to about this."""
+FAR = 4.0
+"""Standard errors from which on a click counts as wrong: one in 3,000 good ones in two dimensions."""
+DRAWS = 60
+"""Triples: with a third of the clicks wrong, 60 hold a right one but for 1 in 10^9."""
+LEAST = 4
+"""Clicks that are needed: three leave up to four poses, and no way to see a wrong one."""
+MOST_WRONG = 1 / 3
+ROUNDS = 30
+CONVERGED = 1e-9
+
+
+@dataclass(frozen=True)
+class Click:
+    """One point of the scan, and where one camera sees it."""
+
+    name: str
+    """Tooth and point, such as ``11 mesial edge``."""
+    camera: str
+    point_mm: Floats
+    """(3,) in the scan."""
+    pixel: Floats
+    """(2,), pixel centres at half-integers."""
+
+
+def pose_from_landmarks(
+    cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
+) -> PoseStep:
+    """The pose that clicked points agree on, wrong ones left out.
+
+    Args:
+        cameras: by name.
+        clicks: of all cameras.
+        centre_mm: of the teeth in the scan (3,), about which the covariance turns.
+        click_mm: standard error of a click at the teeth.
+
+    Raises:
+        CaptureInputError: too few clicks, or so many that contradict each other that no pose is to be believed.
+    """
+    most = max((sum(one.camera == name for one in clicks) for name in cameras), default=0)
+    if most < LEAST:
+        raise CaptureInputError(
+            f"No camera sees {LEAST} landmarks of the scan (the most are {most}); add [[landmark]] entries to raw.toml, "
+            "spread over the arch."
+        )
+    starts = list(_starts(cameras, clicks))
+    if not starts:
+        raise CaptureInputError(
+            "The landmarks lie in one line or at one place, which leaves the scan's pose open; spread them over the arch."
+        )
+    errors = [_errors(cameras, clicks, start, click_mm) for start in starts]
+    best = starts[int(np.argmin([np.minimum(error**2, FAR**2).sum() for error in errors]))]
+    kept = np.ones(len(clicks), dtype=bool)
+    pose, covariance = best, np.eye(6)
+    for _ in range(len(clicks)):
+        # The robust fit first shows which clicks are far off; then the others are fitted alone.
+        pose, covariance = _refined(
+            cameras, [one for one, good in zip(clicks, kept, strict=True) if good], best, centre_mm, click_mm
+        )
+        good = _errors(cameras, clicks, pose, click_mm) < FAR
+        if (good == kept).all():
+            break
+        kept = good
+        if np.count_nonzero(kept) < LEAST:
+            break
+    error = _errors(cameras, clicks, pose, click_mm)
+    wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
+    if len(wrong) > MOST_WRONG * len(clicks) or np.count_nonzero(kept) < LEAST:
+        raise CaptureInputError(_contradiction(cameras, clicks, pose, kept))
+    told = tuple(f"{one.name} in camera {one.camera}, {_offset_px(cameras, one, pose):.0f} px off" for one in wrong)
+    residual_px = {
+        name: float(
+            np.median(
+                [
+                    _offset_px(cameras, one, pose)
+                    for one, good in zip(clicks, kept, strict=True)
+                    if good and one.camera == name
+                ]
+            )
+        )
+        for name in cameras
+        if any(good and one.camera == name for one, good in zip(clicks, kept, strict=True))
+    }
+    return PoseStep(
+        "landmarks", pose, covariance, residual_px, float(np.median(error[kept]) * click_mm), int(kept.sum()), told
+    )
+
+
+def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[RigidPose]:
+    import cv2
+
+    rng = np.random.default_rng(0)
+    for name, camera in cameras.items():
+        own = [one for one in clicks if one.camera == name]
+        if len(own) < LEAST:
+            continue
+        points, pixels = np.array([one.point_mm for one in own]), np.array([one.pixel for one in own])
+        draws = [rng.choice(len(own), LEAST, replace=False) for _ in range(DRAWS)] if len(own) > LEAST else []
+        world_from_camera = np.linalg.inv(np.asarray(camera.camera_from_world))
+        for chosen in [np.arange(len(own)), *draws]:
+            try:
+                found = cv2.solvePnPGeneric(
+                    points[chosen], pixels[chosen], np.asarray(camera.K), None, flags=cv2.SOLVEPNP_SQPNP
+                )
+            except cv2.error:
+                continue
+            for turn, shift in zip(found[1], found[2], strict=True):
+                camera_from_scan = np.eye(4)
+                camera_from_scan[:3, :3], camera_from_scan[:3, 3] = cv2.Rodrigues(turn)[0], np.reshape(shift, 3)
+                pose = world_from_camera @ camera_from_scan
+                if np.isfinite(pose).all():
+                    yield RigidPose(pose[:3, :3], pose[:3, 3])
+
+
+def _errors(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, click_mm: float) -> Floats:
+    # Distance (N,) of each click from its prediction in standard errors; infinite behind a camera.
+    errors = np.empty(len(clicks))
+    for k, one in enumerate(clicks):
+        point = pose.apply(one.point_mm[None])
+        pixel, depth = cameras[one.camera].project(point)
+        size = millimetres_a_pixel(cameras[one.camera], point)[0]
+        errors[k] = np.linalg.norm(pixel[0] - one.pixel) * size / click_mm if depth[0] > 0 else np.inf
+    return errors
+
+
+def _offset_px(cameras: Mapping[str, Camera], one: Click, pose: RigidPose) -> float:
+    return float(np.linalg.norm(cameras[one.camera].project(pose.apply(one.point_mm[None]))[0][0] - one.pixel))
+
+
+def _refined(
+    cameras: Mapping[str, Camera], clicks: Sequence[Click], start: RigidPose, centre_mm: Floats, click_mm: float
+) -> tuple[RigidPose, Floats]:
+    # Gauss-Newton on Huber-weighted distances, with the inverse of the normal equations as covariance.
+    pose, normal = start, np.eye(6)
+    for _ in range(ROUNDS):
+        centre = pose.apply(centre_mm[None])[0]
+        normal, right = np.zeros((6, 6)), np.zeros(6)
+        for one in clicks:
+            camera, point = cameras[one.camera], pose.apply(one.point_mm[None])
+            scale = millimetres_a_pixel(camera, point)[0] / click_mm
+            jacobian = scale * pixel_derivatives(camera, point, centre)[0]
+            residual = scale * (one.pixel - camera.project(point)[0][0])
+            weight = min(1.0, 1.5 / max(float(np.linalg.norm(residual)), 1e-12))
+            normal += weight * jacobian.T @ jacobian
+            right += weight * jacobian.T @ residual
+        step = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(6), right)
+        pose = pose.moved(step, centre)
+        if np.abs(step).max() < CONVERGED:
+            break
+    return pose, np.linalg.inv(normal + 1e-12 * np.trace(normal) * np.eye(6))
+
+
+def _contradiction(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, kept: np.ndarray) -> str:
+    # The wrong click, and the landmark whose place it is at, where it is at one's.
+    wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
+    worst = max(wrong, key=lambda one: _offset_px(cameras, one, pose))
+    said = (
+        f"{len(wrong)} of {len(clicks)} landmarks contradict the others; the worst is {worst.name} in camera "
+        f"{worst.camera}, {_offset_px(cameras, worst, pose):.0f} px from where the scan has it"
+    )
+    return f"{said}; see whether landmarks are exchanged, left with right or tooth with tooth, and whether the scan is this person's."

@@ -1,0 +1,217 @@
+"""The pose at which a scan's outlines meet those in the photographs.
+
+Each round draws the outlines at the present pose, looks for the photograph's own along the line across each of their points
+(Harris, "Tracking with rigid models", 1992), and moves the pose so that the distances across vanish, far ones counting less.
+A tooth's border to gums, lips or the dark is where likeness to tooth falls; that to another tooth is a dark line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.registration.appearance import Appearance, learn_appearance
+from services.calibrate.registration.contours import Contour, tooth_contours
+from services.calibrate.registration.pose import Floats, PoseStep, RigidPose, millimetres_a_pixel, pixel_derivatives
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera, Mesh
+
+STEP_PX = 0.5
+"""Between samples across an outline."""
+POINTS = 1500
+"""Of each camera that are looked at: neighbouring ones tell the same."""
+CLEAR = 0.25
+"""Share of the strong edges' strength (their 90th percentile) that an edge needs to be taken for one."""
+TUKEY = 4.685
+"""Standard errors beyond which a point counts nothing (Tukey's biweight at 95 % efficiency)."""
+LEAST_SPREAD_PX = 0.15
+BETWEEN_WEIGHT = 0.25
+"""Of a border between teeth: its dark line lies beside either tooth's edge by a width that nobody knows."""
+ROUNDS = 12
+LEAST_FOUND = 0.3
+"""Share of the outlines' points that must find an edge; lips and retractor hide some."""
+SECTORS = 6
+"""Parts of a tooth's outline whose errors are taken to be of one piece, for the covariance."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's photograph, cut out around the teeth and made small."""
+
+    camera: Camera
+    image: NDArray[np.float32]
+    """(H, W, C), 0 at black."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the outlines of one view meet in its photograph."""
+
+    contour: Contour
+    offset_px: Floats
+    """(N,) from the predicted outline to the photograph's, outwards."""
+    is_found: NDArray[np.bool_]
+
+
+def pose_from_outlines(
+    views: Sequence[View],
+    teeth: Sequence[Mesh],
+    occluders: Sequence[Mesh],
+    start: PoseStep,
+    centre_mm: Floats,
+    reach_px: float = 14.0,
+) -> PoseStep:
+    """Refine a pose.
+
+    Args:
+        views: of all cameras.
+        teeth: solids of the scan, in the scan's frame.
+        occluders: of the scan, that hide teeth: gums.
+        start: with its covariance, which counts as a measurement.
+        centre_mm: of the teeth in the scan (3,).
+        reach_px: how far an outline is looked for in the first rounds.
+
+    Raises:
+        CaptureInputError: most outlines have no edge in the photographs.
+    """
+    pose, prior = start.pose, np.linalg.inv(start.covariance)
+    appearances: list[Appearance] = []
+    found: list[Found] = []
+    normal, spread = prior, {}
+    for number in range(ROUNDS):
+        # The search narrows from all that the start leaves open to a few pixels.
+        reach = max(reach_px * 0.75**number, 3.0)
+        moved = [_placed(mesh, pose) for mesh in teeth]
+        hidden = [_placed(mesh, pose) for mesh in occluders]
+        drawn = [tooth_contours(view.camera, moved, hidden) for view in views]
+        if number % 4 == 0:
+            appearances = [
+                learn_appearance(view.image, label >= 0, reach / 2)
+                for view, (_, label) in zip(views, drawn, strict=True)
+            ]
+        found = [
+            _searched(_thinned(contour), appearance, reach)
+            for (contour, _), appearance in zip(drawn, appearances, strict=True)
+        ]
+        centre = pose.apply(centre_mm[None])[0]
+        normal, right = prior.copy(), prior @ pose.twist_to(start.pose, centre)
+        for view, one in zip(views, found, strict=True):
+            jacobian, residual, weight, spread[view.camera.name] = _equations(view.camera, one, centre)
+            normal += jacobian.T @ (weight[:, None] * jacobian)
+            right += jacobian.T @ (weight * residual)
+        step = np.linalg.solve(normal, right)
+        pose = pose.moved(step, centre)
+        if reach <= 3.0 and np.abs(step).max() < 1e-4:
+            break
+    _require_edges(found)
+    centre = pose.apply(centre_mm[None])[0]
+    covariance = _sandwich(views, found, centre, normal, prior)
+    apart = {
+        view.camera.name: float(np.median(np.abs(one.offset_px[one.is_found])))
+        for view, one in zip(views, found, strict=True)
+        if one.is_found.any()
+    }
+    sizes = [millimetres_a_pixel(view.camera, centre[None])[0] for view in views if view.camera.name in apart]
+    residual_mm = float(np.mean([px * size for px, size in zip(apart.values(), sizes, strict=True)]))
+    missing = [
+        f"{1 - one.is_found.mean():.0%} of the outlines in camera {view.camera.name}"
+        for view, one in zip(views, found, strict=True)
+    ]
+    return PoseStep(
+        "outlines", pose, covariance, apart, residual_mm, int(sum(one.is_found.sum() for one in found)), tuple(missing)
+    )
+
+
+def _placed(mesh: Mesh, pose: RigidPose) -> Mesh:
+    return Mesh(pose.apply(mesh.vertices_mm), mesh.faces)
+
+
+def _thinned(contour: Contour) -> Contour:
+    if len(contour.pixels) <= POINTS:
+        return contour
+    chosen = np.sort(np.random.default_rng(0).choice(len(contour.pixels), POINTS, replace=False))
+    return Contour(*(getattr(contour, field)[chosen] for field in Contour.__dataclass_fields__))
+
+
+def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Found:
+    import cv2
+
+    # Samples along each point's line, some more at both ends for the differences.
+    steps = np.arange(-np.ceil(reach_px / STEP_PX), np.ceil(reach_px / STEP_PX) + 1) * STEP_PX
+    padded = np.concatenate([steps[0] - STEP_PX * np.arange(4, 0, -1), steps, steps[-1] + STEP_PX * np.arange(1, 5)])
+    place = contour.pixels[:, None] + padded[None, :, None] * contour.outward[:, None] - 0.5
+    x, y = (place[..., k].astype(np.float32) for k in range(2))
+    likeness, brightness = (
+        cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+        for image in (appearance.likeness, appearance.brightness)
+    )
+    ahead, behind, here = slice(8, None), slice(None, -8), slice(4, -4)
+    fall = likeness[:, behind] - likeness[:, ahead]
+    valley = brightness[:, ahead] + brightness[:, behind] - 2 * brightness[:, here]
+    height, width = appearance.likeness.shape
+    outside = (x < 1) | (y < 1) | (x > width - 2) | (y > height - 2)
+    near = np.exp(-(steps**2) / (2 * (0.6 * reach_px) ** 2))
+    offset, is_found = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
+    for between, strength in ((False, fall), (True, valley)):
+        own = np.flatnonzero(contour.between == between)
+        if len(own) == 0:
+            continue
+        score = np.where(outside[own][:, here], -np.inf, strength[own]) * near
+        best = score.argmax(axis=1)
+        top = np.take_along_axis(strength[own], best[:, None], axis=1)[:, 0]
+        inner = (best > 0) & (best < len(steps) - 1)
+        clear = inner & np.isfinite(score.max(axis=1)) & (top > CLEAR * np.percentile(top, 90)) & (top > 0)
+        offset[own] = steps[best] + STEP_PX * _vertex(strength[own], np.clip(best, 1, len(steps) - 2))
+        is_found[own] = clear
+    return Found(contour, offset, is_found)
+
+
+def _vertex(strength: Floats, best: NDArray[np.int64]) -> Floats:
+    # Of the parabola through three samples, in samples.
+    left, middle, right = (np.take_along_axis(strength, best[:, None] + k, axis=1)[:, 0] for k in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    return np.asarray(np.clip(np.where(bend < 0, (left - right) / np.where(bend < 0, 2 * bend, 1.0), 0.0), -1, 1))
+
+
+def _equations(camera: Camera, found: Found, centre_mm: Floats) -> tuple[Floats, Floats, Floats, float]:
+    contour = found.contour
+    across = np.einsum("nk,nkj->nj", contour.outward, pixel_derivatives(camera, contour.points_mm, centre_mm))
+    residual = np.where(found.is_found, found.offset_px, 0.0)
+    seen = np.abs(residual[found.is_found])
+    spread = max(1.4826 * float(np.median(seen)) if len(seen) else LEAST_SPREAD_PX, LEAST_SPREAD_PX)
+    far = np.clip(np.abs(residual) / (TUKEY * spread), 0, 1)
+    weight = found.is_found * (1 - far**2) ** 2 * np.where(contour.between, BETWEEN_WEIGHT, 1.0) / spread**2
+    return across, residual, weight, spread
+
+
+def _sandwich(
+    views: Sequence[View], found: Sequence[Found], centre_mm: Floats, normal: Floats, prior: Floats
+) -> Floats:
+    # Errors along one part of an outline go together, so scores are summed over it before they are squared (cluster-robust).
+    middle, count = prior.copy(), 0
+    for view, one in zip(views, found, strict=True):
+        jacobian, residual, weight, _ = _equations(view.camera, one, centre_mm)
+        angle = np.arctan2(one.contour.outward[:, 1], one.contour.outward[:, 0])
+        cluster = (
+            one.contour.tooth * SECTORS + np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
+        )
+        for number in np.unique(cluster):
+            own = cluster == number
+            score = (weight[own] * residual[own]) @ jacobian[own]
+            middle += np.outer(score, score)
+            count += 1
+    inverse = np.linalg.inv(normal)
+    return np.asarray(max(count, 7) / (max(count, 7) - 6) * inverse @ middle @ inverse)
+
+
+def _require_edges(found: Sequence[Found]) -> None:
+    total, seen = sum(len(one.is_found) for one in found), sum(int(one.is_found.sum()) for one in found)
+    if total == 0 or seen < LEAST_FOUND * total:
+        share = 0.0 if total == 0 else seen / total
+        raise CaptureInputError(
+            f"Only {share:.0%} of the teeth's outlines are seen as edges in the photographs; see in the overlay pictures whether "
+            "the landmarks put the scan on the teeth, and whether the frames are sharp and bright."
+        )
