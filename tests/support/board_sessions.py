@@ -9,14 +9,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.cameras.boards import Board, corners_on_board
+from services.calibrate.cameras.boards import corners_on_board
 from services.calibrate.cameras.bundle import Rig, draw
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 from services.calibrate.cameras.sightings import View, joined
+from services.core.raw.things import Board
 
-CHESSBOARD = Board("plate", "chessboard", (9, 7), 12.0)
+CHESSBOARD = Board(name="plate", type="chessboard", squares=(9, 7), square_mm=12.0)
 SIZE = (1600, 1200)
+
+
+def charuco(squares: tuple[int, int], dictionary: str = "DICT_6X6_250", **others: object) -> Board:
+    """A ChArUco board of squares of 40 mm and markers of 20 mm, or another that has markers."""
+    told = {"type": "charuco", "square_mm": 40, "marker_mm": 20, **others}
+    return Board.model_validate({"name": "plate", "squares": squares, "dictionary": dictionary, **told})
 
 
 def looking(position_mm: NDArray[np.float64], target_mm: NDArray[np.float64]) -> NDArray[np.float64]:

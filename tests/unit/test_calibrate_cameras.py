@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.calibrate.cameras.boards import Board, corners_on_board, detect
+from services.calibrate.cameras.boards import corners_on_board, detect
 from services.calibrate.cameras.bundle import Rig, draw, fit_bundle, jacobian, layout_of
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.models import choose_lens, fit_lens, held_out_squares, of_one_camera
@@ -18,7 +18,7 @@ from services.calibrate.cameras.rotations import pose_matrix, rotation_matrix
 from services.calibrate.cameras.sightings import View, joined
 from services.calibrate.cameras.start import first_lens, first_rig
 from services.core.errors import CaptureInputError
-from tests.support.board_sessions import CHESSBOARD, SIZE, photographed, table_views, true_rig
+from tests.support.board_sessions import CHESSBOARD, SIZE, charuco, photographed, table_views, true_rig
 from tests.support.shared_data import shared_path
 
 CORNERS_OF_A_RECORDING = "calibration/{}/CHARUCO/xy_CHARUCO.csv"
@@ -140,7 +140,7 @@ def test_boards_in_photographs_are_found_and_calibrate_a_camera() -> None:
     import cv2
 
     folder = shared_path("data/aruco-boards")
-    board = Board("plate", "charuco", (5, 7), 40, 20, "DICT_6X6_250")
+    board = charuco((5, 7))
     views = []
     for number in range(4):
         found = detect(cv2.imread(str(folder / f"img_0{number}.jpg"), cv2.IMREAD_GRAYSCALE), board)
@@ -153,7 +153,7 @@ def test_boards_in_photographs_are_found_and_calibrate_a_camera() -> None:
     hidden = detect(cv2.imread(str(folder / "chocclusion_original.jpg"), cv2.IMREAD_GRAYSCALE), board)
     assert (len(hidden.markers), len(hidden.ids)) == (13, 16)
     single = cv2.imread(str(folder / "singlemarkersoriginal.jpg"), cv2.IMREAD_GRAYSCALE)
-    markers = detect(single, Board("marks", "aruco", (12, 17), 40, 20, "DICT_6X6_250")).markers
+    markers = detect(single, charuco((12, 17), type="aruco")).markers
     assert sorted(markers.tolist()) == [23, 40, 62, 98, 124, 203]
 
 
@@ -164,7 +164,7 @@ def test_held_out_boards_are_drawn_at_least_as_well_as_by_opencv() -> None:
 
     if not STEREO_BOARDS.is_dir():
         pytest.skip("Debian's package opencv-doc is not installed")
-    board = Board("plate", "chessboard", (10, 7), 1.0)
+    board = CHESSBOARD.model_copy(update={"squares": (10, 7), "square_mm": 1.0})
     squares = []
     for side in ("left", "right"):
         views = []
@@ -194,20 +194,12 @@ def test_corners_lie_on_the_plate_as_opencv_counts_them() -> None:
     corners = corners_on_board(CHESSBOARD)
     assert corners[:2].tolist() == [[0, 0, 0], [12, 0, 0]]
     assert len(corners) == 48
-    charuco = corners_on_board(Board("plate", "charuco", (5, 7), 40, 20, "DICT_6X6_250"))
-    assert charuco[0].tolist() == [40, 40, 0]
+    assert corners_on_board(charuco((5, 7)))[0].tolist() == [40, 40, 0]
 
 
-@pytest.mark.parametrize(
-    ("board", "named"),
-    [
-        (Board("plate", "charuco", (5, 7), 40, 20, "DICT_9X9_1"), "DICT_9X9_1"),
-        (Board("plate", "charuco", (5, 7), 20, 40, "DICT_6X6_250"), "markers of 40 mm in squares of 20 mm"),
-    ],
-)
-def test_a_board_that_cannot_be_is_refused(board: Board, named: str) -> None:
-    with pytest.raises(CaptureInputError, match=named):
-        corners_on_board(board)
+def test_a_board_of_markers_that_opencv_lacks_is_refused() -> None:
+    with pytest.raises(CaptureInputError, match=r"dictionary DICT_9X9_1, which OpenCV lacks; it has .*DICT_5X5_100"):
+        corners_on_board(charuco((5, 7), "DICT_9X9_1"))
 
 
 def test_a_camera_that_shares_no_board_is_named() -> None:

@@ -3,39 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.lens import HALF_PIXEL
 from services.core.errors import CaptureInputError
+from services.core.raw.things import Board
 
 Floats = NDArray[np.float64]
-BoardType = Literal["charuco", "chessboard", "aruco"]
-
-
-@dataclass(frozen=True)
-class Board:
-    """A flat plate of squares or markers.
-
-    Attributes:
-        name: as the raw folder calls it.
-        type: ``charuco`` (a chessboard with markers in its white squares), ``chessboard``, or ``aruco`` (markers with gaps).
-        squares: columns and rows, of squares or of markers.
-        square_mm: edge of a square; of an ArUco board the distance from one marker's edge to the next one's.
-        marker_mm: edge of a marker; none on a chessboard.
-        dictionary: OpenCV's name of the markers' dictionary.
-        legacy_pattern: ChArUco with an even number of rows as OpenCV printed it before version 4.6.
-    """
-
-    name: str
-    type: BoardType
-    squares: tuple[int, int]
-    square_mm: float
-    marker_mm: float = 0.0
-    dictionary: str = ""
-    legacy_pattern: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,20 +41,18 @@ def corners_on_board(board: Board) -> Floats:
 def opencv_board(board: Board) -> Any:
     """OpenCV's own board of a ChArUco or ArUco board.
 
+    Of an ArUco board ``square_mm`` is the distance from one marker's edge to the next one's.
+
     Raises:
-        CaptureInputError: unknown dictionary, or markers that do not fit.
+        CaptureInputError: unknown dictionary.
     """
     import cv2
 
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or number is None:
+    number = getattr(cv2.aruco, board.dictionary or "", None)
+    if number is None or board.marker_mm is None:
         known = ", ".join(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
         raise CaptureInputError(
-            f"Board {board.name} names dictionary {board.dictionary or 'none'}, which OpenCV lacks; it has {known}."
-        )
-    if not 0 < board.marker_mm < board.square_mm:
-        raise CaptureInputError(
-            f"Board {board.name} has markers of {board.marker_mm:g} mm in squares of {board.square_mm:g} mm; measure both again."
+            f"Board {board.name} names dictionary {board.dictionary}, which OpenCV lacks; it has {known}."
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     if board.type == "aruco":

@@ -1,0 +1,93 @@
+"""A list of light positions that somebody measured in a frame of its own, laid over the lights that highlights found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.rotations import pose_matrix, pose_vector
+
+Floats = NDArray[np.float64]
+MIN_LIGHTS = 4
+"""Three fix a rigid motion; the fourth tells whether it fits."""
+ROUNDS = 20
+CAUCHY_SIGMAS = 3.0
+"""Where a light's weight is halved: a good list loses nothing, and one light off by 10 σ keeps a tenth."""
+NOISE_FLOOR_MM = 0.5
+"""Nobody measures a lamp's place better by hand."""
+OUTLIER_SIGMAS = 5.0
+MAD_OF_DISTANCES = 1.538
+"""Of the length of a vector with three normal coordinates: its median is 1.538 σ."""
+
+
+@dataclass(frozen=True)
+class AlignedList:
+    """A list in the world's frame.
+
+    Attributes:
+        world_from_list: the rigid motion (4, 4).
+        positions_mm: of all listed lights (L, 3).
+        sigma_mm: scatter of one coordinate of the list about the lights that were found.
+        off_mm: distance of listed and found, NaN where no highlight was found (L,).
+        outliers: numbers of the lights that lie elsewhere than listed.
+    """
+
+    world_from_list: Floats
+    positions_mm: Floats
+    sigma_mm: float
+    off_mm: Floats
+    outliers: tuple[int, ...]
+
+
+def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
+    """Lay a list over found lights by the rigid motion of least weighted squares (Kabsch 1976), with Cauchy's weights.
+
+    Args:
+        listed_mm: positions in the list's frame (L, 3).
+        found_mm: positions in the world (L, 3), NaN where a light was not found.
+
+    Returns:
+        None where fewer than four lights were found.
+    """
+    known = np.isfinite(found_mm).all(axis=1)
+    if np.count_nonzero(known) < MIN_LIGHTS:
+        return None
+    source, target = listed_mm[known], found_mm[known]
+    weights = np.ones(len(source))
+    for _ in range(ROUNDS):
+        motion = _rigid(source, target, weights)
+        off = np.linalg.norm(_moved(motion, source) - target, axis=1)
+        sigma = max(float(np.median(off)) / MAD_OF_DISTANCES, NOISE_FLOOR_MM)
+        weights = 1 / (1 + (off / (CAUCHY_SIGMAS * sigma)) ** 2)
+    distances = np.full(len(listed_mm), np.nan)
+    distances[known] = off
+    bad = np.flatnonzero(np.nan_to_num(distances) > OUTLIER_SIGMAS * sigma)
+    return AlignedList(motion, _moved(motion, listed_mm), sigma, distances, tuple(int(n) for n in bad))
+
+
+def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:
+    """Pairs (a, b) of outliers where light a was found where the list has b, within the list's own scatter."""
+    limit = OUTLIER_SIGMAS * aligned.sigma_mm
+    pairs = []
+    for one in aligned.outliers:
+        off = np.linalg.norm(aligned.positions_mm - found_mm[one], axis=1)
+        nearest = int(np.argmin(off))
+        if nearest != one and off[nearest] <= limit:
+            pairs.append((one, nearest))
+    return pairs
+
+
+def _rigid(source: Floats, target: Floats, weights: Floats) -> Floats:
+    share = weights / weights.sum()
+    middle, aim = share @ source, share @ target
+    u, _, vt = np.linalg.svd((target - aim).T @ (share[:, None] * (source - middle)))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, aim - rotation @ middle
+    return pose_matrix(pose_vector(motion))
+
+
+def _moved(motion: Floats, points: Floats) -> Floats:
+    return np.asarray(points @ motion[:3, :3].T + motion[:3, 3])

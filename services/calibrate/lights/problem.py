@@ -1,0 +1,128 @@
+"""What mirror spheres show, as equations: found minus drawn pixels of outlines and highlights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.lights.mirror import (
+    Eye,
+    highlight_points,
+    mirrored_rays,
+    nearest_point,
+    outline_errors,
+    sphere_from_outline,
+)
+from services.core.errors import CaptureInputError
+
+Floats = NDArray[np.float64]
+MIN_HIGHLIGHTS = 2
+"""Of one light: a highlight tells two of a position's three coordinates."""
+
+
+@dataclass(frozen=True)
+class SphereView:
+    """One mirror sphere in one camera.
+
+    Attributes:
+        camera, place: numbers; cameras that share a place saw the sphere unmoved.
+        radius_mm: of the sphere.
+        outline_px: points of its outline (E, 2), pixel centres at half-integers.
+        lights: numbers of the lights whose highlights were found (H,).
+        highlights_px: where (H, 2).
+    """
+
+    camera: int
+    place: int
+    radius_mm: float
+    outline_px: Floats
+    lights: NDArray[np.int64]
+    highlights_px: Floats
+
+
+class Problem:
+    """Residuals of all views. The unknowns stand in the order lights (3 each), spheres' centres by place (3 each), edge shifts by camera."""
+
+    def __init__(self, views: Sequence[SphereView], n_cameras: int, light_names: Sequence[str]) -> None:
+        self.views = views
+        seen = np.concatenate([view.lights for view in views])
+        self.lights, counts = np.unique(seen, return_counts=True)
+        if few := [int(n) for n, count in zip(self.lights, counts, strict=True) if count < MIN_HIGHLIGHTS]:
+            raise CaptureInputError(
+                f"Light {light_names[few[0]]} shows on a mirror sphere only once, which tells a direction and no place; "
+                "photograph the sphere in a second place or by a second camera."
+            )
+        self.n_places, self.n_cameras = max(view.place for view in views) + 1, n_cameras
+        self.row = np.searchsorted(self.lights, seen)
+        per_view, edges = [len(view.lights) for view in views], [len(view.outline_px) for view in views]
+        self.camera, self.edge_camera = (np.repeat([view.camera for view in views], n) for n in (per_view, edges))
+        self.place, self.edge_place = (np.repeat([view.place for view in views], n) for n in (per_view, edges))
+        self._radius, self._edge_radius = (np.repeat([view.radius_mm for view in views], n) for n in (per_view, edges))
+        self._found = np.concatenate([view.highlights_px for view in views])
+        self._edges = np.concatenate([view.outline_px for view in views])
+
+    @property
+    def length(self) -> int:
+        """Number of unknowns."""
+        return 3 * len(self.lights) + 3 * self.n_places + self.n_cameras
+
+    def split(self, values: Floats) -> tuple[Floats, Floats, Floats]:
+        """Lights (M, 3), centres (P, 3) and edge shifts (K,)."""
+        first, second = 3 * len(self.lights), 3 * len(self.lights) + 3 * self.n_places
+        return values[:first].reshape(-1, 3), values[first:second].reshape(-1, 3), values[second : self.length]
+
+    def start(self, eyes: Sequence[Eye]) -> Floats:
+        """Each sphere from its outlines alone, and each light where its mirrored rays come nearest to each other."""
+        centres = np.zeros((self.n_places, 3))
+        for place in range(self.n_places):
+            here = [view for view in self.views if view.place == place]
+            found = [sphere_from_outline(eyes[view.camera], view.outline_px, view.radius_mm) for view in here]
+            centres[place] = np.mean(found, axis=0)
+        mirrored = [
+            mirrored_rays(eyes[view.camera], view.highlights_px, centres[view.place], view.radius_mm)
+            for view in self.views
+        ]
+        points, rays = (np.concatenate(parts) for parts in zip(*mirrored, strict=True))
+        lights = [nearest_point(points[self.row == row], rays[self.row == row]) for row in range(len(self.lights))]
+        return np.concatenate([np.ravel(lights), centres.ravel(), np.zeros(self.n_cameras)])
+
+    def highlights(self, eyes: Sequence[Eye], values: Floats) -> Floats:
+        """Found minus drawn highlights (N, 2)."""
+        lights, centres, _ = self.split(values)
+        where = np.array([eye.centre_mm for eye in eyes])[self.camera]
+        points = highlight_points(where, lights[self.row], centres[self.place], self._radius)
+        off = np.empty_like(self._found)
+        for camera, eye in enumerate(eyes):
+            mine = self.camera == camera
+            if mine.any():
+                off[mine] = self._found[mine] - eye.project(points[mine])
+        return off
+
+    def outlines(self, eyes: Sequence[Eye], values: Floats) -> Floats:
+        """Found minus drawn edges, outward (E,)."""
+        _, centres, shifts = self.split(values)
+        off = np.empty(len(self._edges))
+        for camera, eye in enumerate(eyes):
+            mine = self.edge_camera == camera
+            if mine.any():
+                where = centres[self.edge_place[mine]]
+                off[mine] = outline_errors(eye, self._edges[mine], where, self._edge_radius[mine]) - shifts[camera]
+        return off
+
+    def sparsity(self) -> NDArray[np.bool_]:
+        """Which residuals (2N + E + K: highlights, edges, edge shifts) depend on which unknowns."""
+        n_lights, count, edges = 3 * len(self.lights), 2 * len(self.row), len(self._edges)
+        shifts = n_lights + 3 * self.n_places
+        pattern = np.zeros((count + edges + self.n_cameras, self.length), dtype=bool)
+        highlight, edge = np.arange(len(self.row)), count + np.arange(edges)
+        for axis in range(3):
+            for side in range(2):
+                pattern[2 * highlight + side, 3 * self.row + axis] = True
+                pattern[2 * highlight + side, n_lights + 3 * self.place + axis] = True
+            pattern[edge, n_lights + 3 * self.edge_place + axis] = True
+        pattern[edge, shifts + self.edge_camera] = True
+        pattern[count + edges :, shifts:] = np.eye(self.n_cameras, dtype=bool)
+        return pattern
