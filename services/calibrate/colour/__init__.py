@@ -1,0 +1,1 @@
+"""From a camera's channels to colours, by a chart of patches."""

@@ -1,0 +1,232 @@
+"""How bright each light is in each channel, from white spheres of known reflectance.
+
+A Lambertian sphere under a point light has the radiance ρ ÷ π · I · cos θ ÷ d². Every photograph of a white sphere under one light
+gives one number a channel: the slope of its pixels against that known factor. Its logarithm is a sum of what belongs to the camera
+(counts per radiance), to the light (its intensity) and, where the sphere stood in several places, of the lights' common lobe.
+So all photographs together are linear least squares. Only products of intensity and radiance per count are measurable: the mean of
+the intensities is 1 in every channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.lights.mirror import Eye
+from services.core.errors import CaptureInputError
+
+Floats = NDArray[np.float64]
+LEAST_COSINE_OF_LIGHT = 0.35
+"""Beyond 70° light grazes: cos changes by a tenth within 2°, and no paint is Lambertian there."""
+LEAST_COSINE_OF_VIEW = 0.5
+"""Of the angle to the camera: towards the outline pixels mix with the background."""
+MIN_PIXELS = 50
+MIN_PLACES_FOR_A_LOBE = 3
+LOBE_SIGMAS = 4.0
+"""An exponent that is not this far from 0 is taken to be 0."""
+SIGMA_FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class WhitePhoto:
+    """A white sphere under one light.
+
+    Attributes:
+        camera, place, light: numbers.
+        pixels: of the photograph (N, 2), saturated ones left out.
+        values: counts above black over exposure, gain, level and the lens' fall of light, (N, C).
+    """
+
+    camera: int
+    place: int
+    light: int
+    pixels: Floats
+    values: Floats
+
+
+@dataclass(frozen=True)
+class WhiteSphere:
+    """Where a white sphere stood: centre (3,), radius in mm, and its reflectance by channel (C,)."""
+
+    centre_mm: Floats
+    radius_mm: float
+    reflectance: Floats
+
+
+@dataclass(frozen=True)
+class IntensityFit:
+    """Lights and cameras by channel.
+
+    Attributes:
+        intensity: towards the mean of the spheres, mean 1 over the lights (L, C); NaN for lights that no photograph shows.
+        radiance_per_count: of each camera (K, C).
+        exponent: of the lights' common lobe about their direction to the spheres' mean, and its standard error.
+        covariance: of the logarithms of the S seen lights' intensities, by light and then channel, from the photographs' scatter
+            and the positions together (S · C, S · C).
+        by_positions: derivative of those logarithms to the lights' positions (S · C, 3 L), for errors that are shared.
+        sigma: scatter of one photograph's slope, relative, by channel (C,).
+        residuals: of the slopes' logarithms (photographs, C).
+    """
+
+    intensity: Floats
+    radiance_per_count: Floats
+    exponent: float
+    exponent_se: float
+    covariance: Floats
+    by_positions: Floats
+    sigma: Floats
+    residuals: Floats
+
+
+def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """The factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and which of them show a part of the sphere that can be used."""
+    rays, origin = eye.directions(pixels), eye.centre_mm
+    towards = sphere.centre_mm - origin
+    middle = rays @ towards
+    inside = middle**2 - towards @ towards + sphere.radius_mm**2
+    points = origin + (middle - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
+    normals = (points - sphere.centre_mm) / sphere.radius_mm
+    to_light = light_mm - points
+    distance = np.linalg.norm(to_light, axis=1)
+    cosine = (normals * to_light).sum(axis=1) / distance
+    view = -(normals * rays).sum(axis=1)
+    usable = (inside > 0) & (cosine > LEAST_COSINE_OF_LIGHT) & (view > LEAST_COSINE_OF_VIEW)
+    return np.asarray(cosine / (np.pi * distance**2)), np.asarray(usable)
+
+
+def slope(photo: WhitePhoto, eye: Eye, sphere: WhiteSphere, light_mm: Floats) -> Floats | None:
+    """Values over the known factor (C,), by least squares over the pixels with shot noise; None where too few can be used."""
+    factor, usable = shading(eye, sphere, light_mm, photo.pixels)
+    if np.count_nonzero(usable) < MIN_PIXELS:
+        return None
+    # Shot noise grows with the value, which goes with the factor: weights 1 ÷ factor make the slope a ratio of sums.
+    return np.asarray(photo.values[usable].sum(axis=0) / (factor[usable].sum() * sphere.reflectance))
+
+
+def fit_intensity(
+    photos: Sequence[WhitePhoto],
+    eyes: Sequence[Eye],
+    spheres: Sequence[WhiteSphere],
+    lights_mm: Floats,
+    light_names: Sequence[str],
+    position_covariance: Floats | None = None,
+) -> IntensityFit:
+    """All lights from all photographs.
+
+    Args:
+        photos: white spheres, light by light.
+        eyes: calibrated cameras.
+        spheres: by place.
+        lights_mm: positions (L, 3).
+        light_names: for messages.
+        position_covariance: of the lights' positions (3 L, 3 L), mm².
+
+    Raises:
+        CaptureInputError: no photograph has enough pixels, or a light is dark.
+    """
+    found = [slope(one, eyes[one.camera], spheres[one.place], lights_mm[one.light]) for one in photos]
+    kept = [(photo, value) for photo, value in zip(photos, found, strict=True) if value is not None]
+    if not kept:
+        raise CaptureInputError("No photograph of a white sphere shows enough of its lit side; photograph it larger.")
+    if dark := next((photo for photo, value in kept if value.min() <= 0), None):
+        raise CaptureInputError(
+            f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on."
+        )
+    used = [photo for photo, _ in kept]
+    logs = np.log(np.array([value for _, value in kept]))
+    seen = np.unique([photo.light for photo in used])
+    cosines = _log_cosines(used, spheres, lights_mm)
+    design = _design(used, seen, len(eyes))
+    exponent, exponent_se = _common_exponent(design, logs.mean(axis=1), cosines, len({photo.place for photo in used}))
+    logs = logs - exponent * cosines[:, None]
+    solver = np.asarray(np.linalg.pinv(design), dtype=np.float64)
+    answer = solver @ logs
+    residuals = logs - design @ answer
+    freedom = max(len(used) - np.linalg.matrix_rank(design), 1)
+    sigma = np.maximum(np.sqrt((residuals**2).sum(axis=0) / freedom), SIGMA_FLOOR)
+    relative = np.exp(answer[: len(seen)])
+    mean = relative.mean(axis=0)
+    intensity = np.full((len(lights_mm), relative.shape[1]), np.nan)
+    intensity[seen] = relative / mean
+    steps = np.concatenate([np.zeros((1, relative.shape[1])), answer[len(seen) :]])
+    by_positions = _by_positions(used, eyes, spheres, lights_mm)
+    covariance, moved = _covariance(solver[: len(seen)], by_positions, sigma, relative, position_covariance)
+    return IntensityFit(
+        intensity, 1 / (mean * np.exp(steps)), exponent, exponent_se, covariance, moved, sigma, residuals
+    )
+
+
+def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: int) -> Floats:
+    """One column a light that was seen, and one a camera but the first."""
+    design = np.zeros((len(photos), len(seen) + n_cameras - 1))
+    for row, photo in enumerate(photos):
+        design[row, np.searchsorted(seen, photo.light)] = 1
+        if photo.camera > 0:
+            design[row, len(seen) + photo.camera - 1] = 1
+    return design
+
+
+def _log_cosines(photos: Sequence[WhitePhoto], spheres: Sequence[WhiteSphere], lights_mm: Floats) -> Floats:
+    """Logarithm of the cosine between a light's direction to the photographed sphere and to the mean of all spheres (R,)."""
+    middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
+    lights = lights_mm[[photo.light for photo in photos]]
+    centres = np.array([spheres[photo.place].centre_mm for photo in photos])
+    axis, aim = middle - lights, centres - lights
+    cosine = (axis * aim).sum(axis=1) / (np.linalg.norm(axis, axis=1) * np.linalg.norm(aim, axis=1))
+    return np.asarray(np.log(np.minimum(cosine, 1.0)))
+
+
+def _common_exponent(design: Floats, logs: Floats, cosines: Floats, n_places: int) -> tuple[float, float]:
+    """Exponent of the lobe and its standard error; 0 where the places cannot tell it from an even light."""
+    if n_places < MIN_PLACES_FOR_A_LOBE:
+        return 0.0, float("inf")
+    full = np.column_stack([design, cosines])
+    inverse = np.linalg.pinv(full.T @ full)
+    answer = inverse @ full.T @ logs
+    freedom = max(len(logs) - np.linalg.matrix_rank(full), 1)
+    error = float(np.sqrt(inverse[-1, -1] * ((logs - full @ answer) ** 2).sum() / freedom))
+    exponent = float(answer[-1])
+    return (exponent, error) if exponent > LOBE_SIGMAS * error else (0.0, error)
+
+
+def _by_positions(
+    photos: Sequence[WhitePhoto], eyes: Sequence[Eye], spheres: Sequence[WhiteSphere], lights_mm: Floats
+) -> Floats:
+    """Derivative (R, 3 L) of the slopes' logarithms to the lights' positions, by differences over 0.1 mm."""
+    derivative, step = np.zeros((len(photos), 3 * len(lights_mm))), 0.1
+    for row, photo in enumerate(photos):
+        for axis in range(3):
+            logs = []
+            for sign in (-1, 1):
+                where = lights_mm[photo.light].copy()
+                where[axis] += sign * step
+                moved = slope(photo, eyes[photo.camera], spheres[photo.place], where)
+                logs.append(np.log(moved).mean() if moved is not None else 0.0)
+            derivative[row, 3 * photo.light + axis] = (logs[1] - logs[0]) / (2 * step)
+    return derivative
+
+
+def _covariance(
+    solver: Floats,
+    by_positions: Floats,
+    sigma: Floats,
+    relative: Floats,
+    position_covariance: Floats | None,
+) -> tuple[Floats, Floats]:
+    """Covariance (S · C, S · C) of the seen lights' logarithms, by light and then channel, and their derivative to positions."""
+    n_lights, n_channels = relative.shape
+    size = n_lights * n_channels
+    covariance, moved = np.zeros((size, size)), np.zeros((size, by_positions.shape[1]))
+    for channel in range(n_channels):
+        # The gauge: a logarithm minus the mean of all, weighted by the intensities.
+        gauge = np.eye(n_lights) - relative[:, channel] / relative[:, channel].sum()
+        rows = np.arange(n_lights) * n_channels + channel
+        own = gauge @ solver
+        covariance[np.ix_(rows, rows)] = sigma[channel] ** 2 * own @ own.T
+        moved[rows] = own @ by_positions
+    if position_covariance is not None:
+        covariance += moved @ position_covariance @ moved.T
+    return covariance, moved
