@@ -15,6 +15,8 @@ from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
 from services.core.uncertainty import CalibrationUncertainty, require_known_names
 
+RAW_DESCRIPTION = "raw.toml"
+"""Makes a folder of photographs a capture; see ``services.core.raw``."""
 MAX_LIGHTS = 1000
 """Six times the lights of the largest dome that is known here."""
 MAX_PIXELS = 2**28
@@ -56,18 +58,20 @@ class Calibration(Record):
 
 
 def published_capture(capture: Path) -> tuple[Path, str] | None:
-    """Job folder and stage name of a published capture, or of the job that holds one; None for a folder capture.
+    """Job folder and stage name of a published capture, or of the job that holds one; None for a folder of images or photographs.
 
     Raises:
         CaptureInputError: it is neither.
     """
-    if (capture / "capture.json").is_file() or not capture.is_dir():
+    if any((capture / name).is_file() for name in ("capture.json", RAW_DESCRIPTION)) or not capture.is_dir():
         return None
     if (capture / MANIFEST).is_file():
         return capture.parent, capture.name
     if (capture / "capture" / MANIFEST).is_file():
         return capture, "capture"
-    raise CaptureInputError(f"{capture} holds neither capture.json nor a published capture; check option 'capture'.")
+    raise CaptureInputError(
+        f"{capture} holds neither capture.json, {RAW_DESCRIPTION} nor a published capture; check option 'capture'."
+    )
 
 
 def read_description(capture: Path) -> FolderCapture:

@@ -11,6 +11,7 @@ from services.core.calibration import published_capture, recalibrated
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import teeth_folder
 from services.core.installed import require_packages
+from services.core.raw.folder import is_raw_folder
 from services.core.records import CaptureManifest, JobSpec, MaskBit, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, create_array, open_stage, write_record
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from services.preprocess.source import Source
 
 
-PACKAGES = ("cv2", "rtree")
+PACKAGES = ("cv2", "imagecodecs", "rtree", "tifffile")
 """What the extra ``preprocess`` brings, by the names under which it is imported."""
 
 
@@ -32,7 +33,7 @@ def check() -> None:
         PlatformError: something is missing.
     """
     require_packages(PACKAGES, "preprocess")
-    for module in ("source", "brightness", "masks", "quality", "subject", "valid"):
+    for module in ("source", "raw.source", "brightness", "masks", "quality", "subject", "valid"):
         importlib.import_module(f"services.preprocess.{module}")
 
 
@@ -212,8 +213,11 @@ def _create_arrays(
 def _open_source(spec: JobSpec, root: Path) -> Source:
     """The folder or store that ``spec.capture`` names, or else the job's published capture."""
     from services.preprocess.folder import FolderSource
+    from services.preprocess.raw.source import RawSource
     from services.preprocess.rig import RigSource
 
+    if spec.capture is not None and is_raw_folder(spec.capture):
+        return RawSource(spec.capture, spec.calibration, spec.sensor_noise_relative, spec.sensor_noise_floor)
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
     if published is not None:
         source: FolderSource | RigSource = RigSource(*open_stage(*published, CaptureManifest))

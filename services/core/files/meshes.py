@@ -65,17 +65,18 @@ def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -
     )
 
 
+def fdi_numbers(root: Path) -> tuple[int, ...]:
+    """Numbers of the folders below ``root/teeth``, in ascending order."""
+    return tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
+
+
 def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, ...]:
     """Read and check every tooth below ``root/teeth``.
 
     Raises:
         CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
     """
-    numbers = (
-        fdi
-        if fdi is not None
-        else tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
-    )
+    numbers = fdi_numbers(root) if fdi is None else fdi
     if unknown := next((number for number in numbers if number not in FDI_NUMBERS), None):
         what = f"{root / 'teeth' / str(unknown)} is of tooth {unknown}, which is no FDI number"
         raise CaptureInputError(

@@ -35,6 +35,11 @@ _KINDS: Mapping[str, type[Record]] = MappingProxyType(
 """Records by the key under which they stand."""
 
 
+def is_raw_folder(root: Path) -> bool:
+    """Whether a folder is described by ``raw.toml``; one with ``capture.json`` too is a capture of linear images."""
+    return (root / DESCRIPTION).is_file() and not (root / "capture.json").is_file()
+
+
 def read_raw_folder(root: Path) -> RawFolder:
     """Read ``root/raw.toml`` and see that the files it names lie in the folder and exist.
 

@@ -1,0 +1,256 @@
+"""What one camera's own frames tell of it: black, noise, linearity, fall of light; and its lit frames above black."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibrated import CalibratedCamera
+from services.core.errors import CaptureInputError
+from services.core.raw.frames import read_counts
+from services.core.raw.mosaic import sites
+from services.core.raw.records import DARK, RawFolder, RawFrame
+from services.preprocess.raw.checks import require_like_exposures
+from services.preprocess.raw.demosaic import demosaic
+from services.preprocess.raw.lens import Lens, fitted_vignetting
+from services.preprocess.raw.merge import Exposure, merge
+from services.preprocess.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
+from services.preprocess.raw.response import Linearity, Series, measure_linearity
+from services.preprocess.window import Window
+
+Image = NDArray[np.float32]
+
+FRAMES_MEASURED = 8
+"""Black frames, and pairs of lit ones, that are looked at: more tell little more."""
+BRIGHT_BLACK = 0.25
+"""Of full scale: a frame with a higher median is no black one."""
+PIXELS_MEASURED = 1_000_000
+"""Of a frame, for its noise: they tell a variance to 0.14 %."""
+
+
+class CameraFrames:
+    """One camera of a raw folder.
+
+    Attributes:
+        noise: model of its noise. lens: distortion and fall of light. linearity: of its counts.
+        notes: what was measured, and what had to be assumed, one sentence each.
+    """
+
+    def __init__(
+        self, root: Path, folder: RawFolder, camera: CalibratedCamera, assumed_noise: tuple[float, float]
+    ) -> None:
+        """Measure what the frames tell.
+
+        Args:
+            camera: as calibrated.
+            assumed_noise: fraction of the value, and of full scale, where neither frames nor calibration tell the noise.
+
+        Raises:
+            CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the frame.
+        """
+        self._root, self._folder, self.calibrated = root, folder, camera
+        self.raw = folder.camera_named(camera.name)
+        self.notes: list[str] = []
+        self._blacks: dict[tuple[float, float], tuple[Image, float]] = {}
+        self._ambient: Image | None = None
+        self._full = np.float32(np.inf if self.raw.full_counts is None else self.raw.full_counts)
+        self._black_frames = folder.frames_of(camera.name, "black")
+        self.linearity = Linearity(np.empty(0), (0.0, 0.0), float(self._full))
+        if not self._black_frames:
+            self._require_black_of_calibration()
+        self.noise = self._measured_noise(*assumed_noise)
+        self.linearity = self._measured_linearity()
+        self.lens = self._measured_lens()
+        self._ambient = self._measured_ambient()
+
+    def exposure(self, frame: RawFrame, region: Window | None = None) -> Exposure:
+        """Counts of a frame above black, linear, without the room's own light; (H, W) of a mosaic, else (H, W, C).
+
+        Args:
+            region: the part of the photograph that is wanted; None for all of it.
+
+        Raises:
+            CaptureInputError: it cannot be read; names it.
+        """
+        part = (slice(None), slice(None)) if region is None else (region.rows, region.columns)
+        counts = read_counts(self._root, self._folder, frame)[part].astype(np.float32)
+        black, variance = self._black(frame)
+        signal = self.linearity.linearised(counts - (black[part] if black.ndim else black))
+        seconds = frame.exposure_s * frame.gain
+        if self._ambient is not None and frame.kind not in DARK:
+            signal -= self._ambient[part] * np.float32(seconds)
+        return Exposure(signal, variance, self._full - counts, seconds * frame.level, frame.gain)
+
+    def _black(self, frame: RawFrame) -> tuple[Image, float]:
+        """Mean of the black frames nearest in gain and exposure, or one number for all pixels, and its variance."""
+        if not self._black_frames:
+            assert self.calibrated.black_counts is not None
+            return np.array(self.calibrated.black_counts, dtype=np.float32), 0.0
+
+        def distance(black: RawFrame) -> tuple[float, float]:
+            return abs(np.log(black.gain / frame.gain)), abs(np.log(black.exposure_s / frame.exposure_s))
+
+        nearest = min(self._black_frames, key=distance)
+        key = nearest.gain, nearest.exposure_s
+        if key not in self._blacks:
+            own = [one for one in self._black_frames if (one.gain, one.exposure_s) == key]
+            mean = np.zeros_like(self._black_counts(own[0]))
+            for one in own:
+                mean += self._black_counts(one) / np.float32(len(own))
+            zero = np.zeros((), dtype=np.float32)
+            self._blacks[key] = mean, float(self.noise.variance(zero, nearest.gain)) / len(own)
+        return self._blacks[key]
+
+    def _black_counts(self, frame: RawFrame) -> Image:
+        counts = read_counts(self._root, self._folder, frame).astype(np.float32)
+        if (median := float(np.median(counts))) > BRIGHT_BLACK * self._full:
+            raise CaptureInputError(
+                f"Frame {self._root / frame.file} ({frame.label}) has a median of {median:g} counts, so it is no black frame; "
+                "take it with the lens covered, or correct its kind."
+            )
+        return counts
+
+    def _require_black_of_calibration(self) -> None:
+        name = self.raw.name
+        if self.calibrated.black_counts is None:
+            lit = next((one for one in self._folder.frame if one.camera == name), self._folder.frame[0])
+            raise CaptureInputError(
+                f"Camera {name} has no black frame, so the zero of {lit.file} and its other frames is unknown; add one with "
+                'the lens covered (kind = "black"), or give black_counts in the calibration.'
+            )
+        told = f"{self.calibrated.black_counts:g}"
+        self.notes.append(
+            f"Camera {name} has no black frame; black is taken as the calibration's {told} counts everywhere."
+        )
+
+    def _measured_noise(self, relative: float, floor: float) -> NoiseModel:
+        """Of its own frames; what they do not tell is the calibration's, and what that does not is assumed and noted."""
+        name, calibrated = self.raw.name, self.calibrated
+        # The black's own noise is asked for while it is measured, and counts for nothing there.
+        self.noise = NoiseModel(0.0, 0.0)
+        read = self._read_noise()
+        measured = shot_noise(self._lit_pairs(), read)
+        self._blacks.clear()
+        if measured is not None:
+            slope, read = measured
+            self.notes.append(
+                f"Camera {name}: measured of its own frames are a read noise of {read:.3g} counts and {slope:.3g} counts per electron."
+            )
+            return NoiseModel(read, slope)
+        read = calibrated.read_noise_counts if read is None else read
+        if read is not None and calibrated.counts_per_electron is not None:
+            return NoiseModel(read, calibrated.counts_per_electron)
+        scale = float(self._full) if np.isfinite(self._full) else 1.0
+        self.notes.append(
+            f"Camera {name}: no two frames of one thing and no calibration tell its noise; {relative:.1%} of the signal and "
+            f"{floor:.2%} of full scale are assumed. Two flat frames of one exposure, and two black ones, would tell it."
+        )
+        return NoiseModel(floor * scale if read is None else read, 0.0, relative)
+
+    def _read_noise(self) -> float | None:
+        found = []
+        for own in _alike(self._black_frames):
+            if len(own) > 1:
+                counts = [self._black_counts(one) for one in own[:FRAMES_MEASURED]]
+                found.append((len(counts) - 1, read_noise(counts, own[0].gain)))
+        known = [(weight, value) for weight, value in found if value is not None]
+        return float(np.sqrt(np.average([v**2 for _, v in known], weights=[w for w, _ in known]))) if known else None
+
+    def _lit_pairs(self) -> Iterator[LitPair]:
+        """Pairs of one exposure and one thing; flat ones where there are some, else those of lights and of all lights."""
+        flats = self._folder.frames_of(self.raw.name, "flat")
+        groups = [own for own in _alike(flats) if len(own) > 1]
+        if not groups:
+            lit = self._folder.frames_of(self.raw.name, "light")
+            groups = [own for own in _alike(lit) if len(own) > 1]
+        for first, second in [pair for own in groups for pair in pairwise(own)][:FRAMES_MEASURED]:
+            step = -(-int(np.prod(self.raw.size)) // PIXELS_MEASURED)
+            a, b = (_unsaturated(self.exposure(one)).reshape(-1)[::step] for one in (first, second))
+            yield LitPair(a, b, first.gain)
+
+    def _measured_linearity(self) -> Linearity:
+        """Of flat frames in several exposures, else of lights in several exposures."""
+        name = self.raw.name
+        is_known = np.isfinite(self._full)
+        found = measure_linearity(list(self._series()), float(self._full)) if is_known else self.linearity
+        if found.ratios.size:
+            low, middle, high = np.percentile(found.ratios, (5, 50, 95))
+            told = f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %: {low:.3f} to {high:.3f})"
+            self.notes.append(
+                f"{told}{'' if found.is_linear else '; its counts are linearised by a curve fitted to that'}."
+            )
+        return found
+
+    def _series(self) -> Iterator[Series]:
+        flats = self._folder.frames_of(self.raw.name, "flat")
+        ladders = [own for own in _ladders(flats) if len(own) > 1]
+        if not ladders:
+            ladders = [own for own in _ladders(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1]
+        for pair in [pair for own in ladders for pair in pairwise(own)][:FRAMES_MEASURED]:
+            shorter, longer = (self.exposure(frame) for frame in pair)
+            require_like_exposures(self._root, pair, (shorter, longer), self._folder.channels)
+            yield Series(self._by_colour(shorter), self._by_colour(longer), longer.factor / shorter.factor)
+
+    def _by_colour(self, exposure: Exposure) -> Image:
+        """Counts above black with the four pixels of a mosaic's pattern apart, NaN where full."""
+        signal = _unsaturated(exposure)
+        if self.raw.mosaic == "none":
+            return signal
+        height, width = (length // 2 * 2 for length in signal.shape)
+        return np.stack([view for _, view in sites(signal[:height, :width], self.raw.mosaic)], axis=-1)
+
+    def _measured_lens(self) -> Lens:
+        flats = self._folder.frames_of(self.raw.name, "flat")
+        vignetting = self.calibrated.vignetting
+        if vignetting is None and flats:
+            rate, _, lost = merge([self.exposure(frame) for frame in flats], self.noise)
+            if lost.any():
+                raise CaptureInputError(
+                    f"Frame {self._root / flats[0].file} ({flats[0].label}) and all other flat ones are full at {int(lost.sum())} "
+                    "pixels; take one with a shorter exposure."
+                )
+            seen = np.atleast_3d(rate) if self.raw.mosaic == "none" else demosaic(rate, self.raw.mosaic)
+            vignetting = fitted_vignetting(self.calibrated, seen)
+            told = ", ".join(f"{value:.3g}" for value in vignetting)
+            self.notes.append(f"Camera {self.raw.name}: the fall of light is fitted to its flat frames ({told}).")
+        return Lens(self.calibrated, vignetting or (0.0, 0.0, 0.0))
+
+    def _measured_ambient(self) -> Image | None:
+        """Counts per second at gain 1 of the room's own light."""
+        frames = self._folder.frames_of(self.raw.name, "dark-room")
+        if not frames:
+            return None
+        total = np.zeros_like(self.exposure(frames[0]).signal)
+        for frame in frames:
+            total += self.exposure(frame).signal / np.float32(frame.exposure_s * frame.gain * len(frames))
+        return total
+
+
+def _unsaturated(exposure: Exposure) -> Image:
+    """Counts above black, NaN where full."""
+    return np.where(exposure.headroom > 0, exposure.signal, np.nan).astype(np.float32)
+
+
+def _alike(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
+    """Frames of one thing under one light with the same exposure."""
+    groups: dict[object, list[RawFrame]] = defaultdict(list)
+    for frame in frames:
+        groups[_scene(frame), frame.exposure_s, frame.gain, frame.level].append(frame)
+    return list(groups.values())
+
+
+def _ladders(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
+    """Frames of one thing under one light, one of each exposure, from the shortest to the longest."""
+    groups: dict[object, dict[float, RawFrame]] = defaultdict(dict)
+    for frame in frames:
+        groups[_scene(frame)].setdefault(frame.exposure_s * frame.gain * frame.level, frame)
+    return [[own[key] for key in sorted(own)] for own in groups.values()]
+
+
+def _scene(frame: RawFrame) -> tuple[str | None, ...]:
+    return frame.light, frame.place, frame.session

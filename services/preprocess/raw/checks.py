@@ -1,0 +1,150 @@
+"""What frames of a raw folder say against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.raw.records import RawFolder, RawFrame
+from services.preprocess.raw.merge import Exposure
+
+Image = NDArray[np.float32]
+
+SWAPPED_FACTOR = 1.5
+"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ by 10 %."""
+EXPOSURE_OFF = 1.5
+"""Factor by which a frame may be brighter or darker than another exposure of its light lets expect."""
+TELLING_SHARE = 0.01
+"""Of full scale: darker frames tell nothing of their exposure."""
+TELLING_CONTRAST = 0.2
+"""Standard deviation of a picture by its mean, from which on it is compared with another exposure of the same."""
+MIN_CORRELATION = 0.5
+"""Of two exposures of the same; 12 bits of noise leave 0.9, and a tooth that moved by a tenth of its width 0.7."""
+MIN_OTHERS = 2
+"""Frames that must agree before one is said to differ."""
+
+
+def missing_exposures(folder: RawFolder) -> Iterator[str]:
+    """A sentence for each camera and light that lacks an exposure which that camera's other lights have."""
+    for camera in folder.camera:
+        exposures: dict[str, set[float]] = {}
+        for frame in folder.frames_of(camera.name, "light"):
+            exposures.setdefault(str(frame.light), set()).add(frame.exposure_s * frame.gain)
+        usual = set.union(*exposures.values()) if exposures else set()
+        for light, own in exposures.items():
+            lacking = sorted(
+                value for value in usual - own if sum(value in one for one in exposures.values()) > len(exposures) / 2
+            )
+            if lacking:
+                files = ", ".join(one.file for one in folder.frames_of(camera.name, "light") if one.light == light)
+                yield (
+                    f"Camera {camera.name}, light {light} lacks the exposure of {lacking[0]:g} s that most lights have; its frames "
+                    f"are {files}."
+                )
+
+
+def require_like_colours(
+    earlier: list[tuple[str, float]],
+    channels: tuple[str, ...],
+    radiance: NDArray[np.float32],
+    frame: RawFrame,
+    camera: str,
+) -> None:
+    """Refuse a frame whose red and blue are exchanged against the camera's earlier ones; remembers its own.
+
+    Args:
+        earlier: file and red to blue of the frames before.
+        radiance: (N, C), in the order of ``channels``.
+
+    Raises:
+        CaptureInputError: names the frame.
+    """
+    if not {"red", "blue"} <= set(channels):
+        return
+    if not radiance.size:
+        return
+    red, blue = (float(np.abs(radiance[..., channels.index(one)]).mean(dtype=np.float64)) for one in ("red", "blue"))
+    if min(red, blue) <= 0:
+        return
+    ratio, usual = float(np.log(red / blue)), [value for _, value in earlier]
+    limit = float(np.log(SWAPPED_FACTOR))
+    if len(usual) >= MIN_OTHERS and np.ptp(usual) < limit and abs(np.median(usual)) > limit / 2:
+        middle = float(np.median(usual))
+        if abs(ratio - middle) > limit and abs(-ratio - middle) < limit / 2:
+            raise CaptureInputError(
+                f"Frame {frame.file} ({frame.label}) has {np.exp(ratio):.2g} times as much red as blue where {earlier[0][0]} has "
+                f"{np.exp(middle):.2g} times; its channels look exchanged, so export it like the others of camera {camera}."
+            )
+    earlier.append((frame.file, ratio))
+
+
+def require_like_exposures(
+    root: Path, frames: Sequence[RawFrame], exposures: Sequence[Exposure], channels: tuple[str, ...]
+) -> None:
+    """Refuse exposures of one light that contradict each other, channel by channel.
+
+    Args:
+        exposures: of the frames, (H, W) of a mosaic or (H, W, C) in the order of ``channels``.
+
+    Raises:
+        CaptureInputError: names the longer exposure's frame.
+    """
+    order = sorted(zip(frames, exposures, strict=True), key=lambda one: one[1].factor)
+    for (shorter, first), (longer, second) in pairwise(order):
+        what = f"Frame {root / longer.file} ({longer.label})"
+        off = _brighter(first, second.signal, second.headroom, second.factor)
+        if off is None:
+            continue
+        if np.abs(off).max() < np.log(EXPOSURE_OFF):
+            if not _shows_the_same(first, second):
+                raise CaptureInputError(
+                    f"{what} shows another picture than {shorter.file}; exchange its bytes, or correct its light or place."
+                )
+            continue
+        if first.signal.ndim == 3 and {"red", "blue"} <= set(channels):
+            swap = np.arange(len(channels))
+            red, blue = channels.index("red"), channels.index("blue")
+            swap[[red, blue]] = blue, red
+            against = _brighter(first, second.signal[..., swap], second.headroom[..., swap], second.factor)
+            if against is not None and np.abs(against).max() < np.log(EXPOSURE_OFF) / 2:
+                raise CaptureInputError(
+                    f"{what} has red and blue exchanged against {shorter.file}; export both with the same order of channels."
+                )
+        raise CaptureInputError(
+            f"{what} is {np.exp(off[np.argmax(np.abs(off))]):.3g} times as bright as {shorter.file} lets expect from exposure_s, "
+            "gain and level; correct these, or the order of its bytes, bits or channels."
+        )
+
+
+def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
+    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to tell."""
+    seen = (first.headroom > 0) & (headroom > 0)
+    count = np.atleast_1d(seen.sum(axis=(0, 1)))
+    if not count.all():
+        return None
+    means = [
+        np.atleast_1d(np.where(seen, one, 0).sum(axis=(0, 1), dtype=np.float64)) / count
+        for one in (first.signal, signal)
+    ]
+    full = float(np.max((headroom + signal)[seen]))
+    if not np.isfinite(full) or min(mean.min() for mean in means) < TELLING_SHARE * full:
+        return None
+    return np.asarray(np.log(means[1] / means[0] * first.factor / factor))
+
+
+def _shows_the_same(first: Exposure, second: Exposure) -> bool:
+    """Whether two exposures go up and down together, channels apart; pictures without contrast do not tell otherwise."""
+    seen = (first.headroom > 0) & (second.headroom > 0)
+    planes = [np.moveaxis(np.atleast_3d(image), -1, 0) for image in (first.signal, second.signal, seen)]
+    for a, b, usable in zip(*planes, strict=True):
+        shorter, longer = a[usable.astype(bool)].astype(np.float64), b[usable.astype(bool)].astype(np.float64)
+        if shorter.size < 2 or shorter.std() < TELLING_CONTRAST * abs(shorter.mean()) or longer.std() == 0:
+            continue
+        if np.corrcoef(shorter, longer)[0, 1] < MIN_CORRELATION:
+            return False
+    return True

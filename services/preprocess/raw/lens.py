@@ -1,0 +1,160 @@
+"""Lens distortion and the fall of light, taken out by resampling an image once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibrated import CalibratedCamera
+from services.preprocess.window import Window
+
+Image = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+EVEN = 2
+"""A mosaic's pattern repeats every two pixels, so what is cut out begins at even ones."""
+REACH_PX = 4
+"""Pixels around what is sampled that demosaicing and interpolation look at."""
+BEYOND_PX = 1e-3
+"""A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as much."""
+FLAT_BLOCK = 16
+"""Pixels along a block of a flat field, whose mean is fitted: the fall of light is smooth."""
+MIN_BLOCKS = 16
+"""Blocks along an image's shorter side at least, as far as it has pixels."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The lens of a calibrated camera.
+
+    Attributes:
+        vignetting: a, b, c of the fall of light; zeros where there is none.
+    """
+
+    camera: CalibratedCamera
+    vignetting: tuple[float, float, float]
+
+    def source(self, window: Window) -> Image | None:
+        """Where a window of the pinhole's image lies in the photograph: x, y (H, W, 2) as indices, centres at whole numbers.
+
+        None for a lens without distortion.
+        """
+        import cv2
+
+        if self.camera.distortion is None or not any(self.camera.distortion):
+            return None
+        # OpenCV's pixel centres are whole numbers, ours half ones.
+        K = np.asarray(self.camera.K, dtype=np.float64) - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        shown = K - np.array([[0, 0, window.left], [0, 0, window.top], [0, 0, 0]])
+        maps = cv2.initUndistortRectifyMap(
+            K, np.array(self.camera.distortion), None, shown, window.shape[::-1], cv2.CV_32FC1
+        )
+        return np.ascontiguousarray(np.stack(maps, axis=-1), dtype=np.float32)
+
+    def fall(self, x: Image, y: Image) -> Image | None:
+        """By how much an even source is dimmed at indices of the photograph; None where nowhere."""
+        if not any(self.vignetting):
+            return None
+        a, b, c = self.vignetting
+        q = squared_distance(self.camera, x + 0.5, y + 0.5)
+        return np.asarray(1 + q * (a + q * (b + q * c)), dtype=np.float32)
+
+
+class Sampler:
+    """Brings photographs to a window of the pinhole's image, distortion and motion in one interpolation.
+
+    Attributes:
+        region: the part of the photograph that is needed; it begins at even pixels.
+    """
+
+    def __init__(self, lens: Lens, window: Window) -> None:
+        self._lens, self._window, self._size = lens, window, lens.camera.size
+        self._source = lens.source(window)
+        needed = window
+        if self._source is not None:
+            (left, top), (right, bottom) = (bound(self._source.reshape(-1, 2), axis=0) for bound in (np.min, np.max))
+            needed = Window(
+                int(np.clip(top, 0, self._size[1] - 1)),
+                int(np.clip(np.ceil(bottom), 0, self._size[1] - 1)) + 1,
+                int(np.clip(left, 0, self._size[0] - 1)),
+                int(np.clip(np.ceil(right), 0, self._size[0] - 1)) + 1,
+            )
+        grown = needed.grown(REACH_PX, self._size)
+        self.region = Window(grown.top // EVEN * EVEN, grown.bottom, grown.left // EVEN * EVEN, grown.right)
+
+    @property
+    def is_still_exact(self) -> bool:
+        """Whether pixels of an unmoved subject are taken as they are."""
+        return self._source is None
+
+    def places(self, in_window: Image) -> Image:
+        """Indices x, y (2, H, W) of the photograph for indices of the window."""
+        import cv2
+
+        if self._source is None:
+            return in_window + np.array([self._window.left, self._window.top], dtype=np.float32)[:, None, None]
+        # The lens's map is smooth, and continued beyond the window by its edge.
+        x, y = np.ascontiguousarray(in_window, dtype=np.float32)
+        found = cv2.remap(self._source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.ascontiguousarray(np.moveaxis(found, -1, 0))
+
+    def sampled(self, image: Image, places: Image) -> Image:
+        """Values (H, W, C) of an image that holds ``region`` at indices of the photograph; 0 outside of it."""
+        import cv2
+
+        x, y = (
+            np.ascontiguousarray(places[k] - np.float32(start))
+            for k, start in ((0, self.region.left), (1, self.region.top))
+        )
+        planes = np.atleast_3d(image)
+        # OpenCV takes four channels at most at once.
+        parts = [
+            np.atleast_3d(cv2.remap(np.ascontiguousarray(planes[..., k : k + 4]), x, y, cv2.INTER_LINEAR))
+            for k in range(0, planes.shape[2], 4)
+        ]
+        return np.concatenate(parts, axis=2).astype(np.float32)
+
+    def beyond(self, places: Image) -> BoolArray:
+        """Which places mix in what lies beyond the photograph."""
+        (x, y), (width, height) = places, self._size
+        return np.asarray(
+            (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
+        )
+
+
+def squared_distance(camera: CalibratedCamera, x_px: NDArray[np.floating], y_px: NDArray[np.floating]) -> FloatArray:
+    """q: squared distance from the principal point in units of half the image's diagonal."""
+    width, height = camera.size
+    return np.asarray(
+        ((x_px - camera.K[0][2]) ** 2 + (y_px - camera.K[1][2]) ** 2) * 4 / (width**2 + height**2), dtype=np.float64
+    )
+
+
+def fitted_vignetting(camera: CalibratedCamera, flat: Image) -> tuple[float, float, float]:
+    """a, b, c of the fall of light from an image (H, W, C) of an even source, by least squares; channels share them.
+
+    Blocks with a pixel that is not finite count for nothing.
+    """
+    step = max(1, min(FLAT_BLOCK, *(length // MIN_BLOCKS for length in flat.shape[:2])))
+    height, width = (length // step * step for length in flat.shape[:2])
+    y, x = np.mgrid[0:height, 0:width]
+    q = squared_distance(camera, x + 0.5, y + 0.5)
+    terms = np.stack([_block_means(q**power, step) for power in range(4)], axis=1)
+    found, weights = [], []
+    for channel in range(flat.shape[2]):
+        values = _block_means(flat[:height, :width, channel], step)
+        usable = np.isfinite(values) & (values > 0)
+        scale, *rest = np.linalg.lstsq(terms[usable], values[usable], rcond=None)[0]
+        found.append(np.array(rest) / scale)
+        weights.append(usable.sum())
+    a, b, c = np.average(found, axis=0, weights=weights)
+    return float(a), float(b), float(c)
+
+
+def _block_means(image: NDArray[np.floating], step: int) -> FloatArray:
+    height, width = image.shape
+    blocks = image.reshape(height // step, step, width // step, step)
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64)).ravel()

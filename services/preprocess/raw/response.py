@@ -1,0 +1,125 @@
+"""How a camera's counts follow the light, from series of exposures of the same thing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+MIN_DEVIATION = 0.01
+"""Counts that are linear to one per cent are left as they are."""
+MIN_SIGMAS = 4.0
+"""A deviation less certain than this is noise."""
+MIN_SHARE = 0.02
+"""Of full scale: below it a block's mean is mostly what is left of black."""
+BLOCK = 16
+"""Pixels along a block's edge whose mean is compared."""
+MIN_BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class Series:
+    """Two exposures of the same thing.
+
+    Attributes:
+        shorter, longer: counts above black, (H, W) or (H, W, C); full pixels are NaN.
+        ratio: of exposure times gain times level, longer to shorter.
+    """
+
+    shorter: Image
+    longer: Image
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """What series of exposures tell.
+
+    Attributes:
+        ratios: (longer / shorter) / (ratio of the exposures) of every pair of blocks; 1 for a linear camera.
+        curve: a, b of linear = s (1 + a x + b x²), x = s / full; zeros where the camera is linear.
+    """
+
+    ratios: FloatArray
+    curve: tuple[float, float]
+    full: float
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether counts need no correction."""
+        return self.curve == (0.0, 0.0)
+
+    def linearised(self, signal: Image) -> Image:
+        """Counts above black in proportion to the light."""
+        if self.is_linear:
+            return signal
+        x = signal / np.float32(self.full)
+        a, b = (np.float32(value) for value in self.curve)
+        return np.asarray(signal * (1 + x * (a + x * b)), dtype=np.float32)
+
+
+def measure_linearity(series: Sequence[Series], full: float) -> Linearity:
+    """Compare exposures block by block, and fit a curve where they contradict a linear camera.
+
+    Args:
+        full: counts at saturation, which scale the curve.
+    """
+    pairs = [np.concatenate(found, axis=1) for found in [list(_blocks(one, full)) for one in series] if found]
+    if not pairs or sum(pair.shape[1] for pair in pairs) < MIN_BLOCKS:
+        return Linearity(np.empty(0), (0.0, 0.0), full)
+    shorter, longer, log_ratio = np.concatenate(pairs, axis=1)
+    observed = np.log(longer / shorter) - log_ratio
+    return Linearity(np.exp(observed), _curve(shorter / full, longer / full, observed), full)
+
+
+def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, float]:
+    """a, b such that log(f(y) / f(x)) equals the ratio of exposures, by Gauss-Newton; zeros unless clearly other than that."""
+    solution = np.zeros(2)
+    design = np.stack([y - x, y**2 - x**2], axis=1)
+    for _ in range(8):
+        at_x, at_y = (1 + v * (solution[0] + v * solution[1]) for v in (x, y))
+        if min(at_x.min(), at_y.min()) <= 0.1:
+            return 0.0, 0.0
+        design = np.stack([y / at_y - x / at_x, y**2 / at_y - x**2 / at_x], axis=1)
+        residual = observed + np.log(at_y / at_x)
+        # Blocks at edges that moved do not vote.
+        scale = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-6
+        weight = 1 / (1 + (residual / scale) ** 2)
+        normal = (design * weight[:, None]).T @ design + 1e-9 * np.eye(2)
+        step = np.linalg.solve(normal, -(design * weight[:, None]).T @ residual)
+        solution = solution + step
+        if np.abs(step).max() < 1e-6:
+            break
+    covariance = scale**2 * np.linalg.inv(normal)
+    levels = np.linspace(0, max(y.max(), x.max()), 16)[1:]
+    terms = np.stack([levels, levels**2], axis=1)
+    deviation, error = terms @ solution, np.sqrt(np.einsum("ij,jk,ik->i", terms, covariance, terms))
+    worst = int(np.argmax(np.abs(deviation)))
+    if abs(deviation[worst]) < MIN_DEVIATION or abs(deviation[worst]) < MIN_SIGMAS * error[worst]:
+        return 0.0, 0.0
+    return float(solution[0]), float(solution[1])
+
+
+def _blocks(series: Series, full: float) -> Iterator[FloatArray]:
+    """Means of blocks that are seen whole by both exposures, and the logarithm of their ratio: (3, N) a channel."""
+    shorter, longer = (np.atleast_3d(image) for image in (series.shorter, series.longer))
+    edge = max(1, min(BLOCK, shorter.shape[0] // 2, shorter.shape[1] // 2))
+    height, width = (length // edge * edge for length in shorter.shape[:2])
+    for channel in range(shorter.shape[2]):
+        means = [
+            image[:height, :width, channel]
+            .reshape(height // edge, edge, width // edge, edge)
+            .astype(np.float64)
+            .mean(axis=(1, 3))
+            .ravel()
+            for image in (shorter, longer)
+        ]
+        usable = np.isfinite(means[0]) & np.isfinite(means[1]) & (np.minimum(*means) > MIN_SHARE * full)
+        if usable.any():
+            a, b = means[0][usable], means[1][usable]
+            yield np.stack([a, b, np.full(len(a), np.log(series.ratio))])
