@@ -84,6 +84,15 @@ class FolderSource:
         name = self.description.cameras[camera].name
         return tuple(k for k, light in enumerate(self.description.lights) if (name, light.name) in self._entries)
 
+    def identity(self) -> str:
+        """See ``Source``: every image's size and time of change, so that one that was exported again counts."""
+        lines = [self.description.model_dump_json(), repr(self._noise)]
+        for entry in self._entries.values():
+            for file in filter(None, (entry.file, entry.variance_file)):
+                told = self._path(file).stat()
+                lines.append(f"{file} {told.st_size} {told.st_mtime_ns}")
+        return "\n".join(lines)
+
     def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``; images of a folder are taken to show the subject unmoved."""
         return ()

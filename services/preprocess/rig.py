@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.calibration import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
-from services.core.store import StoredArray
+from services.core.store import MANIFEST, StoredArray
 from services.preprocess.motion import Displacement, ViewMotion, frames_to_match, jaws
 from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import write_array
@@ -72,6 +72,10 @@ class RigSource:
     def lights_of(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``; every camera sees every light."""
         return tuple(range(len(self._frames)))
+
+    def identity(self) -> str:
+        """See ``Source``; the manifest of a published capture holds a checksum of every file."""
+        return self.description.model_dump_json() + (self.root / MANIFEST).read_text()
 
     def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``."""

@@ -88,6 +88,9 @@ class Source(Protocol):
     def lights_of(self, camera: int) -> tuple[int, ...]:
         """Indices of the lights this camera has an image of."""
 
+    def identity(self) -> str:
+        """A text that changes whenever a file does that the images are made of."""
+
     def matched(self, camera: int) -> tuple[int, ...]:
         """Numbers of the frames whose motion is to be measured; none where motion is not measured."""
 

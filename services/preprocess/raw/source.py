@@ -59,6 +59,15 @@ class RawSource:
         lit = {frame.light for frame in self._of(self.description.cameras[camera].name) if frame.kind == "light"}
         return tuple(k for k, light in enumerate(self.description.lights) if light.name in lit)
 
+    def identity(self) -> str:
+        """See ``Source``: every frame's size and time of change, so that one that was exported again counts."""
+        lines = [self.description.model_dump_json(), self._folder.model_dump_json(), repr(self._noise)]
+        lines.append(self._calibration.model_dump_json())
+        for frame in self._folder.frame:
+            if (path := self.root / frame.file).is_file():
+                lines.append(f"{frame.file} {path.stat().st_size} {path.stat().st_mtime_ns}")
+        return "\n".join(lines)
+
     def matched(self, camera: int) -> tuple[int, ...]:
         """See ``Source``."""
         return tuple(row.index for row in frames_to_match(self._table(self.description.cameras[camera].name)))

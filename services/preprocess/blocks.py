@@ -1,0 +1,171 @@
+"""The blocks that a preparation is made of. Each is one Dask task; it skips what is done already, so any of them may run again.
+
+::
+
+    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights)
+
+One block writes an image's shards and no other does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+
+from services.core.records import JobSpec, MaskBit
+from services.core.stage import LocalContext
+from services.preprocess.brightness import light_of
+from services.preprocess.masks import HandMasks
+from services.preprocess.motion import stored_step
+from services.preprocess.opening import open_source
+from services.preprocess.quality import assess, write_picture
+from services.preprocess.records import FrameMotion, ImageDone
+from services.preprocess.source import LightImage, Source, View
+from services.preprocess.subject import NOTHING, Subject, read_subject
+from services.preprocess.valid import require_seen, valid_bits
+from services.preprocess.workshop import Workshop
+
+Step = Literal["look", "match", "develop"]
+BLOCKS_PER_THREAD = 4
+"""So many blocks for each thread leave none without work for long at the end."""
+LARGEST_BLOCK = 8
+"""Images; more would make progress and a cancel wait."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One step for some frames or lights of one camera.
+
+    Attributes:
+        items: frame numbers of ``match``, light indices of ``develop``.
+    """
+
+    spec: JobSpec
+    workshop: Workshop
+    step: Step
+    camera: int
+    items: tuple[int, ...] = ()
+
+    def __call__(self) -> None:
+        """Do what is not done yet.
+
+        Raises:
+            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` say. JobCancelledError. FencedError: another attempt has begun.
+        """
+        context = LocalContext(self.workshop.writer.root, self.workshop.writer.attempt)
+        context.raise_if_cancelled()
+        self.workshop.writer.require_lease()
+        source = open_source(self.spec, context.root, verify=False)
+        subject = read_subject(source.root, whole=self.spec.kind == "jaw")
+        if self.step == "look":
+            _look(self.workshop, source, subject, self.camera)
+            return
+        view = self.workshop.view(self.camera, source.description.cameras[self.camera])
+        assert view is not None, "blocks that need a view wait for it"
+        if self.step == "match":
+            for frame, coefficients in source.match(view, self.items):
+                motion = FrameMotion(coefficients=coefficients.tolist())
+                self.workshop.put_motion(self.camera, frame, motion)
+                context.raise_if_cancelled()
+            return
+        lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
+        motions = self.workshop.motions(self.camera, source.matched(self.camera))
+        desk = _Desk(self.workshop, source, subject, HandMasks(context.root, source.description), view)
+        began_s = time.monotonic()
+        for light, image in source.images(view, lights, motions):
+            self.workshop.put_image(self.camera, light, desk.store(light, image, began_s))
+            context.raise_if_cancelled()
+            began_s = time.monotonic()
+
+
+def blocks_of(
+    spec: JobSpec, workshop: Workshop, step: Step, items: Sequence[Sequence[int]], threads: int
+) -> tuple[Block, ...]:
+    """One step for some frames or lights of each camera, in as many blocks as keep all threads busy."""
+    size = -(-sum(len(own) for own in items) // (BLOCKS_PER_THREAD * threads))
+    size = min(max(size, 1), LARGEST_BLOCK)
+    return tuple(
+        Block(spec, workshop, step, camera, tuple(own[k : k + size]))
+        for camera, own in enumerate(items)
+        for k in range(0, len(own), size)
+    )
+
+
+def images_of(block: Block, workshop: Workshop) -> Iterator[ImageDone]:
+    """What a block has made."""
+    workshop.writer.require_lease()
+    for light in block.items:
+        done = workshop.image(block.camera, light)
+        assert done is not None, "a block has ended once its images are stored"
+        yield done
+
+
+def _array(workshop: Workshop, name: str) -> zarr.Array[Any]:
+    return zarr.open_array(workshop.folder / "prepared.zarr" / name, mode="r+")
+
+
+def _look(workshop: Workshop, source: Source, subject: Subject, camera: int) -> None:
+    """Find a camera's window and footprint; what has no image is said to be unlit."""
+    whole = source.description.cameras[camera]
+    view = subject.view_of(camera, whole)
+    require_seen(view.footprint, len(subject.teeth), whole)
+    surface, valid = (_array(workshop, name) for name in ("surface", "valid"))
+    labels = np.full(surface.shape[1:], NOTHING, dtype=np.int16)
+    labels[view.window.rows, view.window.columns] = view.footprint.mesh
+    surface[camera] = labels
+    for light in sorted(set(range(valid.shape[1])) - set(source.lights_of(camera))):
+        valid[camera, light] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
+    workshop.put_view(view)
+
+
+@dataclass(frozen=True)
+class _Desk:
+    """All that a camera's images need to be judged and stored."""
+
+    workshop: Workshop
+    source: Source
+    subject: Subject
+    masks: HandMasks
+    view: View
+
+    def store(self, light: int, image: LightImage, began_s: float) -> ImageDone:
+        """Mask one image, store it and say what it is."""
+        camera, lamp = self.view.whole, self.source.description.lights[light]
+        footprint, window = self.view.footprint, self.view.window
+        bits = valid_bits(image, footprint, self.view.camera, lamp, self.subject.glossy(footprint))
+        bits |= self.masks.bits(camera.name, lamp.name, camera.size)[window.rows, window.columns]
+        shown = light_of(image, self.view, lamp, (bits == 0) & (footprint.mesh < len(self.subject.teeth)))
+        if shown is not None and shown.dark:
+            bits |= np.uint16(MaskBit.UNLIT)
+        self._write(light, image, bits)
+        picture = self.workshop.folder / "quality" / f"{camera.name}_{lamp.name}.png"
+        write_picture(picture, image.radiance, bits)
+        return ImageDone(
+            quality=assess(camera.name, lamp.name, bits, footprint.covered, image.motion_px),
+            tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
+            light=shown,
+            notes=self.source.notes,
+            files=self.workshop.files_of(self.view.number, light, picture),
+            seconds=time.monotonic() - began_s,
+        )
+
+    def _write(self, light: int, image: LightImage, bits: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]) -> None:
+        place, window = (self.view.number, light), self.view.window
+        for name, values in (("radiance", image.radiance), ("variance", image.variance)):
+            _array(self.workshop, name)[*place, window.rows, window.columns] = values
+        valid = _array(self.workshop, "valid")
+        whole = np.full(valid.shape[2:], MaskBit.OUTSIDE, dtype=np.uint16)
+        whole[window.rows, window.columns] = bits
+        valid[place] = whole
+        if image.displacement is None:
+            return
+        motion = _array(self.workshop, "motion")
+        step = stored_step((valid.shape[2], valid.shape[3]))
+        top, left = -(-window.top // step), -(-window.left // step)
+        rows, columns = image.displacement.shape[:2]
+        motion[*place, top : top + rows, left : left + columns] = image.displacement

@@ -1,0 +1,85 @@
+"""What a preparation is to make, before any pixel is read."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from services.core.errors import SettingsError
+from services.core.records import JobSpec
+from services.core.store import create_array
+from services.preprocess.masks import HandMasks
+from services.preprocess.motion import stored_step
+from services.preprocess.source import Source
+
+FORMAT = 2
+"""Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
+INDIFFERENT = frozenset({"workers", "priority"})
+"""Options that change no pixel."""
+CHUNK_PX = 1024
+"""Edge of the pieces of a shard: what is read or left empty at once."""
+
+
+def create_arrays(store: Path, source: Source) -> None:
+    """Radiance, variance, valid, surface and, where it is measured, motion; one shard per image, so that each has one writer."""
+    description = source.description
+    height, width = (max(camera.size[axis] for camera in description.cameras) for axis in (1, 0))
+    planes = (len(description.cameras), len(description.lights), height, width)
+    channels = len(description.channels)
+    stack = ("camera", "light", "y", "x")
+    chunk = min(CHUNK_PX, height), min(CHUNK_PX, width)
+    padded = tuple(-(-n // edge) * edge for n, edge in zip((height, width), chunk, strict=True))
+    for name in ("radiance", "variance"):
+        create_array(
+            store,
+            name,
+            (*planes, channels),
+            (1, 1, *padded, channels),
+            "float32",
+            (*stack, "channel"),
+            chunk=(1, 1, *chunk, channels),
+            codec="lz4",
+        )
+    create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
+    create_array(store, "surface", (planes[0], height, width), (1, height, width), "int16", ("camera", "y", "x"))
+    if not source.measures_motion:
+        return
+    step = stored_step((height, width))
+    grid = (-(-height // step), -(-width // step))
+    motion = create_array(store, "motion", (*planes[:2], *grid, 2), (1, 1, *grid, 2), "float32", (*stack, "axis"))
+    motion.attrs["step_px"] = step
+
+
+def digest_of_inputs(spec: JobSpec, source: Source, masks: HandMasks) -> str:
+    """SHA-256 of all that the store depends on: another one means that nothing made so far can be gone on with."""
+    digest = hashlib.sha256()
+    parts = [str(FORMAT), spec.model_dump_json(exclude=set(INDIFFERENT)), source.identity(), masks.digest]
+    for path in sorted(source.root.rglob("*.ply")):
+        parts += [path.relative_to(source.root).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
+    for part in parts:
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+def held_out_images(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...]:
+    """(camera, light) pairs kept from the fit: as the job says, else as the capture marks, else every fourth light.
+
+    Raises:
+        SettingsError: a light is unknown, or none is left to fit.
+    """
+    names = [light.name for light in source.description.lights]
+    if spec.held_out_lights is None and source.held_out:
+        return source.held_out
+    chosen = spec.held_out_lights if spec.held_out_lights is not None else tuple(names[3::4])
+    if unknown := [name for name in chosen if name not in names]:
+        raise SettingsError(
+            f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it."
+        )
+    if set(chosen) == set(names):
+        raise SettingsError("Option 'held_out_lights' keeps every light from the fit; leave at least one to it.")
+    return tuple(
+        (camera.name, names[j])
+        for k, camera in enumerate(source.description.cameras)
+        for j in source.lights_of(k)
+        if names[j] in chosen
+    )

@@ -1,0 +1,46 @@
+"""What the blocks of a preparation leave behind, one record a thing, so that nothing that is done is done again."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from services.core.geometry import Record
+from services.preprocess.brightness import ImageLight
+from services.preprocess.quality import ImageQuality
+from services.preprocess.window import Window
+
+
+class ViewDone(Record):
+    """One camera's view was found; its footprint lies beside this."""
+
+    window: tuple[int, int, int, int] = Field(description="top, bottom, left, right in pixels of the whole image")
+
+    def of(self) -> Window:
+        """The window."""
+        return Window(*self.window)
+
+
+class FrameMotion(Record):
+    """One frame's motion was measured."""
+
+    coefficients: tuple[tuple[tuple[float, float], ...], ...] = Field(
+        description="(bodies, terms, 2) of the displacement in pixels since the first frame"
+    )
+
+
+class StoredFile(Record):
+    """A file of an image, as it was written."""
+
+    bytes: int
+    sha256: str
+
+
+class ImageDone(Record):
+    """One image was prepared and stored."""
+
+    quality: ImageQuality
+    tooth_pixels: tuple[int, ...] = Field(description="valid pixels that show each tooth")
+    light: ImageLight | None
+    files: dict[str, StoredFile] = Field(description="by path in the stage's folder")
+    notes: tuple[str, ...] = Field(default=(), description="what the source said of the camera when it read the image")
+    seconds: float = Field(description="how long it took")

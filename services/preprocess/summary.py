@@ -1,0 +1,102 @@
+"""What all images of a preparation come to: refusals, notes, the quality report and the stage's record."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import teeth_folder
+from services.core.records import PreparedManifest
+from services.core.stage import StageContext, StageEvent
+from services.core.store import write_record
+from services.preprocess.brightness import Brightness
+from services.preprocess.quality import QualityReport, unusable_note
+from services.preprocess.records import ImageDone
+from services.preprocess.source import Source
+from services.preprocess.subject import Subject
+from services.preprocess.workshop import Workshop
+
+Known = dict[str, tuple[int, str]]
+"""Size and SHA-256 of files by their path in the store."""
+
+
+def summarise(
+    workshop: Workshop,
+    source: Source,
+    subject: Subject,
+    held_out: tuple[tuple[str, str], ...],
+    masks: str,
+    context: StageContext,
+) -> tuple[PreparedManifest, Known]:
+    """Judge the capture as a whole and write what goes with the store.
+
+    Args:
+        held_out: (camera, light) pairs kept from the fit.
+        masks: digest of the masks by hand.
+
+    Raises:
+        CaptureInputError: no pixel is valid, or no tooth is as bright as these. FencedError: another attempt has begun.
+    """
+    workshop.writer.require_lease()
+    images = _images(workshop, source)
+    reports, brightness = [done.quality for done in images], Brightness()
+    for done in images:
+        brightness.add(done.quality.camera, done.quality.light, done.light)
+    seen = np.sum([done.tooth_pixels for done in images], axis=0)
+    valid_pixels = sum(report.valid_pixels for report in reports)
+    if valid_pixels == 0:
+        what = "is dark: no tooth is above the noise" if brightness.dark else "lacks a valid tooth pixel"
+        raise CaptureInputError(
+            f"Every image of {source.root} {what}; check exposure, lights, noise and masks, then capture again."
+        )
+    brightness.require_plausible()
+    fdi = tuple(tooth.fdi for tooth in subject.teeth)
+    # What a source finds out while it reads is told once
+    told = dict.fromkeys([*source.notes, *(note for done in images for note in done.notes)])
+    notes = [*told, *brightness.notes(), *unusable_note(reports)]
+    if hidden := [str(number) for number, count in zip(fdi, seen, strict=True) if count == 0]:
+        notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
+    for note in notes:
+        context.report(StageEvent(stage="prepare", kind="log", message=note))
+    write_record(workshop.folder / "quality.json", QualityReport(images=tuple(reports)))
+    _copy_meshes(source.root, workshop.folder, fdi)
+    # What a kill has left of a file that was being written
+    for partial in workshop.folder.rglob("*.partial"):
+        partial.unlink()
+    motions = [report.motion_px for report in reports if report.motion_px is not None]
+    manifest = PreparedManifest(
+        channels=source.description.channels,
+        cameras=source.description.cameras,
+        lights=source.description.lights,
+        held_out=held_out,
+        fdi=fdi,
+        dentin_known=tuple(tooth.fdi for tooth in subject.teeth if tooth.dentin is not None),
+        gums=subject.whole and subject.gums is not None,
+        cavity=subject.whole and subject.cavity is not None,
+        tooth_pixels=tuple(seen.tolist()),
+        median_motion_px=float(np.median(motions)) if motions else None,
+        uncertainty=source.description.uncertainty,
+        masks=masks,
+        notes=tuple(notes),
+        valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),
+    )
+    known = {name: (one.bytes, one.sha256) for done in images for name, one in done.files.items()}
+    return manifest, known
+
+
+def _images(workshop: Workshop, source: Source) -> list[ImageDone]:
+    """All images, in the order of cameras and lights, whichever was done first."""
+    found = [workshop.image(k, j) for k in range(len(source.description.cameras)) for j in source.lights_of(k)]
+    assert all(done is not None for done in found), "every block has ended"
+    return [done for done in found if done is not None]
+
+
+def _copy_meshes(source: Path, target: Path, fdi: tuple[int, ...]) -> None:
+    wanted = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
+    for relative in [*wanted, Path("gums.ply"), Path("cavity.ply")]:
+        if (source / relative).is_file():
+            (target / relative).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / relative, target / relative)

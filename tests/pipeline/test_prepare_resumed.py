@@ -1,0 +1,220 @@
+"""A preparation that is cut off anywhere and gone on with leaves the very store that an undisturbed one leaves, here and on workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+
+from services.core.errors import FencedError
+from services.core.placement import STAGES, UNLIMITED
+from services.core.records import JobSpec
+from services.core.stage import LocalContext, StageEvent
+from services.core.store import StageWriter
+from services.preprocess import blocks, workshop
+from services.preprocess.stage import run
+from tests.support.folder_captures import write_folder, write_tree
+
+KILLS = 50
+
+
+class KilledError(BaseException):
+    """In place of a kill: nothing catches it."""
+
+
+def contents(root: Path) -> dict[str, Any]:
+    """Every file of the published store, and its manifest but for the number of the attempt."""
+    folder = root / "prepared"
+    files: dict[str, Any] = {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+    manifest = json.loads(files.pop("manifest.json"))
+    del manifest["attempt"]
+    return {**files, "manifest": manifest}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A folder capture and what becomes of it."""
+    capture, root = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("whole")
+    write_folder(capture)
+    run(JobSpec(capture=capture), LocalContext(root))
+    return capture, contents(root)
+
+
+def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
+    """Kill at the n-th of the writes: each begins or ends with one of these calls."""
+    count = 0
+
+    def counted(original: Any, *, after: bool) -> Any:
+        def wrapped(*args: Any, **options: Any) -> Any:
+            nonlocal count
+            count += 1
+            if count == at and not after:
+                raise KilledError
+            made = original(*args, **options)
+            if count == at:
+                raise KilledError
+            return made
+
+        return wrapped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workshop, "write_atomic", counted(workshop.write_atomic, after=False))
+        patch.setattr(workshop, "write_array", counted(workshop.write_array, after=True))
+        patch.setattr(blocks, "_array", counted(blocks._array, after=False))
+        patch.setattr(blocks, "write_picture", counted(blocks.write_picture, after=True))
+        patch.setattr(StageWriter, "publish", counted(StageWriter.publish, after=False))
+        yield
+
+
+def test_killed_at_any_write(
+    undisturbed: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Killed after a few writes, and the next attempt likewise, until one ends; finding one camera's view takes seven of them."""
+    capture, expected = undisturbed
+    attempts = 0
+    for attempt in range(1, 20):
+        attempts = attempt
+        killing = calls(monkeypatch, at=8 + attempt % 2)
+        next(killing)
+        try:
+            run(JobSpec(capture=capture), LocalContext(tmp_path, attempt))
+        except KilledError:
+            continue
+        finally:
+            next(killing, None)
+        break
+    assert attempts > 4
+    assert contents(tmp_path) == expected
+    assert not (tmp_path / workshop.WORK).exists()
+
+
+@pytest.mark.parametrize("at", [1, 6, 12, 17])
+def test_killed_once(
+    undisturbed: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at: int
+) -> None:
+    capture, expected = undisturbed
+    killing = calls(monkeypatch, at)
+    next(killing)
+    with pytest.raises(KilledError):
+        run(JobSpec(capture=capture), LocalContext(tmp_path, 1))
+    next(killing, None)
+    run(JobSpec(capture=capture), LocalContext(tmp_path, 2))
+    assert contents(tmp_path) == expected
+
+
+def test_what_was_made_of_other_images_is_made_anew(undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    write_folder(tmp_path / "capture")
+    told: list[StageEvent] = []
+
+    def cut_off(event: StageEvent) -> None:
+        told.append(event)
+        if event.kind == "progress":
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        run(JobSpec(capture=tmp_path / "capture"), LocalContext(tmp_path / "job", 1, cut_off))
+    image = tmp_path / "capture" / "front_left.npy"
+    np.save(image, 2 * np.load(image))
+    os.utime(image, ns=(0, 0))
+    told.clear()
+    run(JobSpec(capture=tmp_path / "capture"), LocalContext(tmp_path / "job", 2, told.append))
+    assert sum(event.kind == "progress" for event in told) == 4
+    assert not [event for event in told if "already" in event.message]
+    run(JobSpec(capture=tmp_path / "capture"), LocalContext(tmp_path / "other", 1))
+    assert contents(tmp_path / "job") == contents(tmp_path / "other")
+
+
+def test_an_attempt_that_was_overtaken_records_nothing(
+    undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    capture, expected = undisturbed
+
+    def overtake(event: StageEvent) -> None:
+        if event.kind == "progress":
+            run(JobSpec(capture=capture), LocalContext(tmp_path, 2))
+
+    with pytest.raises(FencedError):
+        run(JobSpec(capture=capture), LocalContext(tmp_path, 1, overtake))
+    assert contents(tmp_path) == expected
+
+
+def test_on_workers(undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """Blocks of a stage that runs as a Dask task are tasks of the same cluster; the store is the same."""
+    capture, expected = undisturbed
+    with (
+        LocalCluster(
+            n_workers=1,
+            threads_per_worker=2,
+            processes=False,
+            dashboard_address=None,
+            resources={STAGES: UNLIMITED},
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        stage = client.submit(
+            run, JobSpec(capture=capture), LocalContext(tmp_path), key="prepare-1", resources={STAGES: 1}
+        )
+        stage.result(timeout=60)
+        made = {str(row[0]) for row in cluster.scheduler.transition_log if str(row[0]).startswith("prepare-1-block-")}
+    # Two cameras are looked at, two blocks a camera follow
+    assert len(made) >= 4
+    assert contents(tmp_path) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_killed_at_random(tmp_path: Path) -> None:
+    """12 frames of 2 megapixels; a process is killed by signal 9 at random moments, 50 times in all."""
+    rng, capture = random.Random(7), tmp_path / "capture"
+    capture.mkdir()
+    tree = write_folder(capture)
+    size = (1632, 1224)
+    tree["images"] = []
+    tree["cameras"] = [{**tree["cameras"][0], "size": size, "K": [[120_000, 0, 816], [0, 120_000, 612], [0, 0, 1]]}]
+    tree["lights"] = [{**tree["lights"][0], "name": f"l{k}"} for k in range(12)]
+    noise = np.random.default_rng(1)
+    for light in tree["lights"]:
+        file = f"{light['name']}.npy"
+        np.save(capture / file, noise.uniform(0.5, 1, (size[1], size[0], 2)).astype(np.float32))
+        tree["images"].append({"camera": tree["cameras"][0]["name"], "light": light["name"], "file": file})
+    write_tree(capture, tree)
+    code = (
+        "import sys; from pathlib import Path; from services.core.records import JobSpec; "
+        "from services.core.stage import LocalContext; from services.preprocess.stage import run; "
+        "run(JobSpec(capture=Path(sys.argv[1])), LocalContext(Path(sys.argv[2]), int(sys.argv[3])))"
+    )
+
+    def start(root: Path, attempt: int) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-c", code, str(capture), str(root), str(attempt)])
+
+    began_s = time.monotonic()
+    assert start(tmp_path / "whole", 1).wait() == 0
+    whole_s, kills, round_number = time.monotonic() - began_s, 0, 0
+    expected = contents(tmp_path / "whole")
+    while kills < KILLS:
+        round_number += 1
+        root = tmp_path / f"round{round_number}"
+        for attempt in range(1, 1000):
+            child = start(root, attempt)
+            try:
+                assert child.wait(rng.uniform(0, whole_s)) == 0
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+                kills += 1
+                continue
+            break
+        assert contents(root) == expected
