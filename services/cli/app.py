@@ -54,6 +54,7 @@ def build_app() -> typer.Typer:
     from services.cli.dask import add_dask_commands
     from services.cli.dome_sim import dome_sim
     from services.cli.export import export
+    from services.cli.import_folder import import_command
     from services.cli.phantom import phantom
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
@@ -76,6 +77,7 @@ def build_app() -> typer.Typer:
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     app.command("sphere")(sphere_command)
+    app.command("import")(import_command)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)
@@ -86,7 +88,14 @@ def build_app() -> typer.Typer:
 
 
 _EXTRAS = MappingProxyType(
-    {"serve": "api", "token": "api", "capture": "capture", "dome-sim": "capture", "bench": "worker,bench"}
+    {
+        "serve": "api",
+        "token": "api",
+        "capture": "capture",
+        "dome-sim": "capture",
+        "bench": "worker,bench",
+        "import": "preprocess",
+    }
 )
 """What a command needs beside the base installation; of those that are not named here all that a worker has."""
 

@@ -156,7 +156,7 @@ def test_lights_without_an_image_are_told(tmp_path: Path) -> None:
 
 def test_neither_folder_nor_store(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CaptureInputError, match=r"holds neither capture\.json nor a published capture"):
+    with pytest.raises(CaptureInputError, match=r"holds neither capture\.json, raw\.toml nor a published capture"):
         prepare(tmp_path / "empty", tmp_path / "job")
     with pytest.raises(CaptureInputError, match=r"capture\.json does not exist"):
         prepare(tmp_path / "absent", tmp_path / "job")

@@ -1,0 +1,223 @@
+"""A folder of named files as a raw folder: ``raw.toml`` from their names and what the first file of each camera holds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from services.capture.raw.names import NamedFrame, named_frame
+from services.core.errors import CaptureInputError
+from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
+from services.core.raw.folder import DESCRIPTION, parse_raw_folder
+from services.core.raw.records import THING_OF, RawFolder
+from services.core.store import write_atomic
+
+IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
+DEPTHS = (8, 10, 12, 14, 16)
+"""Bits that analogue-to-digital converters of cameras have."""
+LOOKED_AT = 8
+"""Frames of a camera that are read to tell its bits."""
+MIN_TRACKING = 4
+"""A smooth motion is followed from four frames on."""
+MOST_NAMED = 5
+Entry = dict[str, Any]
+_THINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "board": (
+            "[[board]]",
+            'name = "board"',
+            'type = "charuco"',
+            "squares = [?, ?]",
+            "square_mm = ?",
+            "marker_mm = ?",
+            'dictionary = "DICT_5X5_100"',
+        ),
+        "mirror-sphere": ("[[sphere]]", 'name = "mirror-sphere"', 'kind = "mirror"', "radius_mm = ?"),
+        "white-sphere": (
+            "[[sphere]]",
+            'name = "white-sphere"',
+            'kind = "white"',
+            "radius_mm = ?",
+            "reflectance = [?, ?, ?]",
+        ),
+        "chart": ("[[chart]]", 'name = "chart"', 'type = "colorchecker-24"', 'reference = "?.csv"'),
+    }
+)
+"""What a person has to measure of each thing, as ``raw.toml`` asks for it."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was made of a folder.
+
+    Attributes:
+        folder: what ``raw.toml`` says now. missing: what a preparation lacks, or would be better with, one sentence each.
+    """
+
+    folder: RawFolder
+    missing: tuple[str, ...]
+
+
+def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, calibration: Path | None) -> Imported:
+    """Write ``root/raw.toml``.
+
+    Args:
+        exposure_s: of files whose names say none.
+        mosaic: of cameras whose files hold one number a pixel, and do not tell themselves.
+        calibration: of the rig.
+
+    Raises:
+        CaptureInputError: there is a description already, no file can be understood, or files of a camera differ; names the file.
+    """
+    if (root / DESCRIPTION).exists():
+        raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
+    files = sorted(
+        p.relative_to(root).as_posix() for p in root.rglob("*") if p.suffix.lower() in IMAGES and p.is_file()
+    )
+    if not files:
+        raise CaptureInputError(
+            f"{root} holds no photograph; put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there."
+        )
+    told = {file: named_frame(file) for file in files}
+    frames = [one for one in told.values() if isinstance(one, NamedFrame)]
+    unnamed = [
+        f"File {file} {why}, so it is left out; rename it, such as left_L07_0.05s.tif."
+        for file, why in told.items()
+        if isinstance(why, str)
+    ]
+    if not frames:
+        raise CaptureInputError(unnamed[0].replace(", so it is left out", ""))
+    if exposure_s is None and (silent := next((one for one in frames if one.exposure_s is None), None)) is not None:
+        raise CaptureInputError(
+            f"File {silent.file} does not say its exposure; rename it, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
+        )
+    content = _written(_tree(root, frames, exposure_s, mosaic, calibration)) + _to_complete(frames, exposure_s)
+    folder = parse_raw_folder(content, str(root / DESCRIPTION))
+    write_atomic(root / DESCRIPTION, content)
+    things = sorted({THING_OF[one.kind] for one in frames if one.kind in THING_OF})
+    of_things = [
+        f"Frames of a {thing} are written as comments, since its measures are not known; give them in raw.toml and take the # away."
+        for thing in things
+    ]
+    return Imported(folder, (*unnamed, *of_things, *_missing(root, folder)))
+
+
+def _tree(
+    root: Path, frames: Sequence[NamedFrame], exposure_s: float | None, mosaic: str | None, calibration: Path | None
+) -> Entry:
+    cameras = dict.fromkeys(one.camera for one in frames)
+    lights = sorted({one.light for one in frames if one.light is not None})
+    tree: Entry = {"units": "mm"}
+    if calibration is not None:
+        tree["calibration"] = {"file": os.path.relpath(calibration, root)}
+    tree["camera"] = [_camera(root, name, [one for one in frames if one.camera == name], mosaic) for name in cameras]
+    tree["light"] = [{"name": name} for name in lights]
+    tree["frame"] = [_frame(one, exposure_s) for one in frames if one.kind not in THING_OF]
+    return tree
+
+
+def _frame(one: NamedFrame, exposure_s: float | None) -> Entry:
+    entry: Entry = {"camera": one.camera, "file": one.file, "kind": one.kind}
+    entry["exposure_s"] = exposure_s if one.exposure_s is None else one.exposure_s
+    if one.light is not None:
+        entry["light"] = one.light
+    if one.gain != 1.0:
+        entry["gain"] = one.gain
+    return entry
+
+
+def _camera(root: Path, name: str, frames: Sequence[NamedFrame], mosaic: str | None) -> Entry:
+    """Size, bits, mosaic and channels of a camera, from some of its files."""
+    # Frames with the most light tell best how many bits there are.
+    bright = sorted(frames, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:LOOKED_AT]
+    decoded = [_decoded(root, one) for one in bright]
+    first = decoded[0]
+    height, width = first.values.shape[:2]
+    entry: Entry = {"name": name, "size": [width, height]}
+    channels = 1 if first.values.ndim == 2 else first.values.shape[2]
+    if first.pattern is not None or (channels == 1 and mosaic is not None):
+        entry["mosaic"] = first.pattern or mosaic
+    elif channels != 3:
+        entry["channels"] = ["grey"] if channels == 1 else [f"channel{k}" for k in range(channels)]
+    if np.issubdtype(first.values.dtype, np.integer):
+        entry |= _bits([one.values for one in decoded])
+    return entry
+
+
+def _decoded(root: Path, frame: NamedFrame) -> Decoded:
+    try:
+        return decode(root / frame.file)
+    except ValueError as problem:
+        raise CaptureInputError(f"File {root / frame.file} {problem}.") from problem
+
+
+def _bits(images: Iterable[np.ndarray]) -> Entry:
+    """Bits and shift of whole numbers: low bits that are never set carry nothing."""
+    used, most = 0, 0
+    for values in images:
+        used |= int(np.bitwise_or.reduce(values.ravel().astype(np.uint16)))
+        most = max(most, 8 * values.dtype.itemsize)
+    shift = (used & -used).bit_length() - 1 if most == 16 and used else 0
+    depth = next(bits for bits in DEPTHS if bits >= (used >> shift).bit_length()) if used else most
+    if shift and depth + shift != most:
+        shift, depth = 0, next(bits for bits in DEPTHS if bits >= used.bit_length())
+    return {"bits": depth} | ({"shift": shift} if shift else {})
+
+
+def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
+    lit = {frame.light for frame in folder.frame if frame.kind == "light"}
+    for camera in folder.camera:
+        name = camera.name
+        if camera.bits is not None:
+            yield f"Camera {name} is taken to have {camera.bits} bits, by its largest count; correct bits where that is wrong."
+        if camera.channels == ("grey",):
+            yield f"Camera {name} has one number a pixel and is taken to have no colours; give --mosaic if it has."
+        if not folder.frames_of(name, "black"):
+            yield f"Camera {name} has no black frame (kind black), without which its zero is unknown."
+        if not folder.frames_of(name, "flat"):
+            yield f"Camera {name} has no flat frame; two of one exposure would tell its noise and its fall of light."
+        if len(folder.frames_of(name, "tracking")) < MIN_TRACKING:
+            yield f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed less well."
+        if lacking := sorted(str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}):
+            shown = ", ".join(lacking[:MOST_NAMED]) + (" and more" if len(lacking) > MOST_NAMED else "")
+            yield f"Camera {name} has no frame of light {shown}, which another camera has."
+    if not lit:
+        yield "No frame shows teeth under a light (kind light)."
+    if folder.calibration is None:
+        yield "No calibration is named; add [calibration] file, or give a job one by its option 'calibration'."
+    if not (root / "teeth").is_dir() and folder.scan is None:
+        yield "There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks."
+
+
+def _written(tree: Mapping[str, Any]) -> bytes:
+    """TOML of a description: plain values, then tables, then lists of tables."""
+    lines = [f"{key} = {_value(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
+    for key, value in tree.items():
+        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
+        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
+        for head, table in tables:
+            lines += ["", head, *(f"{name} = {_value(one)}" for name, one in table.items())]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
+    """Comments: things that frames show, with measures to fill in, and those frames."""
+    shown = [one for one in frames if one.kind in THING_OF]
+    templates = {kind: _THINGS[kind] for kind in dict.fromkeys(one.kind for one in shown)}
+    lines = [line for template in templates.values() for line in ("", *template)]
+    for one in shown:
+        entry = _frame(one, exposure_s) | {THING_OF[one.kind]: one.kind}
+        lines += ["", "[[frame]]", *(f"{name} = {_value(value)}" for name, value in entry.items())]
+    return "".join(f"# {line}\n" if line else "\n" for line in lines).encode()
+
+
+def _value(value: Any) -> str:
+    # A string or a list of JSON is one of TOML as well, but for DEL, which no name holds.
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,86 @@
+"""What the name of a photograph says: camera, kind or light, exposure, gain.
+
+The parts of a path are parted by slashes, underscores and blanks. Parts that nothing else explains are the camera, then the
+light; numbers that follow are repetitions::
+
+    left_L07_0.05s.tif    left/black_50ms_2.png    right_tracking_003_1-20s.dng    left_flat_0.1s_gain4.npy
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from types import MappingProxyType
+
+from services.core.raw.records import LIT_BY_ONE, FrameKind
+
+KINDS: Mapping[str, FrameKind] = MappingProxyType(
+    {
+        "black": "black",
+        "dark": "black",
+        "tracking": "tracking",
+        "all": "tracking",
+        "allon": "tracking",
+        "flat": "flat",
+        "darkroom": "dark-room",
+        "dark-room": "dark-room",
+        "ambient": "dark-room",
+        "board": "board",
+        "charuco": "board",
+        "chessboard": "board",
+        "mirror": "mirror-sphere",
+        "mirror-sphere": "mirror-sphere",
+        "white": "white-sphere",
+        "white-sphere": "white-sphere",
+        "chart": "chart",
+        "colorchecker": "chart",
+    }
+)
+"""Words by which laboratories call a kind of photograph, with an optional number behind."""
+_SECONDS = re.compile(r"(?:(\d+)-(\d+)|(\d+(?:\.\d+)?))(s|ms|us)")
+_GAIN = re.compile(r"gain(\d+(?:\.\d+)?)")
+_NUMBER = re.compile(r"\d+")
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+
+
+@dataclass(frozen=True)
+class NamedFrame:
+    """A photograph by its name; what the name does not say is None."""
+
+    file: str
+    camera: str
+    kind: FrameKind
+    light: str | None
+    exposure_s: float | None
+    gain: float
+
+
+def named_frame(file: str) -> NamedFrame | str:
+    """What a name says, or the part of a sentence that says what it lacks."""
+    pure = PurePosixPath(file)
+    parts = [part for whole in (*pure.parent.parts, pure.stem) for part in re.split(r"[_ ]+", whole) if part]
+    exposure_s, gain, kind = None, 1.0, None
+    words: list[str] = []
+    for part in parts:
+        word = part.lower()
+        if (seconds := _SECONDS.fullmatch(word)) is not None:
+            over, under, whole, unit = seconds.groups()
+            exposure_s = (float(over) / float(under) if over else float(whole)) * _UNITS[unit]
+        elif (told := _GAIN.fullmatch(word)) is not None:
+            gain = float(told[1])
+        elif (found := KINDS.get(word.rstrip("0123456789").rstrip("-"))) is not None and kind is None:
+            kind = found
+        elif _NUMBER.fullmatch(word) is None or not words:
+            words.append(part)
+    if not words:
+        return "does not name its camera"
+    light = words[1] if len(words) > 1 else None
+    kind = kind or ("light" if light is not None else None)
+    if kind is None:
+        return f"names camera {words[0]}, and neither a light nor a kind such as black, flat or tracking"
+    if kind in LIT_BY_ONE and light is None:
+        return f"is of kind {kind} and does not name its light"
+    takes_light = kind in LIT_BY_ONE or kind in {"flat", "board", "chart"}
+    return NamedFrame(file, words[0], kind, light if takes_light else None, exposure_s, gain)
