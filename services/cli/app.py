@@ -41,6 +41,8 @@ def main() -> NoReturn:
 def build_app() -> typer.Typer:
     """Put the commands together."""
     from services.cli.bench import bench
+    from services.cli.board import board_command
+    from services.cli.calibrate import calibrate_command
     from services.cli.capture import capture
     from services.cli.client.cancel import cancel
     from services.cli.client.delete import delete
@@ -78,6 +80,8 @@ def build_app() -> typer.Typer:
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     app.command("sphere")(sphere_command)
     app.command("import")(import_command)
+    app.command("board")(board_command)
+    app.command("calibrate")(calibrate_command)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)

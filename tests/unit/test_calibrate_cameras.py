@@ -49,6 +49,7 @@ def test_undistorted_pixels_are_drawn_again() -> None:
     assert lens.project(lens.undistort(pixels)) == pytest.approx(pixels, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_errors_of_a_rig_are_as_large_as_its_covariance_says() -> None:
     """Whitened errors of four sessions, 4 · 84 parameters: their rms has a standard error of 0.04."""
     whitened = []

@@ -1,0 +1,111 @@
+"""A chart of 24 patches: its reference colours, and the means of its patches in a photograph."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+
+Floats = NDArray[np.float64]
+COLUMNS, ROWS = 6, 4
+NEUTRALS = slice(18, 24)
+"""Patches 19 to 24, from white to black, have the same reflectance in all channels to a few per cent."""
+PATCH_SHARE = 0.25
+"""Half width of the part of a patch that is averaged, in units of the distance to the next one: half of a patch."""
+SAMPLES = 15
+"""Across a patch, in each direction."""
+LARGEST_SATURATED_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Means (24, C) of a chart's patches, and which of them may be used (24,)."""
+
+    means: Floats
+    usable: NDArray[np.bool_]
+
+
+def read_reference(path: Path, chart: str) -> Floats:
+    """XYZ (24, 3) under D50, Y = 1 for a perfect diffuser, from a table with columns X, Y, Z in hundreds.
+
+    Raises:
+        CaptureInputError: not 24 rows of those columns.
+    """
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        rows = [row for row in csv.reader(stream) if row and not row[0].startswith("#")]
+    header = [cell.strip().upper() for cell in rows[0]] if rows else []
+    if not {"X", "Y", "Z"} <= set(header):
+        raise CaptureInputError(
+            f"Reference {path.name} of chart {chart} has no columns X, Y and Z; give XYZ under D50 with Y = 100 for white."
+        )
+    try:
+        table = np.array([[float(row[header.index(axis)]) for axis in "XYZ"] for row in rows[1:]]) / 100
+    except (ValueError, IndexError) as problem:
+        raise CaptureInputError(
+            f"Reference {path.name} of chart {chart} holds what is no number ({problem}); correct it."
+        ) from problem
+    if table.shape != (COLUMNS * ROWS, 3):
+        raise CaptureInputError(f"Reference {path.name} of chart {chart} has {len(table)} patches; 24 are needed.")
+    return np.asarray(table)
+
+
+def patch_means(values: NDArray[np.float32], saturated: NDArray[np.bool_], corners: Floats) -> Patches:
+    """Average the middle of every patch.
+
+    Args:
+        values: an image (h, w, C).
+        saturated: where it is full (h, w).
+        corners: centres (4, 2) of patches 1, 6, 24, 19, in its own pixels with centres at half-integers.
+    """
+    import cv2
+
+    on_chart = np.array([[0, 0], [COLUMNS - 1, 0], [COLUMNS - 1, ROWS - 1], [0, ROWS - 1]], dtype=np.float32)
+    homography = cv2.getPerspectiveTransform(on_chart, corners.astype(np.float32))
+    shift = np.linspace(-PATCH_SHARE, PATCH_SHARE, SAMPLES)
+    means, usable = [], []
+    for patch in range(COLUMNS * ROWS):
+        x, y = np.meshgrid(patch % COLUMNS + shift, patch // COLUMNS + shift)
+        points = np.stack([x, y, np.ones_like(x)], axis=-1) @ homography.T
+        columns, rows = (np.floor(points[..., k] / points[..., 2]).astype(int) for k in (0, 1))
+        inside = (rows >= 0) & (rows < values.shape[0]) & (columns >= 0) & (columns < values.shape[1])
+        if not inside.all():
+            means.append(np.full(values.shape[2], np.nan))
+            usable.append(False)
+            continue
+        means.append(values[rows, columns].mean(axis=(0, 1)).astype(np.float64))
+        usable.append(bool(saturated[rows, columns].mean() <= LARGEST_SATURATED_SHARE))
+    return Patches(np.array(means), np.array(usable))
+
+
+def find_corners(eight_bit: NDArray[np.uint8]) -> Floats | None:
+    """Centres (4, 2) of patches 1, 6, 24, 19 in a colour photograph (H, W, 3), blue first; None where no chart is found."""
+    import cv2
+
+    detector = cv2.mcc.CCheckerDetector.create()
+    if not detector.process(eight_bit, cv2.mcc.MCC24 if hasattr(cv2.mcc, "MCC24") else 0):
+        return None
+    found = np.asarray(detector.getBestColorChecker().getColorCharts(), dtype=np.float64).reshape(24, 4, 2).mean(axis=1)
+    return np.asarray(found[[0, 5, 23, 18]] + 0.5)
+
+
+def over_white(patches: Patches, xyz: Floats, camera: str) -> Floats:
+    """Means (24, C) divided by those of a perfect diffuser in the same light, which the neutral patches tell.
+
+    Raises:
+        CaptureInputError: fewer than three neutral patches can be used.
+    """
+    good = np.zeros(24, dtype=bool)
+    good[NEUTRALS] = patches.usable[NEUTRALS]
+    if np.count_nonzero(good) < 3:
+        raise CaptureInputError(
+            f"Camera {camera} shows fewer than three of the chart's grey patches below saturation; expose the chart less."
+        )
+    luminance = xyz[good, 1:2]
+    # Least squares through the origin: the white that makes greys as bright as their luminance says.
+    white = (patches.means[good] * luminance).sum(axis=0) / (luminance**2).sum()
+    return np.asarray(patches.means / white)

@@ -1,0 +1,171 @@
+"""Spheres in photographs: their outline and the highlights on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.lights.mirror import Eye, outline_errors, sphere_from_outline
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+SEARCH_WIDTH = 640
+"""Pixels across the image in which a sphere is searched; its outline is then measured in the whole one."""
+RADII = (0.5, 2.0)
+"""Of a sphere's image, as a multiple of the one that it has at the boards' distance."""
+CIRCLE_QUALITY = (0.85, 0.6, 0.35)
+"""Of OpenCV's circle search, from nearly perfect outlines to half hidden ones; the first that finds any circle counts."""
+RAYS = 180
+BANDS = (0.12, 0.04, 0.02)
+"""Half widths, as parts of the radius, in which the edge is searched around the last outline."""
+MIN_BAND_PX = 4.0
+SMOOTHING_PX = 1.0
+OUTLIER_SIGMAS = 3.5
+MIN_EDGES = RAYS // 3
+"""A third of an outline fixes the sphere; less is no outline."""
+INSIDE = 0.97
+"""Part of the radius within which highlights are searched: nearer to the outline they are lines."""
+HALF = 0.5
+LEAST_CONTRAST = 8.0
+"""Of a highlight's peak over the sphere, in units of the sphere's own scatter."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Edge points (E, 2) of a sphere in pixels, and their rms distance to the fitted outline."""
+
+    points_px: Floats
+    rms_px: float
+
+
+def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) -> Outline | None:
+    """The outline of a sphere of known radius at about a distance, or None.
+
+    A circle search in a small image comes first. Then the steepest brightness along rays from the middle is followed to a fraction of a
+    pixel, each time in a narrower band about the outline of the sphere that fits the last points.
+    """
+    import cv2
+
+    height, width = grey.shape
+    shrink = max(width / SEARCH_WIDTH, 1.0)
+    small = cv2.resize(grey, (round(width / shrink), round(height / shrink)), interpolation=cv2.INTER_AREA)
+    # The bright end is cut at the median's tenfold, as highlights outshine every outline.
+    top = 4 * float(np.percentile(small, 60)) + 1e-12
+    eight = np.clip(small / top * 255, 0, 255).astype(np.uint8)
+    expected = float(eye.lens.values[0]) * radius_mm / distance_mm / shrink
+    circle = _circle(cv2.GaussianBlur(eight, (0, 0), 1.0), expected)
+    if circle is None:
+        return None
+    points = circle[:2] * shrink + circle[2] * shrink * _unit_circle()
+    # Light is compared by its logarithm: an edge is as steep in the dark as in the bright.
+    floor = 0.02 * top
+    logs = cv2.GaussianBlur(np.log(np.maximum(grey, 0) + floor).astype(np.float32), (0, 0), SMOOTHING_PX)
+    for band in BANDS:
+        sphere = sphere_from_outline(eye, points, radius_mm)
+        found = _edges(logs, eye, sphere, radius_mm, band)
+        points = _without_outliers(found, eye, radius_mm)
+        if len(points) < MIN_EDGES:
+            return None
+    off = outline_errors(eye, points, sphere_from_outline(eye, points, radius_mm), radius_mm)
+    return Outline(points, float(np.sqrt(np.mean(off**2))))
+
+
+def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
+    """The centre (2,) in pixels of the brightest highlight within a sphere's outline, or None.
+
+    It is the mean place of the light above half of the peak, in the patch that holds the peak.
+    """
+    import cv2
+
+    middle = outline_px.mean(axis=0)
+    reach = np.linalg.norm(outline_px - middle, axis=1).mean() * INSIDE
+    x0, y0 = np.maximum(np.floor(middle - reach).astype(int), 0)
+    x1, y1 = np.minimum(np.ceil(middle + reach).astype(int) + 1, grey.shape[::-1])
+    part = grey[y0:y1, x0:x1].astype(np.float32)
+    y, x = np.mgrid[y0:y1, x0:x1]
+    inside = (x + 0.5 - middle[0]) ** 2 + (y + 0.5 - middle[1]) ** 2 < reach**2
+    # The peak is that of the image smoothed by a pixel, so that no single hot pixel is one.
+    smooth = np.where(inside, cv2.GaussianBlur(part, (0, 0), 1.0), -np.inf)
+    row, column = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
+    level = float(np.median(part[inside]))
+    scatter = 1.4826 * float(np.median(np.abs(part[inside] - level)))
+    peak = float(smooth[row, column]) - level
+    if peak <= LEAST_CONTRAST * max(scatter, 1e-12):
+        return None
+    bright = (inside & (smooth - level > HALF * peak)).astype(np.uint8)
+    _, labels = cv2.connectedComponents(bright)
+    mine = labels == labels[row, column]
+    weights = np.where(mine, part - level - HALF * peak * 0.5, 0)
+    weights = np.maximum(weights, 0)
+    total = float(weights.sum())
+    return np.array([(weights * (x + 0.5)).sum() / total, (weights * (y + 0.5)).sum() / total])
+
+
+def _unit_circle() -> Floats:
+    angle = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _circle(image: NDArray[np.uint8], expected_px: float) -> Floats | None:
+    """Centre and radius (3,) of the clearest circle of about the expected radius."""
+    import cv2
+
+    least, most = (max(round(expected_px * part), 4) for part in RADII)
+    for quality in CIRCLE_QUALITY:
+        found = cv2.HoughCircles(
+            image,
+            cv2.HOUGH_GRADIENT_ALT,
+            1.5,
+            max(least, 10),
+            param1=60,
+            param2=quality,
+            minRadius=least,
+            maxRadius=most,
+        )
+        if found is not None:
+            return np.asarray(found, dtype=np.float64).reshape(-1, found.shape[-1])[0, :3]
+    return None
+
+
+def _edges(logs: Image, eye: Eye, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
+    """Points (E, 2) of steepest change across the outline of a sphere, within a band about it."""
+    import cv2
+
+    middle = eye.project(sphere_mm[None])[0]
+    towards = sphere_mm - eye.centre_mm
+    distance = float(np.linalg.norm(towards))
+    axis, sine = towards / distance, radius_mm / distance
+    one = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    one /= np.linalg.norm(one)
+    circle = _unit_circle()
+    across = circle[:, :1] * one + circle[:, 1:] * np.cross(axis, one)
+    edge = eye.project(eye.centre_mm + distance * (np.sqrt(1 - sine**2) * axis + sine * across))
+    outward = (edge - middle) / np.linalg.norm(edge - middle, axis=1, keepdims=True)
+    half = max(band * float(np.linalg.norm(edge - middle, axis=1).mean()), MIN_BAND_PX)
+    offsets = np.arange(-half, half + 0.25, 0.25)
+    places = edge[:, None] + offsets[None, :, None] * outward[:, None]
+    maps = (places - 0.5).astype(np.float32)
+    profile = cv2.remap(logs, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    steep = np.abs(np.gradient(profile.astype(np.float64), axis=1))
+    best = np.clip(steep.argmax(axis=1), 1, len(offsets) - 2)
+    rows = np.arange(len(edge))
+    left, top, right = (steep[rows, best + shift] for shift in (-1, 0, 1))
+    bend = left - 2 * top + right
+    shift = np.where(np.abs(bend) > 0, (left - right) / np.where(bend == 0, 1, 2 * bend), 0.0)
+    found = edge + ((best + np.clip(shift, -1, 1)) * 0.25 - half)[:, None] * outward
+    height, width = logs.shape
+    inside = ((found > 2) & (found < np.array([width - 2, height - 2]))).all(axis=1)
+    return np.asarray(found[inside & (top > 0)])
+
+
+def _without_outliers(points: Floats, eye: Eye, radius_mm: float) -> Floats:
+    """Points near one sphere's outline: those far from it leave, three times."""
+    for _ in range(3):
+        if len(points) < MIN_EDGES:
+            return points
+        off = outline_errors(eye, points, sphere_from_outline(eye, points, radius_mm), radius_mm)
+        scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.02)
+        points = points[np.abs(off - np.median(off)) < OUTLIER_SIGMAS * scale]
+    return points

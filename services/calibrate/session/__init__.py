@@ -1,0 +1,1 @@
+"""A raw folder's calibration frames, step by step, to a calibration record."""

@@ -1,0 +1,123 @@
+"""The cameras' step: boards in photographs to lenses, poses and their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.boards import detect
+from services.calibrate.cameras.bundle import BundleFit, fit_bundle
+from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, choose_lens, fit_lens
+from services.calibrate.cameras.sightings import View
+from services.calibrate.cameras.start import first_rig, usable
+from services.calibrate.lights.mirror import Eye
+from services.calibrate.session.photos import Photos, for_finders
+from services.core.errors import CaptureInputError
+from services.core.raw.records import RawFrame
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CamerasStep:
+    """What boards say of the cameras.
+
+    Attributes:
+        names: of the cameras, in the order of ``raw.toml``.
+        fit: lenses, poses and covariance.
+        choices: how each camera's distortion model was chosen.
+        views: the boards that were found, in the order of the fit's corners.
+        missed: files in which no board was found.
+    """
+
+    names: tuple[str, ...]
+    fit: BundleFit
+    choices: dict[str, ModelChoice]
+    views: tuple[View, ...]
+    missed: tuple[str, ...]
+
+    @property
+    def eyes(self) -> tuple[Eye, ...]:
+        """The cameras."""
+        rig = self.fit.rig
+        return tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+
+    @property
+    def camera_covariance(self) -> Floats:
+        """Of lens values and pose of each camera in turn."""
+        layout = self.fit.layout
+        columns = np.concatenate(
+            [np.concatenate([layout.lens_columns(k), layout.camera_columns(k)]) for k in range(len(self.names))]
+        )
+        return np.asarray(self.fit.covariance[np.ix_(columns, columns)])
+
+    @property
+    def distance_mm(self) -> float:
+        """Median distance between cameras and boards."""
+        places = self.fit.rig.places[:, 3:]
+        centres = np.array([eye.centre_mm for eye in self.eyes])
+        return float(np.median(np.linalg.norm(places[:, None] - centres[None], axis=2)))
+
+
+def calibrate_cameras(photos: Photos) -> CamerasStep:
+    """Find all boards, choose each camera's distortion model, and adjust the rig.
+
+    Raises:
+        CaptureInputError: too few boards, or cameras that share none.
+    """
+    folder = photos.folder
+    names = tuple(camera.name for camera in folder.camera)
+    frames = [frame for frame in folder.frame if frame.kind == "board"]
+    if not frames:
+        raise CaptureInputError("raw.toml lists no frame of kind board; photograph a board in at least ten places.")
+    views, missed = _find(photos, frames, names)
+    first = _place(frames[0])
+    if not any(view.place == 0 for view in usable(views)):
+        raise CaptureInputError(
+            f"No camera shows the board at {first}, the first of raw.toml, which is to be the world's frame; photograph it again, "
+            "or list another place first."
+        )
+    choices, sigmas = {}, []
+    for camera, name in enumerate(names):
+        mine = [view for view in views if view.camera == camera]
+        choices[name] = choose_lens(mine, folder.camera[camera].size, name)
+        sigmas.append(fit_lens(mine, folder.camera[camera].size, choices[name].lens.model, name).sigma_px[0])
+    good = _renumbered(usable(views))
+    start = first_rig(good, [choices[name].lens for name in names], names)
+    fit = fit_bundle(good, start, sigma_px=np.array(sigmas))
+    return CamerasStep(names, fit, choices, tuple(good), missed)
+
+
+def _find(photos: Photos, frames: Sequence[RawFrame], names: Sequence[str]) -> tuple[list[View], tuple[str, ...]]:
+    boards = {board.name: board for board in photos.folder.board}
+    places = list(dict.fromkeys(_place(frame) for frame in frames))
+    views, missed = [], []
+    for frame in frames:
+        found = detect(for_finders(photos.grey(frame)), boards[str(frame.board)])
+        if len(found.ids) == 0:
+            missed.append(frame.file)
+            continue
+        camera, place = names.index(frame.camera), places.index(_place(frame))
+        views.append(View(camera, place, found.corners_mm, found.pixels, found.ids, frame.file))
+    return views, tuple(missed)
+
+
+def _place(frame: RawFrame) -> str:
+    """A board without a place was moved before every photograph."""
+    return frame.place if frame.place is not None else frame.file
+
+
+def _renumbered(views: Sequence[View]) -> list[View]:
+    """Views with places counted without gaps; the first stays the first."""
+    numbers = sorted({view.place for view in views})
+    return [replace(view, place=numbers.index(view.place)) for view in views]
+
+
+def model_told(choice: ModelChoice) -> str:
+    """How a lens' model was chosen, in words."""
+    told = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())
+    plain = " (OpenCV's default)" if choice.lens.model == MODEL_FOR_OUTLIERS else ""
+    return f"{choice.lens.model}{plain}; on boards that were left out: {told}"

@@ -1,0 +1,83 @@
+"""The colours' step: charts in photographs to each camera's matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.colour.chart import Patches, find_corners, over_white, patch_means, read_reference
+from services.calibrate.colour.cie import delta_e_2000, lab_from_xyz
+from services.calibrate.colour.transform import ColourFit, fit_colour
+from services.calibrate.session.photos import Channels, Photos, for_finders
+from services.core.errors import CaptureInputError
+from services.core.raw.records import RawFrame
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ColourStep:
+    """Colours of every camera that photographed a chart.
+
+    Attributes:
+        fits: by camera.
+        rgb: patches over white (24, 3), by camera; those that cannot be used are NaN.
+        xyz: the chart's reference (24, 3).
+        between_cameras: mean ΔE2000 between the cameras' answers to the patches that all of them show, or None of one camera.
+    """
+
+    fits: dict[str, ColourFit]
+    rgb: dict[str, Floats]
+    xyz: Floats
+    between_cameras: float | None
+
+
+def calibrate_colours(photos: Photos) -> ColourStep | None:
+    """Each camera's way from channels to XYZ; None without charts or without three channels.
+
+    Raises:
+        CaptureInputError: a chart that is not found, too bright, or without a reference.
+    """
+    frames = [frame for frame in photos.folder.frame if frame.kind == "chart"]
+    if not frames or len(photos.folder.channels) != 3:
+        return None
+    charts = {chart.name: chart for chart in photos.folder.chart}
+    fits, rgb = {}, {}
+    xyz = read_reference(photos.root / charts[str(frames[0].chart)].reference, str(frames[0].chart))
+    for camera in dict.fromkeys(frame.camera for frame in frames):
+        mine = [frame for frame in frames if frame.camera == camera]
+        total = [_patches(photos, frame) for frame in mine]
+        usable = np.logical_and.reduce([one.usable for one in total])
+        # Light adds up, so photographs light by light are summed.
+        summed = Patches(np.sum([one.means for one in total], axis=0), usable)
+        patches = over_white(summed, xyz, camera)
+        rgb[camera] = np.where(usable[:, None], patches, np.nan)
+        fits[camera] = fit_colour(patches[usable], xyz[usable], camera)
+    return ColourStep(fits, rgb, xyz, _between(fits, rgb))
+
+
+def _patches(photos: Photos, frame: RawFrame) -> Patches:
+    channels = photos.channels(frame)
+    corners = np.array(frame.corners_px, dtype=np.float64) if frame.corners_px is not None else _search(channels)
+    if corners is None:
+        raise CaptureInputError(
+            f"Frame {frame.file} (camera {frame.camera}) shows no chart that can be found; give corners_px, "
+            "the centres of its patches 1, 6, 24 and 19."
+        )
+    return patch_means(channels.values, channels.saturated, corners / channels.pixel)
+
+
+def _search(channels: Channels) -> Floats | None:
+    bgr = np.stack([for_finders(channels.values[..., k]) for k in (2, 1, 0)], axis=-1)
+    found = find_corners(bgr)
+    return None if found is None else found * channels.pixel
+
+
+def _between(fits: dict[str, ColourFit], rgb: dict[str, Floats]) -> float | None:
+    if len(fits) < 2:
+        return None
+    seen = np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in rgb.values()])
+    labs = np.array([lab_from_xyz(fit.xyz(rgb[camera][seen])) for camera, fit in fits.items()])
+    return float(np.mean([delta_e_2000(one, labs.mean(axis=0)) for one in labs]))

@@ -1,0 +1,106 @@
+"""Drawings of a calibration's report as SVG: corners and their residuals, uncertainty over the image, lights, charts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.bundle import BundleFit
+from services.calibrate.cameras.projection import image_grid, projection_sigma
+from services.calibrate.colour.cie import D50
+
+Floats = NDArray[np.float64]
+WIDTH = 360.0
+ARROW_PX = 12.0
+"""Length in the drawing of the largest residual that is drawn; longer ones are cut."""
+GRID = (16, 12)
+SRGB_FROM_XYZ_D50 = np.array(
+    [[3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427]]
+)
+"""Linear sRGB of XYZ under D50, by Bradford's adaptation (Lindbloom)."""
+
+
+def corners_drawing(fit: BundleFit, camera: int) -> str:
+    """All corners of a camera with their residuals, as arrows of a common scale; corners that were left out in red."""
+    size = fit.rig.lenses[camera].size
+    scale = WIDTH / size[0]
+    mine = fit.corners.camera == camera
+    sigma = float(fit.sigma_px[camera])
+    places, off = fit.corners.pixels[mine] * scale, fit.residuals_px[mine] / (3 * sigma) * ARROW_PX
+    length = np.linalg.norm(off, axis=1, keepdims=True)
+    off = off * np.minimum(1, 2 * ARROW_PX / np.maximum(length, 1e-12))
+    shapes = [
+        f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" stroke="{"#25c" if good else "#c22"}"/>'
+        for (x, y), (dx, dy), good in zip(places, off, fit.inliers[mine], strict=True)
+    ]
+    return _svg(shapes, WIDTH, size[1] * scale)
+
+
+def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tuple[str, float]:
+    """Uncertainty of projection over the image, white at 0 and dark at the largest, and that largest in px."""
+    lens = fit.rig.lenses[camera]
+    scale = WIDTH / lens.size[0]
+    sigma = projection_sigma(fit, camera, image_grid(lens.size, *GRID), distance_mm)
+    largest, (columns, rows) = float(sigma.max()), GRID
+    width, height = WIDTH / columns, lens.size[1] * scale / rows
+    shapes = [
+        f'<rect x="{(n % columns) * width:.1f}" y="{(n // columns) * height:.1f}" width="{width:.1f}" height="{height:.1f}" '
+        f'fill="hsl(215,60%,{95 - 65 * value / largest:.0f}%)"><title>{value:.3f} px</title></rect>'
+        for n, value in enumerate(sigma)
+    ]
+    return _svg(shapes, WIDTH, lens.size[1] * scale), largest
+
+
+def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, errors_mm: Floats | None) -> str:
+    """Lights and cameras from above (x, z) and from the side (y, z), lights with circles of 10 σ."""
+    everything = np.concatenate([lights_mm, cameras_mm])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    scale = (WIDTH - 40) / max(float((high - low).max()), 1.0)
+    shapes = []
+    for view, axes in enumerate(((0, 2), (1, 2))):
+        left = view * WIDTH + 20
+        for number, name in enumerate(names):
+            x, y = ((lights_mm[number] - low) * scale)[list(axes)]
+            radius = 2.5 if errors_mm is None else max(10 * float(errors_mm[number]) * scale, 2.5)
+            shapes.append(
+                f'<circle cx="{left + x:.1f}" cy="{20 + y:.1f}" r="{radius:.1f}" fill="#e90" fill-opacity="0.6"><title>{_safe(name)}</title></circle>'
+            )
+        for camera in cameras_mm:
+            x, y = ((camera - low) * scale)[list(axes)]
+            shapes.append(f'<rect x="{left + x - 3:.1f}" y="{20 + y - 3:.1f}" width="6" height="6" fill="#333"/>')
+    return _svg(shapes, 2 * WIDTH, float((high - low)[2]) * scale + 40)
+
+
+def chart_drawing(reference: Floats, before: Floats, after: Floats) -> str:
+    """A chart's patches: around, the reference; in the middle, on the left as the sensor sees them and on the right corrected."""
+    side, shapes = 44.0, []
+    for patch in range(len(reference)):
+        x, y = patch % 6 * side, patch // 6 * side
+        parts = [(0.0, 0.0, side, side, reference), (10.0, 10.0, 12.0, 24.0, before), (22.0, 10.0, 12.0, 24.0, after)]
+        for dx, dy, width, height, colours in parts:
+            if np.isfinite(colours[patch]).all():
+                shapes.append(
+                    f'<rect x="{x + dx:.0f}" y="{y + dy:.0f}" width="{width:.0f}" height="{height:.0f}" fill="{_hex(colours[patch])}"/>'
+                )
+    return _svg(shapes, 6 * side, 4 * side)
+
+
+def srgb(xyz: Floats) -> Floats:
+    """Linear sRGB (N, 3) of XYZ (N, 3) under D50."""
+    return np.asarray(xyz @ SRGB_FROM_XYZ_D50.T / (D50 @ SRGB_FROM_XYZ_D50.T))
+
+
+def _hex(linear: Floats) -> str:
+    clipped = np.clip(linear, 0, 1)
+    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in encoded)
+
+
+def _safe(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;")
+
+
+def _svg(shapes: Iterable[str], width: float, height: float) -> str:
+    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" role="img">{"".join(shapes)}</svg>'

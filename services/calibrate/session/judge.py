@@ -1,0 +1,207 @@
+"""Whether a calibration keeps its limits, what in it looks wrong, and what to photograph again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.bundle import BundleFit
+from services.calibrate.cameras.projection import image_grid, projection_sigma
+from services.calibrate.lights.listed import swapped_names
+from services.calibrate.session.boards import CamerasStep
+from services.calibrate.session.charts import ColourStep
+from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.raw.records import RawFolder
+from services.core.uncertainty import CalibrationUncertainty
+
+Floats = NDArray[np.float64]
+GRID = (8, 6)
+MOST_EDGE_SHIFT_PX = 1.0
+"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
+FEW_PLACES = 8
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One figure that a calibration must keep: what it is, its value, the limit and the unit."""
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the value is within the limit."""
+        return self.value <= self.limit
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Limits, what looks wrong (each in a sentence with its remedy), and what to photograph again."""
+
+    limits: tuple[Limit, ...]
+    suspicions: tuple[str, ...]
+    advice: str
+
+    @property
+    def broken(self) -> tuple[Limit, ...]:
+        """Limits that are not kept."""
+        return tuple(one for one in self.limits if not one.is_kept)
+
+
+def judge(
+    folder: RawFolder,
+    cameras: CamerasStep,
+    lights: LightsStep | None,
+    intensity: IntensityStep | None,
+    colours: ColourStep | None,
+    uncertainty: CalibrationUncertainty | None,
+) -> Judgement:
+    """Hold a calibration to its limits. They are those that keep a tooth's absorption within a few per cent."""
+    limits = list(_limits(cameras, lights, uncertainty, colours))
+    suspicions = tuple(_suspicions(folder, cameras, lights))
+    return Judgement(tuple(limits), suspicions, _advice(limits, cameras, lights, intensity, colours))
+
+
+def _limits(
+    cameras: CamerasStep,
+    lights: LightsStep | None,
+    uncertainty: CalibrationUncertainty | None,
+    colours: ColourStep | None,
+) -> Iterator[Limit]:
+    for number, name in enumerate(cameras.names):
+        yield Limit(f"scatter of corners, camera {name}", cameras.fit.rms_px(number), 1.0, "px")
+        worst = float(np.max(uncertainty_at_the_boards(cameras.fit, number, cameras.distance_mm)))
+        yield Limit(f"uncertainty of projection at the boards, camera {name}", worst, 0.05, "mm")
+    if lights is not None:
+        count = 3 * len(lights.fit.lights)
+        errors = np.sqrt(np.diag(lights.fit.covariance)[:count].reshape(-1, 3).sum(axis=1))
+        yield Limit("position of the lights, rms ±", float(np.sqrt(np.mean(errors**2))), 2.0, "mm")
+    if uncertainty is not None:
+        gains = [n for n, name in enumerate(uncertainty.names) if name.startswith("light_gain.")]
+        if gains:
+            variances = np.diag(uncertainty.matrix)[gains]
+            yield Limit("intensity of the lights, rms ±", 100 * float(np.sqrt(np.mean(variances))), 0.5, "%")
+    if colours is not None:
+        for name, fit in colours.fits.items():
+            yield Limit(
+                f"patches that were left out, median ΔE2000, camera {name}", float(np.median(fit.held_out)), 1.0, ""
+            )
+
+
+def uncertainty_at_the_boards(fit: BundleFit, camera: int, distance_mm: float) -> Floats:
+    """How far off in mm, one σ, a camera draws points at the boards' distance, on a grid over its image, inside of what boards covered."""
+    lens = fit.rig.lenses[camera]
+    grid = image_grid(lens.size, *GRID)
+    covered = grid[covered_cells(fit, camera)]
+    if len(covered) == 0:
+        return np.array([np.inf])
+    return projection_sigma(fit, camera, covered, distance_mm) * distance_mm / float(lens.values[0])
+
+
+def covered_cells(fit: BundleFit, camera: int) -> NDArray[np.bool_]:
+    """Which cells of the grid hold a corner that was used (rows · columns,)."""
+    columns, rows = GRID
+    width, height = fit.rig.lenses[camera].size
+    seen = fit.corners.pixels[fit.inliers & (fit.corners.camera == camera)]
+    cell = np.clip((seen / [width, height] * [columns, rows]).astype(int), 0, [columns - 1, rows - 1])
+    covered = np.zeros(columns * rows, dtype=bool)
+    covered[cell[:, 1] * columns + cell[:, 0]] = True
+    return covered
+
+
+def _suspicions(folder: RawFolder, cameras: CamerasStep, lights: LightsStep | None) -> Iterator[str]:
+    if cameras.missed:
+        yield (
+            f"{len(cameras.missed)} frames show no board, among them {cameras.missed[0]}: check that the board of raw.toml is the one "
+            "that was photographed, not mirrored and in focus."
+        )
+    bad = ~cameras.fit.inliers
+    for number, view in enumerate(cameras.views):
+        share = bad[cameras.fit.corners.view == number].mean()
+        if share > 0.5:
+            yield f"Most corners of {view.name} fit no pose: the board or the camera moved, or frames are interchanged."
+    if lights is None:
+        return
+    fit, names = lights.fit, [light.name for light in folder.light]
+    for number, shift in enumerate(fit.edge_shifts_px):
+        if abs(shift) > MOST_EDGE_SHIFT_PX:
+            yield (
+                f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
+                "measure radius_mm again."
+            )
+    for outlier in fit.outliers:
+        yield (
+            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is {outlier.off_px:.1f} px off: "
+            "something else may shine there, so it was left out."
+        )
+    if lights.no_highlight:
+        yield f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the light on?"
+    yield from _about_the_list(names, lights)
+    yield from _twins(names, lights)
+
+
+def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
+    if lights.aligned is None:
+        return
+    found = np.full((len(names), 3), np.nan)
+    found[lights.fit.lights] = lights.fit.positions_mm
+    swapped = dict(swapped_names(found, lights.aligned))
+    for number in lights.aligned.outliers:
+        if number in swapped:
+            yield f"Light {names[number]} shines where the list has {names[swapped[number]]}; their names are interchanged."
+        else:
+            off = lights.aligned.off_mm[number]
+            yield f"Light {names[number]} lies {off:.0f} mm from where the list has it; measure it again."
+
+
+def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
+    """Two lights at one place are one light listed twice."""
+    positions = lights.fit.positions_mm
+    for one in range(len(positions)):
+        for two in range(one):
+            apart = float(np.linalg.norm(positions[one] - positions[two]))
+            if apart < 1.0:
+                first, second = names[lights.fit.lights[two]], names[lights.fit.lights[one]]
+                yield f"Lights {first} and {second} lie {apart:.1f} mm apart: one light was photographed under two names."
+
+
+def _advice(
+    limits: list[Limit],
+    cameras: CamerasStep,
+    lights: LightsStep | None,
+    intensity: IntensityStep | None,
+    colours: ColourStep | None,
+) -> str:
+    """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of photographs."""
+    if lights is None:
+        return "Photograph a mirror sphere light by light in three or more places: without it the lights are where the list says."
+    if intensity is None:
+        return "Photograph a white sphere light by light: without it all lights count as equally bright."
+    if colours is None:
+        return "Photograph a colour chart under all lights: without it the asset has no colours."
+    worst = max(limits, key=lambda one: one.value / one.limit)
+    if not worst.is_kept:
+        times = int(np.ceil((worst.value / worst.limit) ** 2))
+        thing = (
+            "spheres, larger or further apart,"
+            if "light" in worst.what
+            else "the chart"
+            if "patches" in worst.what
+            else "boards"
+        )
+        return (
+            f"Photograph {thing} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}; "
+            f"{times} times as many photographs would meet it, if chance alone is the cause."
+        )
+    empty = {name: 1 - float(covered_cells(cameras.fit, number).mean()) for number, name in enumerate(cameras.names)}
+    name, share = max(empty.items(), key=lambda pair: pair[1])
+    if share > 0.3:
+        return f"All limits are kept; boards nearer to the edges of camera {name} would cover the {share:.0%} of its image that none touches."
+    if len(cameras.fit.rig.places) < FEW_PLACES:
+        return f"All limits are kept by {len(cameras.fit.rig.places)} places of the board; twice as many would make lenses 1.4 times surer."
+    return "All limits are kept; nothing needs to be photographed again."

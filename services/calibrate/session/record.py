@@ -1,0 +1,175 @@
+"""A session's results as a calibration record, with one covariance over all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.rotations import cross_matrix, left_jacobian, pose_matrix, rotation_matrix
+from services.calibrate.lights.mirror import Eye
+from services.calibrate.session.boards import CamerasStep
+from services.calibrate.session.charts import ColourStep
+from services.calibrate.session.photos import Black
+from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.calibrated import CalibratedCamera, CalibratedLight, CameraColour, Lobe
+from services.core.calibration import Calibration
+from services.core.raw.records import RawFolder
+from services.core.uncertainty import LENS, TWIST, CalibrationUncertainty
+
+Floats = NDArray[np.float64]
+LIGHT_DRIFT = 1e-4
+"""Relative: a lamp's brightness changes by so much while it warms, whatever the fit says."""
+
+
+def record_of(
+    folder: RawFolder,
+    black: Mapping[str, Black],
+    cameras: CamerasStep,
+    lights: LightsStep | None,
+    intensity: IntensityStep | None,
+    colours: ColourStep | None,
+    made: str,
+    valid_days: float,
+    inputs: dict[str, str],
+) -> Calibration:
+    """The record; lights that neither highlights nor a list place are left out."""
+    eyes = cameras.eyes if lights is None else lights.fit.eyes
+    positions = light_positions(folder, lights)
+    return Calibration(
+        units="mm",
+        channels=folder.channels,
+        cameras=tuple(
+            _camera(name, eye, black[name], None if intensity is None else intensity.fit.radiance_per_count[number])
+            for number, (name, eye) in enumerate(zip(cameras.names, eyes, strict=True))
+        ),
+        lights=tuple(
+            _light(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
+            for number, where in positions.items()
+        ),
+        uncertainty=uncertainty_of(folder, cameras, lights, intensity),
+        made=made,
+        valid_days=valid_days,
+        inputs=inputs,
+        colour=None
+        if colours is None
+        else {
+            name: CameraColour.model_validate(
+                {
+                    "xyz_from_rgb": fit.matrix.tolist(),
+                    "root_polynomial": None if fit.root_polynomial is None else fit.root_polynomial.tolist(),
+                }
+            )
+            for name, fit in colours.fits.items()
+        },
+    )
+
+
+def light_positions(folder: RawFolder, lights: LightsStep | None) -> dict[int, Floats]:
+    """Positions (3,) by number of the light: from highlights, else from the list laid over them, else from the list as it is."""
+    found = {} if lights is None else dict(zip(lights.fit.lights.tolist(), lights.fit.positions_mm, strict=True))
+    positions = {}
+    for number, light in enumerate(folder.light):
+        if number in found:
+            positions[number] = found[number]
+        elif lights is not None and lights.aligned is not None:
+            positions[number] = lights.aligned.positions_mm[number]
+        elif lights is None and light.position_mm is not None:
+            positions[number] = np.array(light.position_mm)
+    return positions
+
+
+def twist_derivative(pose: Floats) -> Floats:
+    """Derivative (6, 6) of a camera's twist, about its own centre in world axes, to its pose camera_from_world.
+
+    The rotation R = exp(r) becomes R exp(−w) under the twist's rotation w, so w = −Rᵀ J dr; and the centre c = −Rᵀ t moves by
+    −Rᵀ dt + w × c.
+    """
+    R = rotation_matrix(pose[:3])
+    centre = -R.T @ pose[3:]
+    turn = -R.T @ left_jacobian(pose[:3])
+    derivative = np.zeros((6, 6))
+    derivative[:3, :3] = turn
+    derivative[3:, :3] = -cross_matrix(centre) @ turn
+    derivative[3:, 3:] = -R.T
+    return derivative
+
+
+def uncertainty_of(
+    folder: RawFolder, cameras: CamerasStep, lights: LightsStep | None, intensity: IntensityStep | None
+) -> CalibrationUncertainty:
+    """Covariance of cameras, lights and intensities together; what they share goes from the first to the last."""
+    eyes = cameras.eyes if lights is None else lights.fit.eyes
+    names, rows = _camera_rows(cameras.names, eyes)
+    covariance = cameras.camera_covariance
+    first = 0
+    if lights is not None:
+        covariance, count = lights.fit.covariance, 3 * len(lights.fit.lights)
+        first = len(covariance) - rows.shape[1]
+        names += [f"light.{folder.light[number].name}.{axis}" for number in lights.fit.lights for axis in "xyz"]
+        rows = np.block([[np.zeros((len(rows), first)), rows], [np.eye(count, len(covariance))]])
+    noise = np.zeros((len(rows), len(rows)))
+    if intensity is not None:
+        fit = intensity.fit
+        seen = np.flatnonzero(np.isfinite(fit.intensity[:, 0]))
+        names += [f"light_gain.{folder.light[n].name}.{channel}" for n in seen for channel in folder.channels]
+        moved = np.zeros((len(fit.covariance), covariance.shape[1]))
+        if lights is not None:
+            # A light that is believed nearer than it is comes out dimmer: gains go with the positions that highlights found.
+            for place, number in enumerate(lights.fit.lights):
+                moved[:, 3 * place : 3 * place + 3] = fit.by_positions[:, 3 * number : 3 * number + 3]
+        rows = np.concatenate([rows, moved])
+        noise = np.zeros((len(rows), len(rows)))
+        noise[-len(moved) :, -len(moved) :] = fit.covariance + LIGHT_DRIFT**2 * np.eye(len(moved))
+    total = rows @ covariance @ rows.T + noise
+    return CalibrationUncertainty.model_validate({"names": names, "covariance": ((total + total.T) / 2).tolist()})
+
+
+def _camera_rows(names: Sequence[str], eyes: Sequence[Eye]) -> tuple[list[str], Floats]:
+    """Names of the cameras' errors, and their derivative to lens values and pose of each camera in turn."""
+    told, blocks, width = [], [], sum(len(eye.lens.values) + 6 for eye in eyes)
+    first = 0
+    for name, eye in zip(names, eyes, strict=True):
+        count = len(eye.lens.values)
+        block = np.zeros((10, width))
+        block[:6, first + count : first + count + 6] = twist_derivative(eye.pose)
+        block[6:, first : first + 4] = np.diag([1 / eye.lens.values[0], 1 / eye.lens.values[1], 1, 1])
+        told += [f"camera.{name}.{axis}" for axis in TWIST + LENS]
+        blocks.append(block)
+        first += count + 6
+    return told, np.concatenate(blocks)
+
+
+def _camera(name: str, eye: Eye, black: Black, scale: Floats | None) -> CalibratedCamera:
+    return CalibratedCamera.model_validate(
+        {
+            "name": name,
+            "size": eye.lens.size,
+            "K": eye.lens.matrix.tolist(),
+            "distortion": eye.lens.distortion.tolist() or None,
+            "camera_from_world": pose_matrix(eye.pose).tolist(),
+            "radiance_per_count": None if scale is None else scale.tolist(),
+            "black_counts": black.counts,
+            "read_noise_counts": black.noise,
+        }
+    )
+
+
+def _light(
+    name: str,
+    where: Floats,
+    number: int,
+    step: IntensityStep | None,
+    channels: int,
+    positions: Mapping[int, Floats],
+) -> CalibratedLight:
+    """A light; one that no white sphere was lit by takes the mean intensity, 1."""
+    known = step is not None and bool(np.isfinite(step.fit.intensity[number, 0]))
+    lobe = None
+    if step is not None and step.fit.exponent > 0:
+        axis = np.array(step.middle_mm) - positions[number]
+        lobe = Lobe.model_validate({"axis": (axis / np.linalg.norm(axis)).tolist(), "exponent": step.fit.exponent})
+    intensity = step.fit.intensity[number].tolist() if step is not None and known else [1.0] * channels
+    x, y, z = (float(one) for one in where)
+    return CalibratedLight(name=name, position_mm=(x, y, z), intensity=tuple(intensity), lobe=lobe)

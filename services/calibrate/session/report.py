@@ -1,0 +1,137 @@
+"""A calibration's report: one HTML file that opens alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from services.calibrate.session.boards import model_told
+from services.calibrate.session.drawings import (
+    ARROW_PX,
+    chart_drawing,
+    corners_drawing,
+    lights_drawing,
+    srgb,
+    uncertainty_drawing,
+)
+from services.calibrate.session.run import Session
+from services.core.store import write_atomic
+
+REPORT = "report.html"
+
+
+def write_report(session: Session, out: Path) -> None:
+    """Write ``report.html`` into a folder."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string((Path(__file__).parent / "report.html.j2").read_text(encoding="utf-8"))
+    judgement = session.judgement
+    broken = len(judgement.broken)
+    page = template.render(
+        made=session.record.made,
+        days=f"{session.record.valid_days:g}",
+        verdict="All limits are kept." if not broken else f"{broken} of {len(judgement.limits)} limits are not kept.",
+        advice=judgement.advice,
+        suspicions=judgement.suspicions,
+        limits=judgement.limits,
+        arrow=f"{ARROW_PX:g}",
+        channels=", ".join(session.record.channels),
+        cameras=[_camera(session, number) for number in range(len(session.cameras.names))],
+        lights=_lights(session),
+        colours=_colours(session),
+        assumed=list(_assumed(session)),
+    )
+    write_atomic(out / REPORT, page.encode())
+
+
+def _markup(drawing: str) -> Any:
+    from markupsafe import Markup
+
+    return Markup(drawing)  # noqa: S704 - drawn from numbers, names escaped
+
+
+def _camera(session: Session, number: int) -> dict[str, Any]:
+    fit, name = session.cameras.fit, session.cameras.names[number]
+    values = fit.rig.lenses[number].values
+    errors = np.sqrt(np.diag(fit.covariance)[fit.layout.lens_columns(number)])
+    mine = fit.corners.camera == number
+    drawing, largest = uncertainty_drawing(fit, number, session.cameras.distance_mm)
+    told = {key: f"{values[place]:.2f} ± {errors[place]:.2f}" for place, key in enumerate(("fx", "fy", "cx", "cy"))}
+    return {
+        **told,
+        "name": name,
+        "model": model_told(session.cameras.choices[name]),
+        "corners": int(mine.sum()),
+        "left_out": int((mine & ~fit.inliers).sum()),
+        "sigma": f"{fit.sigma_px[number]:.3f}",
+        "residuals": _markup(corners_drawing(fit, number)),
+        "uncertainty": _markup(drawing),
+        "largest": f"{largest:.3f}",
+    }
+
+
+def _lights(session: Session) -> dict[str, Any] | None:
+    record = session.record
+    if not record.lights:
+        return None
+    errors = np.full(len(record.lights), np.nan)
+    if record.uncertainty is not None:
+        place = {name: n for n, name in enumerate(record.uncertainty.names)}
+        variances = np.diag(record.uncertainty.matrix)
+        for number, light in enumerate(record.lights):
+            mine = [place[f"light.{light.name}.{axis}"] for axis in "xyz" if f"light.{light.name}.{axis}" in place]
+            errors[number] = np.sqrt(variances[mine].sum()) if mine else np.nan
+    where = np.array([light.position_mm for light in record.lights])
+    cameras = np.array([eye.centre_mm for eye in session.cameras.eyes])
+    names = [light.name for light in record.lights]
+    rows = [
+        {
+            "name": light.name,
+            "where": ", ".join(f"{x:.1f}" for x in light.position_mm),
+            "error": f"{error:.2f} mm" if np.isfinite(error) else "not known",
+            "intensity": ", ".join(f"{x:.4f}" for x in light.intensity),
+        }
+        for light, error in zip(record.lights, errors, strict=True)
+    ]
+    told = []
+    if session.lights is not None:
+        fit = session.lights.fit
+        told.append(
+            f"Highlights scatter by {fit.highlight_sigma_px:.3f} px and outlines by {fit.outline_sigma_px:.3f} px about the fit."
+        )
+    if session.intensity is not None:
+        scatter = ", ".join(f"{100 * one:.2f} %" for one in session.intensity.fit.sigma)
+        told.append(f"Photographs of white spheres scatter by {scatter} about the fit.")
+    drawing = lights_drawing(where, names, cameras, errors if np.isfinite(errors).all() else None)
+    return {"drawing": _markup(drawing), "rows": rows, "told": " ".join(told)}
+
+
+def _colours(session: Session) -> list[dict[str, Any]]:
+    step = session.colours
+    if step is None:
+        return []
+    told = []
+    for name, fit in step.fits.items():
+        rgb = step.rgb[name]
+        drawing = chart_drawing(srgb(step.xyz), rgb, srgb(fit.xyz(np.nan_to_num(rgb))))
+        models = ", ".join(f"{model} {value:.2f}" for model, value in fit.held_out_by_model.items())
+        sentence = f"ΔE2000 of patches that were left out, mean by model: {models}."
+        told.append({"name": name, "drawing": _markup(drawing), "told": sentence})
+    return told
+
+
+def _assumed(session: Session) -> Iterator[str]:
+    yield "Counts are linear in light above black."
+    yield "The fall of light towards the image's corners was not measured: no vignetting is in the record."
+    if session.lights is None:
+        yield "No mirror sphere was photographed: lights stand where raw.toml lists them, in the frame of the first board."
+    if session.intensity is None:
+        yield "No white sphere was photographed: all lights count as equally bright."
+    elif session.intensity.fit.exponent == 0:
+        yield "Lights shine alike in all directions: the white spheres' places tell of no lobe."
+    if session.colours is not None:
+        yield "Light on the chart is even; its white is that of its grey patches."

@@ -1,0 +1,114 @@
+"""One raw folder's calibration frames to ``calibration.json``, its residuals and its report."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from services.calibrate.session.boards import CamerasStep, calibrate_cameras
+from services.calibrate.session.charts import ColourStep, calibrate_colours
+from services.calibrate.session.judge import Judgement, judge
+from services.calibrate.session.photos import Photos
+from services.calibrate.session.record import light_positions, record_of
+from services.calibrate.session.spheres import IntensityStep, LightsStep, find_lights, measure_intensity
+from services.core.calibration import Calibration
+from services.core.raw.folder import DESCRIPTION, read_raw_folder
+from services.core.store import write_atomic, write_record
+
+VALID_DAYS = 30.0
+"""A rig that stands in a practice is touched within a month."""
+CALIBRATION, RESIDUALS = "calibration.json", "residuals.json"
+
+
+@dataclass(frozen=True)
+class Session:
+    """All that a raw folder's calibration frames say."""
+
+    record: Calibration
+    cameras: CamerasStep
+    lights: LightsStep | None
+    intensity: IntensityStep | None
+    colours: ColourStep | None
+    judgement: Judgement
+
+
+def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_days: float = VALID_DAYS) -> Session:
+    """Calibrate cameras, lights and colours from the frames of a raw folder.
+
+    Args:
+        root: folder with ``raw.toml``.
+        tell: is told each step as it begins.
+        valid_days: after how many days the calibration warns that it is old.
+
+    Raises:
+        CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
+    """
+    folder = read_raw_folder(root)
+    photos = Photos(root, folder)
+    tell("cameras: boards, lenses, poses")
+    cameras = calibrate_cameras(photos)
+    tell("lights: mirror spheres")
+    lights = find_lights(photos, cameras.eyes, cameras.camera_covariance, cameras.distance_mm)
+    eyes = cameras.eyes if lights is None else lights.fit.eyes
+    tell("intensities: white spheres")
+    positions = np.full((len(folder.light), 3), np.nan)
+    for number, where in light_positions(folder, lights).items():
+        positions[number] = where
+    intensity = measure_intensity(photos, eyes, positions, cameras.distance_mm)
+    tell("colours: charts")
+    colours = calibrate_colours(photos)
+    used = [root / DESCRIPTION, *(root / frame.file for frame in folder.frame if _is_used(frame.kind))]
+    inputs = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in used}
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    record = record_of(folder, photos.black, cameras, lights, intensity, colours, made, valid_days, inputs)
+    judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty)
+    return Session(record, cameras, lights, intensity, colours, judgement)
+
+
+def write_session(session: Session, out: Path) -> None:
+    """Write ``calibration.json`` and ``residuals.json`` into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(out / RESIDUALS, (json.dumps(_residuals(session), indent=1) + "\n").encode())
+    write_record(out / CALIBRATION, session.record)
+
+
+def _is_used(kind: str) -> bool:
+    return kind in {"black", "board", "mirror-sphere", "white-sphere", "chart"}
+
+
+def _residuals(session: Session) -> dict[str, Any]:
+    """What each step left over, by the photograph it comes from."""
+    fit = session.cameras.fit
+    told: dict[str, Any] = {
+        "corners": [
+            {
+                "file": view.name,
+                "ids": view.ids.tolist(),
+                "seen_px": np.round(view.pixels, 4).tolist(),
+                "seen_minus_drawn_px": np.round(fit.residuals_px[fit.corners.view == number], 4).tolist(),
+                "used": fit.inliers[fit.corners.view == number].tolist(),
+            }
+            for number, view in enumerate(session.cameras.views)
+        ]
+    }
+    if session.lights is not None:
+        first = 0
+        told["highlights"] = []
+        for name, view in zip(session.lights.view_names, session.lights.views, strict=True):
+            off = session.lights.fit.highlight_errors_px[first : first + len(view.lights)]
+            first += len(view.lights)
+            told["highlights"].append(
+                {"of": name, "lights": view.lights.tolist(), "seen_minus_drawn_px": np.round(off, 4).tolist()}
+            )
+    if session.intensity is not None:
+        told["white_spheres"] = np.round(session.intensity.fit.residuals, 6).tolist()
+    if session.colours is not None:
+        told["patches_delta_e_2000"] = {name: one.fitted.tolist() for name, one in session.colours.fits.items()}
+    return told

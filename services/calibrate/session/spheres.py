@@ -1,0 +1,150 @@
+"""The lights' steps: mirror spheres to positions, white spheres to intensities."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.lights.centres import OutlineView, fit_centres
+from services.calibrate.lights.images import Outline, find_highlight, find_outline
+from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity
+from services.calibrate.lights.listed import AlignedList, align_list
+from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.positions import LightsFit, fit_lights
+from services.calibrate.lights.problem import SphereView
+from services.calibrate.session.photos import Photos
+from services.core.errors import CaptureInputError
+from services.core.raw.records import FrameKind, RawFrame
+
+Floats = NDArray[np.float64]
+WHITE_PIXELS_ACROSS = 60
+"""A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit it."""
+
+
+@dataclass(frozen=True)
+class LightsStep:
+    """Where lights are: the fit to highlights, and the list of ``raw.toml`` laid over it where there is one."""
+
+    fit: LightsFit
+    views: tuple[SphereView, ...]
+    view_names: tuple[str, ...]
+    aligned: AlignedList | None
+    no_highlight: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class IntensityStep:
+    """How bright lights are, and the mean place of the white spheres (3,), towards which intensities are told."""
+
+    fit: IntensityFit
+    photos: tuple[WhitePhoto, ...]
+    middle_mm: Floats
+
+
+def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distance_mm: float) -> LightsStep | None:
+    """Positions of the lights from the folder's mirror spheres; None without any.
+
+    Raises:
+        CaptureInputError: no sphere is found in a photograph, or its radius cannot be right.
+    """
+    groups = _groups(photos, "mirror-sphere")
+    if not groups:
+        return None
+    folder = photos.folder
+    cameras, lights = [camera.name for camera in folder.camera], [light.name for light in folder.light]
+    places = list(dict.fromkeys(place for _, place in groups))
+    radii = {sphere.name: sphere.radius_mm for sphere in folder.sphere}
+    views, names, missed = [], [], []
+    for (camera, place), frames in groups.items():
+        radius, eye = radii[str(frames[0].sphere)], eyes[cameras.index(camera)]
+        outline = _outline(photos, frames, eye, radius, distance_mm)
+        found = {}
+        for frame in frames:
+            where = find_highlight(photos.grey(frame), outline.points_px)
+            if where is None:
+                missed.append(frame.file)
+            else:
+                found[lights.index(str(frame.light))] = where
+        numbers = np.array(sorted(found), dtype=np.int64)
+        pixels = np.array([found[number] for number in numbers]).reshape(-1, 2)
+        views.append(SphereView(cameras.index(camera), places.index(place), radius, outline.points_px, numbers, pixels))
+        names.append(f"camera {camera}, {place}")
+    fit = fit_lights(views, eyes, lights, covariance)
+    listed = np.array([light.position_mm or (np.nan,) * 3 for light in folder.light], dtype=np.float64)
+    aligned = None
+    if np.isfinite(listed).all():
+        all_found = np.full((len(lights), 3), np.nan)
+        all_found[fit.lights] = fit.positions_mm
+        aligned = align_list(listed, all_found)
+    return LightsStep(fit, tuple(views), tuple(names), aligned, tuple(missed))
+
+
+def measure_intensity(
+    photos: Photos, eyes: Sequence[Eye], lights_mm: Floats, distance_mm: float
+) -> IntensityStep | None:
+    """Intensities of the lights from the folder's white spheres; None without any."""
+    groups = _groups(photos, "white-sphere")
+    if not groups:
+        return None
+    folder = photos.folder
+    cameras, lights = [camera.name for camera in folder.camera], [light.name for light in folder.light]
+    places = list(dict.fromkeys(place for _, place in groups))
+    things = {sphere.name: sphere for sphere in folder.sphere}
+    outlines: list[OutlineView] = []
+    found: list[WhitePhoto] = []
+    thing_of = {place: things[str(frames[0].sphere)] for (_, place), frames in groups.items()}
+    for (camera, place), frames in groups.items():
+        eye, radius = eyes[cameras.index(camera)], thing_of[place].radius_mm
+        outline = _outline(photos, frames, eye, radius, distance_mm)
+        outlines.append(OutlineView(cameras.index(camera), places.index(place), radius, outline.points_px))
+        for frame in frames:
+            number = lights.index(str(frame.light))
+            pixels, values = _sampled(photos, frame, outline)
+            found.append(WhitePhoto(cameras.index(camera), places.index(place), number, pixels, values))
+    centres = fit_centres(outlines, eyes)
+    spheres = [
+        WhiteSphere(centre, thing_of[place].radius_mm, np.array(thing_of[place].reflectance))
+        for centre, place in zip(centres, places, strict=True)
+    ]
+    middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
+    return IntensityStep(fit_intensity(found, eyes, spheres, lights_mm, lights), tuple(found), middle)
+
+
+def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFrame]]:
+    """Frames of spheres by camera and place; a sphere without a place stood at one."""
+    groups: dict[tuple[str, str], list[RawFrame]] = defaultdict(list)
+    for frame in photos.folder.frame:
+        if frame.kind == kind:
+            groups[frame.camera, f"{frame.sphere}, {frame.place or 'its place'}"].append(frame)
+    return groups
+
+
+def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: float, distance_mm: float) -> Outline:
+    """The outline in the mean of all lights, as each alone leaves a part of it dark."""
+    total = sum(photos.grey(frame).astype(np.float64) for frame in frames)
+    outline = find_outline(np.asarray(total / len(frames), dtype=np.float32), eye, radius_mm, distance_mm)
+    if outline is None:
+        first = frames[0]
+        raise CaptureInputError(
+            f"Frame {first.file} (camera {first.camera}) shows no whole outline of sphere {first.sphere} of radius {radius_mm:g} mm; "
+            "photograph it whole against a background of another brightness, or correct radius_mm."
+        )
+    return outline
+
+
+def _sampled(photos: Photos, frame: RawFrame, outline: Outline) -> tuple[Floats, Floats]:
+    """Pixels (N, 2) and light by channel (N, C) on a grid over a sphere, saturated values left out."""
+    channels = photos.channels(frame)
+    middle = outline.points_px.mean(axis=0)
+    reach = float(np.linalg.norm(outline.points_px - middle, axis=1).mean())
+    step = max(int(2 * reach / channels.pixel / WHITE_PIXELS_ACROSS), 1)
+    low = np.maximum(((middle - reach) / channels.pixel).astype(int), 0)
+    high = np.minimum(((middle + reach) / channels.pixel).astype(int) + 1, channels.values.shape[1::-1])
+    columns, rows = (grid.ravel() for grid in np.meshgrid(*(np.arange(low[k], high[k], step) for k in (0, 1))))
+    good = ~channels.saturated[rows, columns]
+    rows, columns = rows[good], columns[good]
+    return channels.centres(rows, columns), channels.values[rows, columns].astype(np.float64)

@@ -1,0 +1,39 @@
+"""``dentine calibrate``: photographs of boards, spheres and charts to a calibration that knows its errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from services.calibrate.session.run import Session
+
+
+def calibrate_command(
+    raw: Annotated[Path, typer.Argument(metavar="RAW", help="Folder with raw.toml and its frames.")],
+    out: Annotated[Path, typer.Option(help="Folder of calibration.json, residuals.json and report.html.")],
+    valid_days: Annotated[float, typer.Option(min=1, help="After how many days the calibration is old.")] = 30.0,
+    accept: Annotated[bool, typer.Option("--accept", help="End well though a limit is not kept.")] = False,
+) -> None:
+    """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status 9."""
+    from services.calibrate.session.report import write_report
+    from services.calibrate.session.run import calibrate, write_session
+
+    session = calibrate(raw, print, valid_days)
+    write_session(session, out)
+    write_report(session, out)
+    _tell(session)
+    print(f"calibration: {out / 'calibration.json'}, report: {out / 'report.html'}")
+    if session.judgement.broken and not accept:
+        raise typer.Exit(9)
+
+
+def _tell(session: Session) -> None:
+    for limit in session.judgement.limits:
+        kept = "" if limit.is_kept else ", beyond its limit"
+        print(f"{limit.what}: {limit.value:.3g} {limit.unit} (limit {limit.limit:g}){kept}")
+    for sentence in session.judgement.suspicions:
+        print(sentence)
+    print(session.judgement.advice)

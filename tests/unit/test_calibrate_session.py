@@ -1,0 +1,200 @@
+"""A raw folder of calibration frames whose truth is known, from its files to the record and its report."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from services.calibrate.cameras.printing import board_pdf, board_rectangles
+from services.calibrate.session.judge import judge
+from services.calibrate.session.photos import Photos
+from services.calibrate.session.record import uncertainty_of
+from services.calibrate.session.report import write_report
+from services.calibrate.session.run import Session, calibrate, write_session
+from services.calibrate.session.spheres import LightsStep, find_lights
+from services.cli.app import build_app
+from services.core.calibration import Calibration, require_consistent
+from services.core.errors import CaptureInputError
+from services.core.raw.folder import read_raw_folder
+from services.core.raw.records import RawFolder
+from services.core.store import read_record
+from tests.support.board_sessions import CHESSBOARD, charuco
+from tests.support.virtual_session import BOARD, XYZ_FROM_SENSOR, Truth, write_virtual_session
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Truth]]:
+    root = tmp_path_factory.mktemp("session")
+    sizes = {"n_cameras": 2, "n_lights": 4, "n_places": 6, "n_mirror": 2, "n_white": 1}
+    yield root, write_virtual_session(root, np.random.default_rng(1), **sizes)
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="module")
+def session(made: tuple[Path, Truth]) -> Session:
+    return calibrate(made[0])
+
+
+def test_cameras_are_where_they_were(made: tuple[Path, Truth], session: Session) -> None:
+    truth, fit = made[1], session.cameras.fit
+    for number, eye in enumerate(truth.eyes):
+        assert fit.rms_px(number) < 0.12
+        # Points around the teeth are drawn where the true camera draws them, within four times the largest ±.
+        points = np.random.default_rng(0).uniform(-20, 20, (50, 3)) + np.array([54.0, 42.0, 0.0])
+        off = np.linalg.norm(session.cameras.eyes[number].project(points) - eye.project(points), axis=1)
+        assert off.max() < 0.4
+
+
+def test_lights_are_as_far_off_as_their_errors_say(made: tuple[Path, Truth], session: Session) -> None:
+    assert session.lights is not None
+    fit = session.lights.fit
+    error = (fit.positions_mm - made[1].lights_mm).ravel()
+    covariance = fit.covariance[:12, :12]
+    # Twelve values: a rms of whitened errors beyond 1.7 has a chance below 0.1 %.
+    assert np.sqrt(np.mean(np.linalg.solve(np.linalg.cholesky(covariance), error) ** 2)) < 1.7
+    assert fit.outliers == ()
+
+
+def test_colours_are_the_sensors(session: Session) -> None:
+    assert session.colours is not None
+    for fit in session.colours.fits.values():
+        assert fit.matrix == pytest.approx(XYZ_FROM_SENSOR, abs=0.01)
+        assert np.median(fit.held_out) < 1
+
+
+def test_the_record_is_one_that_jobs_read(made: tuple[Path, Truth], session: Session, tmp_path: Path) -> None:
+    write_session(session, tmp_path)
+    write_report(session, tmp_path)
+    record = read_record(tmp_path / "calibration.json", Calibration)
+    require_consistent(record, "it")
+    assert record.uncertainty is not None
+    names = record.uncertainty.names
+    assert {"camera.c0.rx", "camera.c1.cy", "light.L3.z", "light_gain.L2.blue"} <= set(names)
+    # Gains and positions err together: a light that is believed nearer comes out dimmer.
+    gains, places = names.index("light_gain.L0.red"), names.index("light.L0.x")
+    assert np.abs(record.uncertainty.matrix[gains, places : places + 3]).max() > 0
+    assert np.mean([light.intensity for light in record.lights], axis=0) == pytest.approx(1)
+    assert record.inputs is not None
+    assert "raw.toml" in record.inputs
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<svg") == 2 * 2 + 1 + 2
+    assert not re.search(r"(src|href)=", page)
+    assert '"corners"' in (tmp_path / "residuals.json").read_text()
+
+
+def with_lights(session: Session, root: Path, folder: RawFolder) -> LightsStep:
+    photos = Photos(root, folder)
+    cameras = session.cameras
+    found = find_lights(photos, cameras.eyes, cameras.camera_covariance, cameras.distance_mm)
+    assert found is not None
+    return found
+
+
+def suspicions(session: Session, folder: RawFolder, lights: LightsStep) -> str:
+    uncertainty = uncertainty_of(folder, session.cameras, lights, None)
+    return " ".join(judge(folder, session.cameras, lights, None, None, uncertainty).suspicions)
+
+
+def test_a_good_session_raises_no_suspicion(session: Session) -> None:
+    assert session.judgement.suspicions == ()
+
+
+@pytest.mark.slow
+def test_a_wrong_radius_is_named(made: tuple[Path, Truth], session: Session) -> None:
+    folder = read_raw_folder(made[0])
+    spheres = tuple(
+        one.model_copy(update={"radius_mm": one.radius_mm * (1.05 if one.kind == "mirror" else 1)})
+        for one in folder.sphere
+    )
+    wrong = folder.model_copy(update={"sphere": spheres})
+    assert "measure radius_mm again" in suspicions(session, wrong, with_lights(session, made[0], wrong))
+
+
+@pytest.mark.slow
+def test_one_light_under_two_names_is_named(made: tuple[Path, Truth], session: Session) -> None:
+    folder = read_raw_folder(made[0])
+    frames = []
+    for frame in folder.frame:
+        if frame.light == "L1" and frame.kind == "mirror-sphere":
+            continue
+        frames.append(frame)
+        if frame.light == "L0" and frame.kind == "mirror-sphere":
+            frames.append(frame.model_copy(update={"light": "L1"}))
+    twice = folder.model_copy(update={"frame": tuple(frames)})
+    told = suspicions(session, twice, with_lights(session, made[0], twice))
+    assert "Lights L0 and L1 lie 0.0 mm apart" in told
+
+
+def test_a_sphere_that_is_not_there_is_named(made: tuple[Path, Truth], session: Session) -> None:
+    folder = read_raw_folder(made[0])
+    black = next(frame for frame in folder.frame if frame.kind == "black" and frame.camera == "c0")
+    frames = tuple(
+        frame.model_copy(update={"file": black.file})
+        if frame.kind == "mirror-sphere" and frame.camera == "c0"
+        else frame
+        for frame in folder.frame
+    )
+    with pytest.raises(CaptureInputError, match=r"camera c0\) shows no whole outline of sphere mirror"):
+        with_lights(session, made[0], folder.model_copy(update={"frame": frames}))
+
+
+def test_a_folder_without_boards_is_refused(made: tuple[Path, Truth]) -> None:
+    from services.calibrate.session.boards import calibrate_cameras
+
+    folder = read_raw_folder(made[0])
+    frames = tuple(frame for frame in folder.frame if frame.kind != "board")
+    with pytest.raises(CaptureInputError, match="no frame of kind board; photograph a board"):
+        calibrate_cameras(Photos(made[0], folder.model_copy(update={"frame": frames})))
+
+
+@pytest.mark.parametrize(
+    "board", [BOARD, CHESSBOARD, charuco((5, 8), legacy_pattern=True), charuco((4, 3), type="aruco")]
+)
+def test_a_printed_board_is_opencvs(board) -> None:  # type: ignore[no-untyped-def]
+    import cv2
+
+    from services.calibrate.cameras.boards import opencv_board
+
+    scale = 10
+    columns, rows = board.squares
+    width, height = (round(n * board.square_mm * scale) for n in (columns, rows))
+    ours = np.full((height, width), 255, dtype=np.uint8)
+    for x, y, w, h in board_rectangles(board):
+        corner, end = (round(x * scale), round(y * scale)), (round((x + w) * scale), round((y + h) * scale))
+        ours[corner[1] : end[1], corner[0] : end[0]] = 0
+    if board.type == "chessboard":
+        found, _ = cv2.findChessboardCornersSB(cv2.copyMakeBorder(ours, 200, 200, 200, 200, 0, value=255), (8, 6))
+        assert found
+        return
+    made = opencv_board(board)
+    if board.type == "aruco":
+        width, height = (
+            width - round((board.square_mm - board.marker_mm) * scale),
+            height - round((board.square_mm - board.marker_mm) * scale),
+        )
+        ours = ours[:height, :width]
+    theirs = made.generateImage((width, height))
+    # OpenCV draws markers to whole pixels, so cells' edges may differ by one.
+    assert np.mean(ours != theirs) < 0.02
+
+
+def test_a_pdf_has_the_boards_size() -> None:
+    content = board_pdf(BOARD)
+    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", content)
+    assert box is not None
+    assert [float(one) * 25.4 / 72 for one in box.groups()] == pytest.approx([128, 114], abs=1e-3)
+    start = int(content.split(b"startxref\n")[1].split(b"\n")[0])
+    assert content[start:].startswith(b"xref")
+
+
+def test_the_command_writes_a_board(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(build_app(), ["board", "--out", str(tmp_path / "b.pdf"), "--squares", "7", "5"])
+    assert ran.exit_code == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert "squares = [7, 5]" in ran.output
