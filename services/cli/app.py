@@ -58,6 +58,7 @@ def build_app() -> typer.Typer:
     from services.cli.export import export
     from services.cli.import_folder import import_command
     from services.cli.phantom import phantom
+    from services.cli.register import register
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
     from services.cli.serve import serve
@@ -74,7 +75,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_root)
-    local = serve, dome_sim, capture, run, export, phantom, bench
+    local = serve, dome_sim, capture, run, export, register, phantom, bench
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
@@ -99,6 +100,7 @@ _EXTRAS = MappingProxyType(
         "dome-sim": "capture",
         "bench": "worker,bench",
         "import": "preprocess",
+        "register": "calibrate,preprocess",
     }
 )
 """What a command needs beside the base installation; of those that are not named here all that a worker has."""

@@ -12,9 +12,9 @@ from services.anatomy.templates.average_arch import is_upper, side_of_front
 from services.anatomy.templates.dimensions import upper_tooth
 from services.core.errors import MeshError
 
-Unit = Literal["mm", "cm", "m", "inch"]
+Unit = Literal["mm", "cm", "m", "um", "inch"]
 
-MM_PER_UNIT = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4})
+MM_PER_UNIT = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4})
 LIKELY = (0.6, 1.6)
 """Distance between neighbouring teeth to that of average upper ones, as a median over a jaw: lower incisors are narrower by a third,
 teeth of one person differ from the average by up to 20 %, and crowded or gapped arches by as much again."""

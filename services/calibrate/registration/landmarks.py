@@ -24,6 +24,8 @@ DRAWS = 60
 """Triples: with a third of the clicks wrong, 60 hold a right one but for 1 in 10^9."""
 LEAST = 4
 """Clicks that are needed: three leave up to four poses, and no way to see a wrong one."""
+TRIED = 12
+"""Starts that are refined over all cameras."""
 MOST_WRONG = 1 / 3
 ROUNDS = 30
 CONVERGED = 1e-9
@@ -56,6 +58,20 @@ def pose_from_landmarks(
     Raises:
         CaptureInputError: too few clicks, or so many that contradict each other that no pose is to be believed.
     """
+    step, contradiction = fit_landmarks(cameras, clicks, centre_mm, click_mm)
+    if contradiction is not None:
+        raise CaptureInputError(contradiction)
+    return step
+
+
+def fit_landmarks(
+    cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
+) -> tuple[PoseStep, str | None]:
+    """The same with a sentence where the pose is not to be believed, so that a picture of it can be shown.
+
+    Raises:
+        CaptureInputError: too few clicks for any pose.
+    """
     most = max((sum(one.camera == name for one in clicks) for name in cameras), default=0)
     if most < LEAST:
         raise CaptureInputError(
@@ -67,14 +83,16 @@ def pose_from_landmarks(
         raise CaptureInputError(
             "The landmarks lie in one line or at one place, which leaves the scan's pose open; spread them over the arch."
         )
-    errors = [_errors(cameras, clicks, start, click_mm) for start in starts]
-    best = starts[int(np.argmin([np.minimum(error**2, FAR**2).sum() for error in errors]))]
+    # Far cameras see little perspective, so that a start may lean to the wrong side; refined over all cameras, it shows.
+    best = _best(cameras, clicks, starts, click_mm, TRIED)
+    refined = [_refined(cameras, clicks, start, centre_mm, click_mm)[0] for start in best]
+    (best_start,) = _best(cameras, clicks, [*best, *refined], click_mm, 1)
     kept = np.ones(len(clicks), dtype=bool)
-    pose, covariance = best, np.eye(6)
+    pose, covariance = best_start, np.eye(6)
     for _ in range(len(clicks)):
         # The robust fit first shows which clicks are far off; then the others are fitted alone.
         pose, covariance = _refined(
-            cameras, [one for one, good in zip(clicks, kept, strict=True) if good], best, centre_mm, click_mm
+            cameras, [one for one, good in zip(clicks, kept, strict=True) if good], best_start, centre_mm, click_mm
         )
         good = _errors(cameras, clicks, pose, click_mm) < FAR
         if (good == kept).all():
@@ -84,8 +102,7 @@ def pose_from_landmarks(
             break
     error = _errors(cameras, clicks, pose, click_mm)
     wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
-    if len(wrong) > MOST_WRONG * len(clicks) or np.count_nonzero(kept) < LEAST:
-        raise CaptureInputError(_contradiction(cameras, clicks, pose, kept))
+    is_believed = len(wrong) <= MOST_WRONG * len(clicks) and np.count_nonzero(kept) >= LEAST
     told = tuple(f"{one.name} in camera {one.camera}, {_offset_px(cameras, one, pose):.0f} px off" for one in wrong)
     residual_px = {
         name: float(
@@ -100,9 +117,18 @@ def pose_from_landmarks(
         for name in cameras
         if any(good and one.camera == name for one, good in zip(clicks, kept, strict=True))
     }
-    return PoseStep(
+    step = PoseStep(
         "landmarks", pose, covariance, residual_px, float(np.median(error[kept]) * click_mm), int(kept.sum()), told
     )
+    return step, None if is_believed else _contradiction(cameras, clicks, pose, kept)
+
+
+def _best(
+    cameras: Mapping[str, Camera], clicks: Sequence[Click], poses: Sequence[RigidPose], click_mm: float, count: int
+) -> list[RigidPose]:
+    # Those that most clicks agree with; a click that is far off counts the same however far.
+    errors = [np.minimum(_errors(cameras, clicks, pose, click_mm), FAR) for pose in poses]
+    return [poses[k] for k in np.argsort([float((error**2).sum()) for error in errors])[:count]]
 
 
 def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[RigidPose]:

@@ -8,7 +8,7 @@ A tooth's border to gums, lips or the dark is where likeness to tooth falls; tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ CLEAR = 0.25
 TUKEY = 4.685
 """Standard errors beyond which a point counts nothing (Tukey's biweight at 95 % efficiency)."""
 LEAST_SPREAD_PX = 0.15
+OTHER_TOOTH = 0.5
+"""Likeness to tooth beyond an outline from which on another tooth is taken to be there."""
 BETWEEN_WEIGHT = 0.25
 """Of a border between teeth: its dark line lies beside either tooth's edge by a width that nobody knows."""
 ROUNDS = 12
@@ -125,6 +127,29 @@ def pose_from_outlines(
     )
 
 
+def outline_misfit_mm(
+    views: Sequence[View], teeth: Sequence[Mesh], occluders: Sequence[Mesh], pose: RigidPose, reach_mm: float = 1.2
+) -> float:
+    """Median distance at the teeth between their outlines, as drawn at a pose, and the photographs'.
+
+    The nearest edges of a narrow search always lie close, whoever's teeth are seen; so the strongest one within a wide reach
+    counts here, and a point without a clear one counts as the reach. Borders between teeth are left out.
+    """
+    distances = []
+    for view in views:
+        contour, label = tooth_contours(
+            view.camera, [_placed(mesh, pose) for mesh in teeth], [_placed(mesh, pose) for mesh in occluders]
+        )
+        if len(contour.pixels) == 0:
+            continue
+        size_mm = float(np.median(millimetres_a_pixel(view.camera, contour.points_mm)))
+        appearance = learn_appearance(view.image, label >= 0, 0.5 * reach_mm / size_mm)
+        found = _searched(_thinned(contour), appearance, reach_mm / size_mm)
+        off = np.where(found.is_found, np.abs(found.offset_px) * size_mm, reach_mm)
+        distances.append(off[~found.contour.between])
+    return float(np.median(np.concatenate(distances))) if distances else reach_mm
+
+
 def _placed(mesh: Mesh, pose: RigidPose) -> Mesh:
     return Mesh(pose.apply(mesh.vertices_mm), mesh.faces)
 
@@ -155,6 +180,8 @@ def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Foun
     outside = (x < 1) | (y < 1) | (x > width - 2) | (y > height - 2)
     near = np.exp(-(steps**2) / (2 * (0.6 * reach_px) ** 2))
     offset, is_found = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
+    # A tooth that the scan does not have, of the other jaw or behind the scan's last, may be on the other side.
+    contour = replace(contour, between=contour.between | (likeness[:, -1] > OTHER_TOOTH))
     for between, strength in ((False, fall), (True, valley)):
         own = np.flatnonzero(contour.between == between)
         if len(own) == 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ class RigidPose:
 class PoseStep:
     """What one step of the registration has found."""
 
-    name: str
+    name: Literal["landmarks", "outlines"]
     pose: RigidPose
     covariance: Floats
     """(6, 6) of the twist about the teeth's centre in the rig: rad, then mm."""

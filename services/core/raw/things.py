@@ -89,7 +89,7 @@ class ScanFile(Record):
     """A labelled intra-oral scan to take the teeth from."""
 
     file: FileName
-    units: Literal["mm", "cm", "m", "um"]
+    units: Literal["mm", "cm", "m", "um", "inch"]
     labels: str | None = Field(
         default=None, description="property of the scan's faces or vertices that holds the labels, or a file beside it"
     )

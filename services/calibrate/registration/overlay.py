@@ -1,0 +1,90 @@
+"""Pictures that show where a pose puts the teeth in the photographs, and a page of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.registration.contours import tooth_contours
+from services.calibrate.registration.landmarks import Click
+from services.calibrate.registration.outlines import View
+from services.calibrate.registration.pose import PoseStep, RigidPose
+from services.core.geometry import Mesh
+from services.core.registration import Registration
+from services.core.store import write_atomic
+
+BRIGHT_PERCENT = 99.0
+GAMMA = 2.2
+COLOURS = {"landmarks": (255, 140, 0), "outlines": (80, 230, 80)}
+"""Blue, green, red, by step."""
+CLICKED, PREDICTED = (60, 60, 230), (230, 60, 230)
+
+
+def write_overlay(
+    path: Path,
+    view: View,
+    teeth: Sequence[Mesh],
+    occluders: Sequence[Mesh],
+    steps: Sequence[PoseStep],
+    clicks: Sequence[Click],
+) -> None:
+    """Write a PNG: outlines after each step, clicks as rings, and where the last step has them as dots joined to them."""
+    import cv2
+
+    picture = _displayed(view.image)
+    for step in steps:
+        contour, _ = tooth_contours(view.camera, _placed(teeth, step.pose), _placed(occluders, step.pose))
+        column, row = np.floor(contour.pixels).astype(int).T
+        picture[np.clip(row, 0, len(picture) - 1), np.clip(column, 0, picture.shape[1] - 1)] = COLOURS[step.name]
+    for one in clicks if steps else ():
+        if one.camera != view.camera.name:
+            continue
+        there = view.camera.project(steps[-1].pose.apply(one.point_mm[None]))[0][0]
+        ends = [tuple(int(value) for value in np.round(place - 0.5)) for place in (one.pixel, there)]
+        cv2.line(picture, ends[0], ends[1], PREDICTED, 1)
+        cv2.circle(picture, ends[0], 4, CLICKED, 1)
+        cv2.circle(picture, ends[1], 2, PREDICTED, -1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, cv2.imencode(".png", picture)[1].tobytes())
+
+
+def report_page(record: Registration) -> str:
+    """An HTML page of the record and its pictures, which lie beside it."""
+    rows = "".join(
+        f"<tr><td>{escape(step.name)}</td><td>{step.points}</td><td>{step.residual_mm:.3f}</td>"
+        f"<td>{escape(', '.join(f'{name} {value:.2f}' for name, value in step.residual_px.items()))}</td>"
+        f"<td>{_errors(step.covariance)}</td><td>{escape('; '.join(step.left_out))}</td></tr>"
+        for step in record.steps
+    )
+    pictures = "".join(f'<p><img src="{escape(name)}" alt="{escape(name)}"></p>' for name in record.pictures)
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Registration</title>'
+        "<style>body{font-family:sans-serif;margin:2em}td,th{padding:.2em .8em;text-align:left}img{max-width:100%}</style>"
+        f"<h1>Registration</h1><p>Teeth {', '.join(map(str, record.teeth))}. {escape(record.repairs)}</p>"
+        f"<p>Median distance of the teeth's outlines from those in the photographs: {record.misfit_mm:.3f} mm.</p>"
+        "<table><tr><th>step</th><th>points</th><th>residual, mm</th><th>residual, px</th><th>standard errors</th>"
+        f"<th>left out</th></tr>{rows}</table>"
+        "<p>Outlines: orange after landmarks, green after outlines. Rings: clicks; dots: where the scan has them.</p>"
+        f"{pictures}</html>\n"
+    )
+
+
+def _errors(covariance: Sequence[Sequence[float]]) -> str:
+    turn, move = np.split(np.sqrt(np.diag(np.asarray(covariance))), 2)
+    return f"{np.degrees(np.linalg.norm(turn)):.3f}°, {np.linalg.norm(move):.3f} mm"
+
+
+def _placed(meshes: Sequence[Mesh], pose: RigidPose) -> list[Mesh]:
+    return [Mesh(pose.apply(mesh.vertices_mm), mesh.faces) for mesh in meshes]
+
+
+def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    # Blue, green, red of the first three channels, or grey.
+    bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
+    shown = np.clip(image[..., :3] / bright, 0, 1) ** (1 / GAMMA)
+    colours = shown[..., ::-1] if shown.shape[-1] == 3 else np.repeat(shown[..., :1], 3, axis=-1)
+    return np.ascontiguousarray(np.round(255 * colours).astype(np.uint8))

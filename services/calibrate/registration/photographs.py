@@ -1,0 +1,176 @@
+"""What registration looks at in a raw folder: one photograph a camera, without lens distortion, and clicks on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.lens import HALF_PIXEL, Lens
+from services.calibrate.registration.landmarks import Click
+from services.calibrate.registration.outlines import View
+from services.calibrate.registration.pose import Floats, RigidPose
+from services.core.calibrated import CalibratedCamera
+from services.core.calibration import Calibration
+from services.core.errors import CaptureInputError
+from services.core.geometry import Camera
+from services.core.raw.frames import read_counts
+from services.core.raw.mosaic import binned
+from services.core.raw.records import RawFolder, RawFrame
+
+WIDEST_PX = 2400
+"""Photographs are made smaller than this before anything else: a pixel is then some 0.05 mm at the teeth."""
+CUT_PX = 700
+"""Width of the part around the teeth in which outlines are looked for: 0.1 mm a pixel, and edges are found to a fraction of it."""
+MARGIN_MM = 4.0
+"""Around the teeth in that part."""
+MOST_LIGHTS = 12
+"""Frames of single lights that are averaged where no frame has all of them on."""
+
+
+def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict[str, View]:
+    """The teeth under all lights, or under the mean of some, by camera.
+
+    Raises:
+        CaptureInputError: a camera is not calibrated, or has no frame of the teeth.
+    """
+    views = {}
+    for raw in folder.camera:
+        camera = _calibrated(calibration, raw.name, raw.size)
+        frames = folder.frames_of(raw.name, "tracking")[:1] or _some(folder.frames_of(raw.name, "light"))
+        if not frames:
+            raise CaptureInputError(
+                f"Camera {raw.name} has no frame of kind tracking or light; add one that shows the teeth, or remove the camera."
+            )
+        black = _black_counts(root, folder, raw.name, camera)
+        mean = np.mean([_image(root, folder, frame, black) for frame in frames], axis=0, dtype=np.float32)
+        views[raw.name] = _undistorted(mean, camera)
+    return views
+
+
+def clicks_of(folder: RawFolder, calibration: Calibration) -> list[Click]:
+    """Landmarks of a raw folder, their pixels as a lens without distortion would have them."""
+    clicks = []
+    for landmark in folder.landmark:
+        for seen in landmark.pixels:
+            camera = _calibrated(calibration, seen.camera, folder.camera_named(seen.camera).size)
+            direction = _lens(camera).undistort(np.array([seen.xy_px], dtype=np.float64))
+            pixel = direction @ np.asarray(camera.K).T
+            name = f"{landmark.tooth} {landmark.point}"
+            clicks.append(Click(name, seen.camera, np.array(landmark.xyz_mm), pixel[0, :2] / pixel[0, 2]))
+    return clicks
+
+
+def cut_out(view: View, points_mm: Floats) -> View:
+    """The part of a photograph around points of the rig (N, 3), made small.
+
+    Raises:
+        CaptureInputError: the points are not in the photograph.
+    """
+    import cv2
+
+    camera = view.camera
+    pixels, depth = camera.project(points_mm)
+    margin = MARGIN_MM / camera.pixel_mm(points_mm.mean(axis=0))
+    low = np.maximum(np.floor(pixels.min(axis=0) - margin), 0).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0) + margin), camera.size).astype(int)
+    if (depth <= 0).any() or (high - low < 16).any():
+        raise CaptureInputError(
+            f"The landmarks put the teeth beside the picture of camera {camera.name}; correct them, or the camera's pose."
+        )
+    part = view.image[low[1] : high[1], low[0] : high[0]]
+    scale = min(1.0, CUT_PX / part.shape[1])
+    size = (max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1))
+    small = part if scale == 1 else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+    by = np.array(size) / np.array(part.shape[1::-1])
+    (fx, skew, cx), (_, fy, cy), last = camera.K
+    K = ((fx * by[0], skew * by[0], (cx - low[0]) * by[0]), (0.0, fy * by[1], (cy - low[1]) * by[1]), last)
+    return View(
+        Camera(name=camera.name, size=size, K=K, camera_from_world=camera.camera_from_world), _with_channels(small)
+    )
+
+
+def require_facing(cameras: Sequence[Camera], pose: RigidPose, arch_from_scan: Floats, centre_mm: Floats) -> None:
+    """Refuse a pose in which no camera sees the front or the chewing side of the teeth.
+
+    Raises:
+        CaptureInputError: says so.
+    """
+    centre, axes = pose.apply(centre_mm[None])[0], arch_from_scan[:3, :3] @ pose.rotation.T
+    for camera in cameras:
+        placed = np.asarray(camera.camera_from_world)
+        towards = -placed[:3, :3].T @ placed[:3, 3] - centre
+        if max(axes[1] @ towards, axes[2] @ towards) > 0:
+            return
+    raise CaptureInputError(
+        "The landmarks turn the teeth's back and their roots to every camera; exchange left and right, or give the other jaw's scan."
+    )
+
+
+def _calibrated(calibration: Calibration, name: str, size: tuple[int, int]) -> CalibratedCamera:
+    found = next((camera for camera in calibration.cameras if camera.name == name), None)
+    if found is None:
+        known = ", ".join(camera.name for camera in calibration.cameras)
+        raise CaptureInputError(
+            f"Camera {name} of the raw folder is not in the calibration, which has {known}; calibrate it or correct its name."
+        )
+    if found.size != size:
+        theirs, ours = (" x ".join(map(str, one)) for one in (found.size, size))
+        raise CaptureInputError(
+            f"The calibration is for images of {theirs} pixels of camera {name}, but the raw folder's are {ours}; calibrate anew."
+        )
+    return found
+
+
+def _lens(camera: CalibratedCamera) -> Lens:
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    return Lens(camera.size, np.array([fx, fy, cx, cy, *(camera.distortion or ())]))
+
+
+def _some(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_LIGHTS)).astype(int)) if frames else []
+    return [frames[k] for k in chosen]
+
+
+def _black_counts(root: Path, folder: RawFolder, name: str, camera: CalibratedCamera) -> float:
+    if camera.black_counts is not None:
+        return camera.black_counts
+    frames = folder.frames_of(name, "black")
+    return float(read_counts(root, folder, frames[0]).mean()) if frames else 0.0
+
+
+def _image(root: Path, folder: RawFolder, frame: RawFrame, black: float) -> NDArray[np.float32]:
+    counts: NDArray[Any] = read_counts(root, folder, frame)
+    mosaic = folder.camera_named(frame.camera).mosaic
+    image = binned(counts, mosaic) if mosaic != "none" else counts.astype(np.float32)
+    return np.asarray((_with_channels(image) - black) / (frame.exposure_s * frame.gain), dtype=np.float32)
+
+
+def _undistorted(image: NDArray[np.float32], camera: CalibratedCamera) -> View:
+    import cv2
+
+    # Made small first, which for a mosaic it is already by half.
+    scale = min(image.shape[1], WIDEST_PX) / image.shape[1]
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    small = image if scale == 1 else _with_channels(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    by = np.array(size) / np.array(camera.size)
+    (fx, skew, cx), (_, fy, cy), last = camera.K
+    K = ((fx * by[0], skew * by[0], cx * by[0]), (0.0, fy * by[1], cy * by[1]), last)
+    if camera.distortion is not None:
+        # OpenCV's pixel centres are whole numbers.
+        own = np.array(K)
+        own[:2, 2] -= HALF_PIXEL
+        small = _with_channels(cv2.undistort(small, own, np.array(camera.distortion)))
+    return View(Camera(name=camera.name, size=size, K=K, camera_from_world=camera.camera_from_world), small)
+
+
+def _with_channels(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return image[..., None] if image.ndim == 2 else image
+
+
+def cameras_of(views: Mapping[str, View]) -> dict[str, Camera]:
+    """Cameras of photographs, by name."""
+    return {name: view.camera for name, view in views.items()}

@@ -1,0 +1,226 @@
+"""From a raw folder with a scan and landmarks to teeth in the rig's frame: what ``dentine register`` does."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from services.anatomy.scans.scan import read_scan
+from services.anatomy.scans.scanned_jaw import ScannedJaw, jaw_from_scan
+from services.calibrate.registration.landmarks import Click, fit_landmarks
+from services.calibrate.registration.outlines import View, outline_misfit_mm, pose_from_outlines
+from services.calibrate.registration.overlay import report_page, write_overlay
+from services.calibrate.registration.photographs import cameras_of, clicks_of, cut_out, photographs, require_facing
+from services.calibrate.registration.pose import Floats, PoseStep, RigidPose
+from services.core.calibration import Calibration
+from services.core.errors import CaptureInputError
+from services.core.files.meshes import write_mesh
+from services.core.geometry import Matrix4, Mesh, teeth_folder
+from services.core.raw.folder import DESCRIPTION, read_raw_folder
+from services.core.raw.records import RawFolder
+from services.core.registration import REGISTRATION, Registration, RegistrationStep
+from services.core.store import read_record, write_atomic, write_record
+from services.core.uncertainty import TWIST, CalibrationUncertainty
+
+PICTURES, PAGE = "registration", "registration.html"
+REACH_MM = 1.5
+"""How far outlines are looked for at first: clicks leave a pose open by less."""
+MOST_MISFIT_MM = 0.12
+"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.06 mm in a
+calibrated rig, those of others to 0.18 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
+
+
+@dataclass(frozen=True)
+class ScannedTeeth:
+    """Solids of a scan in the scan's own frame, in mm."""
+
+    fdi: tuple[int, ...]
+    teeth: tuple[Mesh, ...]
+    gums: Mesh
+    arch_from_scan: Floats
+    repairs: str
+
+    @property
+    def centre_mm(self) -> Floats:
+        """Mean of all vertices of the teeth (3,)."""
+        return np.asarray(np.concatenate([mesh.vertices_mm for mesh in self.teeth]).mean(axis=0))
+
+
+def register_folder(
+    root: Path,
+    calibration_file: Path | None = None,
+    out: Path | None = None,
+    most_misfit_mm: float = MOST_MISFIT_MM,
+) -> Registration:
+    """Register the scan of a raw folder and write teeth, gums, record, pictures and page.
+
+    Args:
+        root: the folder of ``raw.toml``.
+        calibration_file: in place of the one that ``raw.toml`` names.
+        out: where to write; the raw folder itself by default, whose teeth they then are.
+        most_misfit_mm: median distance of outlines beyond which the scan is refused.
+
+    Raises:
+        CaptureInputError: something is missing or contradicts, or the pose is not to be believed; where a picture shows
+            why, the message names it. MeshError: the scan cannot be made solid.
+    """
+    folder, out = read_raw_folder(root), root if out is None else out
+    if (out / "teeth").exists():
+        raise CaptureInputError(
+            f"{out} has teeth already; remove its teeth and {REGISTRATION} to register again, or give --out."
+        )
+    calibration_path, calibration = _calibration(root, folder, calibration_file)
+    scanned = scanned_teeth(root, folder)
+    views, clicks = photographs(root, folder, calibration), clicks_of(folder, calibration)
+    _require_known_teeth(clicks, scanned)
+    steps, cut, misfit_mm = _registered(views, clicks, scanned, out / PICTURES, most_misfit_mm)
+
+    pose = steps[-1].pose
+    pictures = []
+    for view in cut:
+        pictures.append(f"{PICTURES}/overlay_{view.camera.name}.png")
+        write_overlay(out / pictures[-1], view, scanned.teeth, [scanned.gums], steps, _in_view(clicks, views, view))
+    for fdi, mesh in zip(scanned.fdi, scanned.teeth, strict=True):
+        write_mesh(teeth_folder(out, fdi) / "outer.ply", _placed(mesh, pose))
+    write_mesh(out / "gums.ply", _placed(scanned.gums, pose))
+    assert folder.scan is not None
+    inputs = {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (root / folder.scan.file, calibration_path)
+    }
+    record = _record(steps, scanned, misfit_mm, inputs, tuple(pictures))
+    write_atomic(out / PAGE, report_page(record).encode())
+    write_record(out / REGISTRATION, record)
+    return record
+
+
+def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
+    """Solids of the scan of a raw folder.
+
+    Raises:
+        CaptureInputError: it has none, or it cannot be used. MeshError: it cannot be made solid.
+    """
+    scan = folder.scan
+    if scan is None:
+        raise CaptureInputError(f"{root / DESCRIPTION} names no scan; add [scan] with its file, units and jaw.")
+    if scan.jaw == "both":
+        raise CaptureInputError(f"Scan {scan.file} is of both jaws; export the jaw that is photographed alone.")
+    read = read_scan(root / scan.file, "either", scan.labels or "Label", units=scan.units, jaw=scan.jaw)
+    jaw: ScannedJaw = jaw_from_scan(read, "whole")
+    scan_from_arch = np.linalg.inv(jaw.arch_from_scan)
+    back = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
+    teeth = tuple(_placed(tooth.outer, back) for tooth in jaw.teeth)
+    fdi = tuple(tooth.fdi for tooth in jaw.teeth)
+    return ScannedTeeth(fdi, teeth, _placed(jaw.gums, back), jaw.arch_from_scan, jaw.repairs.sentence())
+
+
+def _registered(
+    views: Mapping[str, View], clicks: Sequence[Click], scanned: ScannedTeeth, pictures: Path, most_misfit_mm: float
+) -> tuple[list[PoseStep], list[View], float]:
+    first, contradiction = fit_landmarks(cameras_of(views), clicks, scanned.centre_mm)
+    steps = [first]
+    placed = steps[0].pose.apply(np.concatenate([mesh.vertices_mm for mesh in scanned.teeth]))
+    cut = [cut_out(view, placed) for view in views.values()]
+    try:
+        _require_agreement(contradiction)
+        require_facing(list(cameras_of(views).values()), steps[0].pose, scanned.arch_from_scan, scanned.centre_mm)
+        reach_px = REACH_MM / min(view.camera.pixel_mm(placed.mean(axis=0)) for view in cut)
+        steps.append(pose_from_outlines(cut, scanned.teeth, [scanned.gums], steps[0], scanned.centre_mm, reach_px))
+        misfit_mm = outline_misfit_mm(cut, scanned.teeth, [scanned.gums], steps[-1].pose)
+        _require_small(misfit_mm, most_misfit_mm)
+    except CaptureInputError as problem:
+        names = []
+        for view in cut:
+            names.append(str(pictures / f"refused_{view.camera.name}.png"))
+            write_overlay(Path(names[-1]), view, scanned.teeth, [scanned.gums], steps, _in_view(clicks, views, view))
+        raise CaptureInputError(f"{problem.message[:-1]}; {', '.join(names)} show it.") from problem
+    return steps, cut, misfit_mm
+
+
+def _require_agreement(contradiction: str | None) -> None:
+    if contradiction is not None:
+        raise CaptureInputError(contradiction)
+
+
+def _require_small(misfit_mm: float, most_mm: float) -> None:
+    if misfit_mm > most_mm:
+        raise CaptureInputError(
+            f"The scan's teeth lie {misfit_mm:.2f} mm from the photographs' outlines in the median, more than "
+            f"{most_mm:g} mm; see whether the scan is of this person and as the teeth are now, and whether the "
+            "calibration is this rig's."
+        )
+
+
+def _calibration(root: Path, folder: RawFolder, given: Path | None) -> tuple[Path, Calibration]:
+    if given is None and folder.calibration is None:
+        raise CaptureInputError(
+            f"{root / DESCRIPTION} names no calibration; add [calibration] with its file, or give --calibration."
+        )
+    path = given if given is not None else root / (folder.calibration.file if folder.calibration else "")
+    return path, read_record(path, Calibration)
+
+
+def _require_known_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> None:
+    for one in clicks:
+        if int(one.name.split()[0]) not in scanned.fdi:
+            raise CaptureInputError(
+                f"Landmark {one.name} is of a tooth that the scan does not have ({', '.join(map(str, scanned.fdi))}); "
+                "correct its tooth, or remove it."
+            )
+
+
+def _in_view(clicks: Sequence[Click], views: Mapping[str, View], cut: View) -> list[Click]:
+    # Pixels of the whole photograph in the part of it.
+    whole, part = np.asarray(views[cut.camera.name].camera.K), np.asarray(cut.camera.K)
+    part_from_whole = part @ np.linalg.inv(whole)
+    return [
+        Click(one.name, one.camera, one.point_mm, (part_from_whole @ [*one.pixel, 1.0])[:2])
+        for one in clicks
+        if one.camera == cut.camera.name
+    ]
+
+
+def _placed(mesh: Mesh, pose: RigidPose) -> Mesh:
+    return Mesh(pose.apply(mesh.vertices_mm), mesh.faces)
+
+
+def _record(
+    steps: Sequence[PoseStep],
+    scanned: ScannedTeeth,
+    misfit_mm: float,
+    inputs: dict[str, str],
+    pictures: tuple[str, ...],
+) -> Registration:
+    last = steps[-1]
+    x, y, z = last.pose.apply(scanned.centre_mm[None])[0]
+    rows = tuple(map(tuple, ((last.covariance + last.covariance.T) / 2).tolist()))
+    return Registration(
+        rig_from_scan=_rows(last.pose),
+        centre_mm=(float(x), float(y), float(z)),
+        uncertainty=CalibrationUncertainty(names=tuple(f"teeth.{axis}" for axis in TWIST), covariance=rows),
+        steps=tuple(
+            RegistrationStep(
+                name=step.name,
+                rig_from_scan=_rows(step.pose),
+                covariance=tuple(map(tuple, step.covariance.tolist())),
+                residual_px=dict(step.residual_px),
+                residual_mm=step.residual_mm,
+                points=step.points,
+                left_out=step.left_out,
+            )
+            for step in steps
+        ),
+        misfit_mm=misfit_mm,
+        teeth=scanned.fdi,
+        repairs=scanned.repairs,
+        inputs=inputs,
+        pictures=pictures,
+    )
+
+
+def _rows(pose: RigidPose) -> Matrix4:
+    one, two, three, four = ((float(a), float(b), float(c), float(d)) for a, b, c, d in pose.matrix)
+    return one, two, three, four

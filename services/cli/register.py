@@ -1,0 +1,41 @@
+"""``dentine register``: the scan of a raw folder becomes teeth where they stand in the rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(
+    raw: Annotated[
+        Path, typer.Argument(metavar="RAW", help="Folder of raw.toml with [scan] and [[landmark]] entries.")
+    ],
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration.json to use in place of the one that raw.toml names.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write teeth, record and pictures to; default: the raw folder.")
+    ] = None,
+    most_misfit_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Median distance of outlines beyond which the scan is refused, mm; default: 0.12, for a calibrated rig.",
+        ),
+    ] = None,
+) -> None:
+    """Find where the teeth of a scan stand in the rig."""
+    from services.calibrate.registration.register import MOST_MISFIT_MM, PAGE, register_folder
+    from services.core.files.folders import require_folder
+
+    if out is not None:
+        require_folder(out, "--out")
+    record = register_folder(raw, calibration, out, MOST_MISFIT_MM if most_misfit_mm is None else most_misfit_mm)
+    for step in record.steps:
+        print(f"{step.name}: {step.points} points, {step.residual_mm:.3f} mm in the median")
+        for text in step.left_out:
+            print(f"  left out: {text}")
+    print(f"teeth: {', '.join(map(str, record.teeth))}; {record.repairs}")
+    print(f"report: {(raw if out is None else out) / PAGE}")

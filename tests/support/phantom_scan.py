@@ -1,0 +1,47 @@
+"""A scan of a phantom jaw as a scanner would give it: one open labelled surface, cut off above the gums' base, with noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.anatomy.scans.scan import LabelledScan
+from services.anatomy.scans.separation import separate
+from services.anatomy.templates.jaw import Jaw
+from services.core.geometry import Mesh, Tooth
+
+BELOW_CERVIX_MM = 4.0
+"""How much of the gums a scan shows beside the teeth."""
+
+
+def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) -> LabelledScan:
+    """In the jaw's frame.
+
+    Args:
+        jaw: the phantom.
+        noise_mm: standard deviation of each coordinate.
+        seed: of the noise.
+        places: teeth from the midline that are scanned; the scan ends behind them.
+    """
+    surfaces = separate(tuple(Tooth(tooth.fdi, tooth.outer) for tooth in jaw.teeth), jaw.gums)
+    cervix = float(
+        np.mean(
+            [tooth.frame.world_from_canonical(np.array([[0.0, 0.0, tooth.cervix_mm]]))[0, 2] for tooth in jaw.teeth]
+        )
+    )
+    parts = [(mesh, tooth.fdi) for mesh, tooth in zip(surfaces.crowns, jaw.teeth, strict=True)] + [(surfaces.gums, 0)]
+    first = np.cumsum([0, *(len(mesh.vertices_mm) for mesh, _ in parts)])
+    vertices = np.concatenate([mesh.vertices_mm for mesh, _ in parts])
+    faces = np.concatenate([mesh.faces + start for (mesh, _), start in zip(parts, first, strict=False)])
+    labels = np.repeat([label for _, label in parts], [len(mesh.faces) for mesh, _ in parts])
+    # Surfaces share their cut edges bit by bit, so equal vertices are one.
+    joined, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces].astype(np.int32)
+    kept = joined[faces][..., 2].min(axis=1) > cervix - BELOW_CERVIX_MM
+    middles = {tooth.fdi: tooth.outer.vertices_mm.mean(axis=0) for tooth in jaw.teeth}
+    if places < 7:
+        # Midway to the next tooth; who is behind is part of the gums no more.
+        behind = np.mean([middles[10 * quadrant + places + k][1] for quadrant in (1, 2) for k in (0, 1)])
+        near = joined[faces].mean(axis=1)[:, 1] > behind
+        kept &= near & ((labels == 0) | (labels % 10 <= places))
+    joined = joined + np.random.default_rng(seed).normal(0, noise_mm, joined.shape)
+    return LabelledScan(Mesh(joined, faces[kept]), labels[kept])

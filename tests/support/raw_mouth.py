@@ -1,0 +1,72 @@
+"""A raw folder as a laboratory has it: tracking frames of a phantom mouth, a scan in a frame of its own, clicked landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from services.anatomy.templates.jaw import build_jaw
+from services.calibrate.registration.pose import RigidPose
+from services.core.calibrated import CalibratedCamera, CalibratedLight
+from services.core.calibration import Calibration
+from services.core.geometry import Mesh
+from services.core.store import write_record
+from tests.support.labelled_scan import write_labelled_ply
+from tests.support.phantom_scan import scan_of
+from tests.support.photographed_mouth import clicks_on, photographed_mouth
+from tests.support.raw_folders import Tree, write_toml
+
+BLACK, FULL_SCALE = 64, 3000
+BITS = 12
+
+
+@dataclass(frozen=True)
+class RawMouth:
+    """What the folder hides."""
+
+    root: Path
+    tree: Tree
+    rig_from_scan: RigidPose
+    centre_mm: np.ndarray
+
+
+def write_raw_mouth(root: Path, subject: int | None = None, seed: int = 1, places: int = 3) -> RawMouth:
+    """Three cameras; the scan is of the teeth up to a place from the midline."""
+    jaw = build_jaw(subject)
+    mouth = photographed_mouth(subject, seed, 0.2, jaw)
+    inverse = mouth.rig_from_scan.rotation.T
+    scan = scan_of(jaw, seed=seed, places=places)
+    vertices = (scan.mesh.vertices_mm - mouth.rig_from_scan.translation_mm) @ inverse.T
+    write_labelled_ply(root / "scan.ply", Mesh(vertices, scan.mesh.faces), scan.fdi)
+
+    cameras, frames = [], []
+    for view in mouth.views:
+        name, size = view.camera.name, list(view.camera.size)
+        np.save(root / f"{name}.npy", (BLACK + FULL_SCALE * np.clip(view.image, 0, 1)).round().astype(np.uint16))
+        cameras.append({"name": name, "size": size, "bits": BITS})
+        frames.append({"camera": name, "file": f"{name}.npy", "kind": "tracking", "exposure_s": 0.1})
+    calibrated = tuple(CalibratedCamera(**camera.model_dump(), black_counts=BLACK) for camera in mouth.cameras.values())
+    lights = (CalibratedLight(name="l0", position_mm=(0.0, 900.0, 0.0), intensity=(1.0, 1.0, 1.0)),)
+    channels = ("red", "green", "blue")
+    write_record(
+        root / "calibration.json", Calibration(units="mm", channels=channels, cameras=calibrated, lights=lights)
+    )
+
+    landmarks: dict[str, dict[str, object]] = {}
+    for one in clicks_on(mouth, np.random.default_rng(seed)):
+        tooth = int(one.name.split()[0])
+        if tooth % 10 > places:
+            continue
+        entry = landmarks.setdefault(
+            one.name, {"tooth": tooth, "point": "tip", "xyz_mm": one.point_mm.tolist(), "pixels": []}
+        )
+        pixels = entry["pixels"]
+        assert isinstance(pixels, list)
+        pixels.append({"camera": one.camera, "xy_px": one.pixel.tolist()})
+    tree: Tree = {"units": "mm", "calibration": {"file": "calibration.json"}, "camera": cameras, "frame": frames}
+    tree["scan"] = {"file": "scan.ply", "units": "mm", "labels": "label", "jaw": "upper"}
+    tree["landmark"] = list(landmarks.values())
+    write_toml(root, tree)
+    return RawMouth(root, tree, mouth.rig_from_scan, mouth.centre_mm)
