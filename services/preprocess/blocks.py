@@ -149,6 +149,7 @@ class _Desk:
             quality=assess(camera.name, lamp.name, bits, footprint.covered, image.motion_px),
             tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
             light=shown,
+            colour=image.colour,
             notes=self.source.notes,
             files=self.workshop.files_of(self.view.number, light, picture),
             seconds=time.monotonic() - began_s,

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from services.core.geometry import Record
 from services.preprocess.brightness import ImageLight
+from services.preprocess.colours import FrameColour
 from services.preprocess.quality import ImageQuality
 from services.preprocess.window import Window
 
@@ -41,6 +42,7 @@ class ImageDone(Record):
     quality: ImageQuality
     tooth_pixels: tuple[int, ...] = Field(description="valid pixels that show each tooth")
     light: ImageLight | None
+    colour: FrameColour | None = None
     files: dict[str, StoredFile] = Field(description="by path in the stage's folder")
     notes: tuple[str, ...] = Field(default=(), description="what the source said of the camera when it read the image")
     seconds: float = Field(description="how long it took")

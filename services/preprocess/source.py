@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera
 from services.core.records import FolderCapture
+from services.preprocess.colours import FrameColour
 from services.preprocess.projection import Footprint
 from services.preprocess.window import Window
 
@@ -52,6 +53,7 @@ class LightImage:
         displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not measured.
         motion_px: median over the teeth; None where motion is not measured.
         warped: whether the pixels were resampled.
+        colour: of a frame whose order of channels may be wrong; None where nothing tells.
     """
 
     radiance: Image
@@ -60,6 +62,7 @@ class LightImage:
     displacement: Image | None = None
     motion_px: float | None = None
     warped: bool = False
+    colour: FrameColour | None = None
 
 
 class Source(Protocol):

@@ -13,6 +13,7 @@ from services.core.records import PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
 from services.preprocess.brightness import Brightness
+from services.preprocess.colours import require_like_colours
 from services.preprocess.quality import QualityReport, unusable_note
 from services.preprocess.records import ImageDone
 from services.preprocess.source import Source
@@ -38,13 +39,16 @@ def summarise(
         masks: digest of the masks by hand.
 
     Raises:
-        CaptureInputError: no pixel is valid, or no tooth is as bright as these. FencedError: another attempt has begun.
+        CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError: another attempt has begun.
     """
     workshop.writer.require_lease()
     images = _images(workshop, source)
     reports, brightness = [done.quality for done in images], Brightness()
     for done in images:
         brightness.add(done.quality.camera, done.quality.light, done.light)
+    for camera in source.description.cameras:
+        colours = [done.colour for done in images if done.quality.camera == camera.name and done.colour is not None]
+        require_like_colours(colours, camera.name)
     seen = np.sum([done.tooth_pixels for done in images], axis=0)
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFolder, RawFrame
+from services.preprocess.colours import FrameColour
 from services.preprocess.raw.merge import Exposure
 
 Image = NDArray[np.float32]
 
-SWAPPED_FACTOR = 1.5
-"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ by 10 %."""
 EXPOSURE_OFF = 1.5
 """Factor by which a frame may be brighter or darker than another exposure of its light lets expect."""
 TELLING_SHARE = 0.01
@@ -25,8 +24,6 @@ TELLING_CONTRAST = 0.2
 """Standard deviation of a picture by its mean, from which on it is compared with another exposure of the same."""
 MIN_CORRELATION = 0.5
 """Of two exposures of the same; 12 bits of noise leave 0.9, and a tooth that moved by a tenth of its width 0.7."""
-MIN_OTHERS = 2
-"""Frames that must agree before one is said to differ."""
 
 
 def missing_exposures(folder: RawFolder) -> Iterator[str]:
@@ -48,39 +45,14 @@ def missing_exposures(folder: RawFolder) -> Iterator[str]:
                 )
 
 
-def require_like_colours(
-    earlier: list[tuple[str, float]],
-    channels: tuple[str, ...],
-    radiance: NDArray[np.float32],
-    frame: RawFrame,
-    camera: str,
-) -> None:
-    """Refuse a frame whose red and blue are exchanged against the camera's earlier ones; remembers its own.
-
-    Args:
-        earlier: file and red to blue of the frames before.
-        radiance: (N, C), in the order of ``channels``.
-
-    Raises:
-        CaptureInputError: names the frame.
-    """
-    if not {"red", "blue"} <= set(channels):
-        return
-    if not radiance.size:
-        return
+def colour_of(frame: RawFrame, channels: tuple[str, ...], radiance: NDArray[np.float32]) -> FrameColour | None:
+    """How red a frame's pixels (N, C), in the order of ``channels``, are against their blue; None where that cannot be told."""
+    if not {"red", "blue"} <= set(channels) or not radiance.size:
+        return None
     red, blue = (float(np.abs(radiance[..., channels.index(one)]).mean(dtype=np.float64)) for one in ("red", "blue"))
     if min(red, blue) <= 0:
-        return
-    ratio, usual = float(np.log(red / blue)), [value for _, value in earlier]
-    limit = float(np.log(SWAPPED_FACTOR))
-    if len(usual) >= MIN_OTHERS and np.ptp(usual) < limit and abs(np.median(usual)) > limit / 2:
-        middle = float(np.median(usual))
-        if abs(ratio - middle) > limit and abs(-ratio - middle) < limit / 2:
-            raise CaptureInputError(
-                f"Frame {frame.file} ({frame.label}) has {np.exp(ratio):.2g} times as much red as blue where {earlier[0][0]} has "
-                f"{np.exp(middle):.2g} times; its channels look exchanged, so export it like the others of camera {camera}."
-            )
-    earlier.append((frame.file, ratio))
+        return None
+    return FrameColour(file=frame.file, label=frame.label, log_red_to_blue=float(np.log(red / blue)))
 
 
 def require_like_exposures(

@@ -63,9 +63,8 @@ class RawSource:
         """See ``Source``: every frame's size and time of change, so that one that was exported again counts."""
         lines = [self.description.model_dump_json(), self._folder.model_dump_json(), repr(self._noise)]
         lines.append(self._calibration.model_dump_json())
-        for frame in self._folder.frame:
-            if (path := self.root / frame.file).is_file():
-                lines.append(f"{frame.file} {path.stat().st_size} {path.stat().st_mtime_ns}")
+        paths = [path for frame in self._folder.frame if (path := self.root / frame.file).is_file()]
+        lines += [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
         return "\n".join(lines)
 
     def matched(self, camera: int) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from services.core.raw.records import RawFrame
 from services.core.records import MaskBit
 from services.preprocess.motion import Displacement, ViewMotion
 from services.preprocess.raw.camera import CameraFrames
-from services.preprocess.raw.checks import require_like_colours, require_like_exposures
+from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance, spoiled
 from services.preprocess.raw.lens import Sampler
 from services.preprocess.raw.merge import Exposure, merge
@@ -41,7 +41,6 @@ class RawView:
         self._unmixed = (
             None if camera.crosstalk is None else np.linalg.inv(np.array(camera.crosstalk)).astype(np.float32)
         )
-        self._colours: list[tuple[str, float]] = []
 
     def brightness(self, frame: RawFrame) -> Image:
         """Mean of the channels of one frame in ``motion.window`` (H, W), undistorted; its unit does not matter."""
@@ -59,7 +58,7 @@ class RawView:
         """The exposures of one light, merged before they are interpolated where the subject was still between them, and after otherwise.
 
         Raises:
-            CaptureInputError: they contradict each other or the camera's earlier ones; names the frame.
+            CaptureInputError: they contradict each other; names the frame.
         """
         exposures = [self._frames.exposure(frame, self._sampler.region) for frame in frames]
         require_like_exposures(self._root, frames, exposures, self._channels)
@@ -80,9 +79,10 @@ class RawView:
         if max(move.error_px for move in moves) > UNCERTAIN_PX:
             bits |= np.uint16(MaskBit.MOTION)
         usable = (bits == 0) & self._view.footprint.covered
-        require_like_colours(self._colours, self._channels, radiance[usable], frames[0], self._frames.raw.name)
+        colour = colour_of(frames[0], self._channels, radiance[usable])
         farthest = max(moves, key=lambda move: move.median_px)
-        return LightImage(radiance, variance, bits, self.motion.stored(farthest), farthest.median_px, any(is_warped))
+        moved = self.motion.stored(farthest), farthest.median_px, any(is_warped)
+        return LightImage(radiance, variance, bits, *moved, colour)
 
     def _groups(
         self, exposures: Sequence[Exposure], moves: Sequence[Displacement]

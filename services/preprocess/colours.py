@@ -1,0 +1,42 @@
+"""Whether the frames of a camera agree which channel is red and which is blue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from services.core.errors import CaptureInputError
+from services.core.geometry import Record
+
+SWAPPED_FACTOR = 1.5
+"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ by 10 %."""
+MIN_OTHERS = 2
+"""Frames that must agree before one is said to differ."""
+
+
+class FrameColour(Record):
+    """Colour of what a frame shows of the subject."""
+
+    file: str
+    label: str
+    log_red_to_blue: float
+
+
+def require_like_colours(colours: Sequence[FrameColour], camera: str) -> None:
+    """Refuse frames of which one has red and blue exchanged against those before it.
+
+    Raises:
+        CaptureInputError: names the frame.
+    """
+    limit = float(np.log(SWAPPED_FACTOR))
+    for number, own in enumerate(colours):
+        usual = [one.log_red_to_blue for one in colours[:number]]
+        if len(usual) < MIN_OTHERS or np.ptp(usual) >= limit or abs(np.median(usual)) <= limit / 2:
+            continue
+        ratio, middle = own.log_red_to_blue, float(np.median(usual))
+        if abs(ratio - middle) > limit and abs(-ratio - middle) < limit / 2:
+            raise CaptureInputError(
+                f"Frame {own.file} ({own.label}) has {np.exp(ratio):.2g} times as much red as blue where {colours[0].file} has "
+                f"{np.exp(middle):.2g} times; its channels look exchanged, so export it like the others of camera {camera}."
+            )
