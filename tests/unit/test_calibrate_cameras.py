@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from services.calibrate.cameras.boards import corners_on_board, detect
 from services.calibrate.cameras.bundle import Rig, draw, fit_bundle, jacobian, layout_of
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.models import choose_lens, fit_lens, held_out_squares, of_one_camera
-from services.calibrate.cameras.projection import image_grid, projection_sigma
+from services.calibrate.cameras.projection import image_grid, projection_covariance, projection_sigma
 from services.calibrate.cameras.rotations import pose_matrix, rotation_matrix
 from services.calibrate.cameras.sightings import View, joined
 from services.calibrate.cameras.start import first_lens, first_rig
@@ -212,3 +213,22 @@ def test_a_camera_that_shares_no_board_is_named() -> None:
     apart = [view for view in views if not (view.camera == 1 and view.place >= 4)]
     with pytest.raises(CaptureInputError, match="right sees no board together with the other cameras"):
         first_rig(apart, rig.lenses, ["left", "middle", "right"])
+
+
+def test_lens_and_uncertainty_of_projection_are_those_of_mrcal() -> None:
+    """mrcal's own answer to the same corners, made by ``projection_uncertainty(what="covariance")`` of its Debian package 2.2."""
+    table = json.loads((Path(__file__).parents[1] / "data" / "mrcal_chessboard.json").read_text())
+    corners = corners_on_board(CHESSBOARD)
+    seen = np.array(table["corners_px"]) + 0.5
+    views = [View(0, n, corners, pixels, np.arange(48), f"view {n}") for n, pixels in enumerate(seen)]
+    lens = first_lens(views, SIZE, "radial-tangential-4", "camera")
+    fit = fit_bundle(views, first_rig(views, [lens], ["camera"]), robust=False)
+    theirs = np.array(table["intrinsics"])
+    theirs[2:4] += 0.5
+    errors = np.sqrt(np.diag(fit.covariance)[fit.layout.lens_columns(0)])
+    # Two solvers' stopping rules: a thousandth of an error bar.
+    assert (fit.rig.lenses[0].values - theirs) / errors == pytest.approx(0, abs=1e-3)
+    ours = projection_covariance(fit, 0, np.array(table["pixels"]) + 0.5, table["distance_mm"])
+    # mrcal divides squared residuals by their number and not by their degrees of freedom.
+    counted = (table["rms_of_a_coordinate_px"] / fit.sigma_px[0]) ** 2
+    assert ours * counted == pytest.approx(np.array(table["covariance_px2"]), rel=2e-3, abs=1e-7)
