@@ -15,6 +15,7 @@ from services.core.errors import InputError
 _BENCHMARKS = MappingProxyType(
     {
         "jaw": "services.bench.fits.jaw:run",
+        "prepare": "services.bench.preparation.run:run",
         "slab": "services.bench.slab.forward:run",
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",

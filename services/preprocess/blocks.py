@@ -25,7 +25,7 @@ from services.preprocess.motion import stored_step
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, write_picture
 from services.preprocess.records import FrameMotion, ImageDone
-from services.preprocess.source import LightImage, Source, View
+from services.preprocess.source import Bits, LightImage, Source, View
 from services.preprocess.subject import NOTHING, Subject, read_subject
 from services.preprocess.valid import require_seen, valid_bits
 from services.preprocess.workshop import Workshop
@@ -75,7 +75,7 @@ class Block:
             return
         lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
         motions = self.workshop.motions(self.camera, source.matched(self.camera))
-        desk = _Desk(self.workshop, source, subject, HandMasks(context.root, source.description), view)
+        desk = Desk(self.workshop, source, subject, HandMasks(context.root, source.description), view)
         began_s = time.monotonic()
         for light, image in source.images(view, lights, motions):
             self.workshop.put_image(self.camera, light, desk.store(light, image, began_s))
@@ -124,7 +124,7 @@ def _look(workshop: Workshop, source: Source, subject: Subject, camera: int) -> 
 
 
 @dataclass(frozen=True)
-class _Desk:
+class Desk:
     """All that a camera's images need to be judged and stored."""
 
     workshop: Workshop
@@ -142,7 +142,7 @@ class _Desk:
         shown = light_of(image, self.view, lamp, (bits == 0) & (footprint.mesh < len(self.subject.teeth)))
         if shown is not None and shown.dark:
             bits |= np.uint16(MaskBit.UNLIT)
-        self._write(light, image, bits)
+        self.store_masked(light, image, bits)
         picture = self.workshop.folder / "quality" / f"{camera.name}_{lamp.name}.png"
         write_picture(picture, image.radiance, bits)
         return ImageDone(
@@ -155,7 +155,8 @@ class _Desk:
             seconds=time.monotonic() - began_s,
         )
 
-    def _write(self, light: int, image: LightImage, bits: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]) -> None:
+    def store_masked(self, light: int, image: LightImage, bits: Bits) -> None:
+        """Write an image's arrays and its mask (H, W)."""
         place, window = (self.view.number, light), self.view.window
         for name, values in (("radiance", image.radiance), ("variance", image.variance)):
             _array(self.workshop, name)[*place, window.rows, window.columns] = values

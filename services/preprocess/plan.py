@@ -12,12 +12,12 @@ from services.preprocess.masks import HandMasks
 from services.preprocess.motion import stored_step
 from services.preprocess.source import Source
 
-FORMAT = 2
+FORMAT = 3
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
 INDIFFERENT = frozenset({"workers", "priority"})
 """Options that change no pixel."""
-CHUNK_PX = 1024
-"""Edge of the pieces of a shard: what is read or left empty at once."""
+CHUNK_ROWS = 256
+"""Rows of the pieces of a shard, which are read or left empty at once; whole rows are written fastest."""
 
 
 def create_arrays(store: Path, source: Source) -> None:
@@ -27,20 +27,20 @@ def create_arrays(store: Path, source: Source) -> None:
     planes = (len(description.cameras), len(description.lights), height, width)
     channels = len(description.channels)
     stack = ("camera", "light", "y", "x")
-    chunk = min(CHUNK_PX, height), min(CHUNK_PX, width)
-    padded = tuple(-(-n // edge) * edge for n, edge in zip((height, width), chunk, strict=True))
+    rows = min(CHUNK_ROWS, height)
+    shard_rows = -(-height // rows) * rows
     for name in ("radiance", "variance"):
         create_array(
             store,
             name,
             (*planes, channels),
-            (1, 1, *padded, channels),
+            (1, 1, shard_rows, width, channels),
             "float32",
             (*stack, "channel"),
-            chunk=(1, 1, *chunk, channels),
+            chunk=(1, 1, rows, width, channels),
             codec="lz4",
         )
-    create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack)
+    create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack, codec="lz4")
     create_array(store, "surface", (planes[0], height, width), (1, height, width), "int16", ("camera", "y", "x"))
     if not source.measures_motion:
         return

@@ -1,0 +1,111 @@
+"""One camera's frames of a tooth that fills most of its height, made in place: no file is needed and none is left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from services.core.files.meshes import write_mesh
+from services.core.geometry import Camera, Light, Mesh, teeth_folder
+from services.core.records import CaptureManifest, FolderCapture, FrameRecord
+from services.core.store import StageWriter, create_array
+
+DISTANCE_MM = 300.0
+HALF_AXES_MM = (4.5, 5.5, 3.5)
+SHARE_OF_HEIGHT = 0.8
+BLACK, BITS = 64, 12
+CHANNELS = ("red", "green", "blue")
+COLOUR = (3000.0, 2700.0, 2200.0)
+"""Counts of a surface that faces the light."""
+MOVED_PX = (1.3, 0.7)
+"""By how much the tooth moves from the first tracking frame to the last."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A published capture of one camera.
+
+    Attributes:
+        root: the job's folder. counts: (H, W, C) of a light frame.
+    """
+
+    root: Path
+    manifest: CaptureManifest
+    counts: NDArray[np.uint16]
+
+
+def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4, seed: int = 1) -> Scene:
+    """Publish a capture of ``size`` (width, height): black frames, tracking frames and one frame a light."""
+    width, height = size
+    focal_px = SHARE_OF_HEIGHT / 2 * height / HALF_AXES_MM[1] * DISTANCE_MM
+    camera = Camera(
+        name="c0",
+        size=size,
+        K=((focal_px, 0, width / 2), (0, focal_px, height / 2), (0, 0, 1)),
+        camera_from_world=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, DISTANCE_MM), (0, 0, 0, 1)),
+    )
+    lamps = tuple(
+        Light(name=f"l{k}", position_mm=(200.0 + 5 * k, -300.0, -700.0), intensity=(1e6,) * 3) for k in range(lights)
+    )
+    kinds = ["black", *["tracking"] * tracking, *["light"] * lights]
+    frames = tuple(
+        FrameRecord.model_validate(
+            {
+                "index": index,
+                "kind": kind,
+                "light": lamps[index - 1 - tracking].name if kind == "light" else None,
+                "exposure_s": 0.05,
+                "level": 0.0 if kind == "black" else 1.0,
+                "time_s": 0.06 * index,
+                "readback": (0, 0, 0),
+            }
+        )
+        for index, kind in enumerate(kinds)
+    )
+    writer = StageWriter(root, "capture", 1)
+    shape = (1, len(frames), height, width, 3)
+    array = create_array(
+        writer.folder, "capture.zarr", shape, (1, 1, *shape[2:]), "uint16", ("camera", "frame", "y", "x", "channel")
+    )
+    rng = np.random.default_rng(seed)
+    grain = rng.normal(scale=20, size=(height, width)).astype(np.float32)
+    counts = np.empty((height, width, 3), dtype=np.uint16)
+    for frame in frames:
+        share = 0.0 if frame.kind == "black" else max(0.0, (frame.index - 1) / max(tracking - 1, 1))
+        _photograph(counts, grain, focal_px, share if frame.kind == "tracking" else 0.5, lit=frame.kind != "black")
+        array[0, frame.index] = counts
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    mesh = Mesh(np.asarray(ball.vertices) * HALF_AXES_MM, np.asarray(ball.faces, dtype=np.int32))
+    write_mesh(teeth_folder(writer.folder, 11) / "outer.ply", mesh)
+    manifest = CaptureManifest(
+        description=FolderCapture(units="mm", channels=CHANNELS, cameras=(camera,), lights=lamps),
+        frames=frames,
+        bits=BITS,
+        black_level=BLACK,
+        radiance_per_count=1e-3,
+        sensor_noise_relative=0.01,
+        sensor_noise_floor=0.002,
+        fdi=(11,),
+    )
+    writer.publish(manifest)
+    return Scene(root, manifest, counts)
+
+
+def _photograph(
+    counts: NDArray[np.uint16], grain: NDArray[np.float32], focal_px: float, share: float, *, lit: bool
+) -> None:
+    # A shaded ellipse in parallel projection, near enough for speed, with fixed grain so that no two runs differ
+    height, width = grain.shape
+    x = (np.arange(width, dtype=np.float32) - width / 2 - share * MOVED_PX[0]) * (
+        DISTANCE_MM / focal_px / HALF_AXES_MM[0]
+    )
+    y = (np.arange(height, dtype=np.float32) - height / 2 - share * MOVED_PX[1]) * (
+        DISTANCE_MM / focal_px / HALF_AXES_MM[1]
+    )
+    facing = np.sqrt(np.maximum(1 - x * x - (y * y)[:, None], 0)) if lit else np.zeros_like(grain)
+    for c, level in enumerate(COLOUR):
+        counts[..., c] = np.clip(BLACK + level * 0.8 * facing + grain, 0, 2**BITS - 1)
