@@ -207,7 +207,7 @@ class JobSpec(Record):
     )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
-    pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit every n-th pixel in x and y")
+    pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
     samples_per_pixel: Whole = Field(
         default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs"
     )

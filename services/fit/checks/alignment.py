@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import MaskBit
-from services.core.store import StoredArray
 from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.inputs.levels import LevelReader, whole_squares
 from services.fit.inputs.observations import Observations, ViewStack
 
 LOOKED_AT = 0.05
@@ -93,20 +93,24 @@ def _compared(
 ) -> list[tuple[ViewStack, float, list[Comparison]]]:  # fmt: skip
     seen = np.flatnonzero(np.any([view.valid.any(axis=1) for view in views], axis=0))
     store, index = observations.folder / "prepared.zarr", observations.manifest.channels.index(channel)
+    cameras = {camera.name: camera for camera in observations.manifest.cameras}
     names = [camera.name for camera in observations.manifest.cameras]
     centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
     pairs = []
-    radiance, variance, bits = (StoredArray(store / name) for name in ("radiance", "variance", "valid"))
     for view in views:
         (width, height), number, images = view.camera.size, names.index(view.camera.name), []
+        whole_camera = cameras[view.camera.name]
+        level = LevelReader(store, index, round(whole_camera.K[0][0] / view.camera.K[0][0]))
         for (camera, shown), (pixels, values) in evaluation.renders.items():
             if camera != view.camera.name:
                 continue
             light = int(seen[shown])
             # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels that tell.
-            usable = bits[number, light][:height, :width] & ~np.uint16(MaskBit.OUTSIDE) == 0
-            photo = np.where(usable, radiance[number, light][:height, :width, index].astype(np.float64), np.nan)
-            noise = np.nan_to_num(variance[number, light][:height, :width, index].astype(np.float64))
+            usable = whole_squares(
+                level.bits(number, light, whole_camera) & ~np.uint16(MaskBit.OUTSIDE) == 0, level.step
+            )
+            measured, noise = level.image(number, light, whole_camera)
+            photo, noise = np.where(usable, measured, np.nan), np.nan_to_num(noise)
             render, spread = np.full((height, width), np.nan), np.zeros((height, width))
             render[pixels[:, 1], pixels[:, 0]] = values
             spread[pixels[:, 1], pixels[:, 0]] = evaluation.spreads.get((camera, shown), 0.0)

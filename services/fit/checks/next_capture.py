@@ -96,7 +96,6 @@ def advice(
     sensor: Sensor,
     weight: float,
     samples: int,
-    pixel_step: int = 1,
 ) -> tuple[str, tuple[Candidate, ...]]:
     """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where none would.
 
@@ -106,10 +105,9 @@ def advice(
         folder: for the scenes and blocks of what was not taken.
         weight: of a measurement in the fit.
         samples: paths per pixel and seed, those of the fit's last measurement.
-        pixel_step: every n-th pixel is fitted.
     """
     assert known.sandwich is not None
-    recipe, probes = probes_of(problem, folder, pixel_step)
+    recipe, probes = probes_of(problem, folder)
     _, similar, how = problem.jacobian_media(known.x)
     seeds = problem.seed(0, "advice-1"), problem.seed(0, "advice-2")
     images = problem.seed(0, "advice-image-1"), problem.seed(0, "advice-image-2")
@@ -165,7 +163,7 @@ def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
     }
 
 
-def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) -> tuple[StoredFile, tuple[Probe, ...]]:
+def probes_of(problem: StackProblem[Tissue], folder: Path) -> tuple[StoredFile, tuple[Probe, ...]]:
     """The scene with the candidate lights added, and views to probe: the fit's own under these lights, further ones under the lights there are."""
     blocks, recipe = problem.passes.read_blocks(), read_recipe(problem.passes.recipe)
     cameras = {block.view.camera.name: block.view.camera for block in blocks}
@@ -192,7 +190,7 @@ def probes_of(problem: StackProblem[Tissue], folder: Path, pixel_step: int = 1) 
         probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words, own[0].instrument, "light_gain"))
     for words, axis in VIEWS.items():
         camera = turned(first, centre, np.asarray(axis, dtype=float) @ axes)
-        pixels = seen_pixels(camera, more, pixel_step)
+        pixels = seen_pixels(camera, more, 1)
         if len(pixels):
             probes.append(
                 _probe(

@@ -14,8 +14,9 @@ from services.core.errors import CaptureInputError, SettingsError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import JobSpec, Loss, PreparedManifest
-from services.core.store import StoredArray, open_stage
+from services.core.store import open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
+from services.fit.inputs.levels import LevelReader, reduced_camera, whole_squares
 from services.fit.instrument.capture import Instrument
 from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
 from services.fit.instrument.moves import Move
@@ -190,26 +191,22 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
 
 
 def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
-    """Gather one channel's valid pixels of every camera.
+    """Gather one channel's valid pixels of every camera, at the resolution that is fitted.
 
     Raises:
         CaptureInputError: no valid pixel, or no light in them.
     """
     manifest, index = observations.manifest, observations.manifest.channels.index(channel)
-    store = observations.folder / "prepared.zarr"
-    views = []
-    radiance, variance, bits = (StoredArray(store / name) for name in ("radiance", "variance", "valid"))
+    level = LevelReader(observations.folder / "prepared.zarr", index, spec.pixel_step)
+    lights, views = range(len(manifest.lights)), []
     for c, camera in enumerate(manifest.cameras):
-        width, height = camera.size
-        valid = bits[c][:, :height, :width] == 0
-        valid[:, np.arange(height) % spec.pixel_step != 0] = False
-        valid[:, :, np.arange(width) % spec.pixel_step != 0] = False
+        valid = np.stack([whole_squares(level.bits(c, light, camera) == 0, spec.pixel_step) for light in lights])
         y, x = np.nonzero(valid.any(axis=0))
         if len(x) == 0:
             continue
+        images = (level.image(c, light, camera) for light in lights)
         reference, spread = (
-            np.stack([stack[c, light][y, x, index] for light in range(len(manifest.lights))]).astype(np.float64)
-            for stack in (radiance, variance)
+            np.stack(one) for one in zip(*((radiance[y, x], own[y, x]) for radiance, own in images), strict=True)
         )
         chosen = valid[:, y, x] & np.isfinite(reference)
         reference = np.where(chosen, reference, 0.0)
@@ -218,8 +215,9 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         ) ** 2
         known = np.isfinite(spread) & (spread > 0)
         pixels = np.stack([x, y], axis=-1).astype(np.int32)
+        reduced = reduced_camera(camera, spec.pixel_step)
         views.append(
-            ViewStack(camera, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c])
+            ViewStack(reduced, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c])
         )
     if not views:
         raise CaptureInputError(

@@ -115,7 +115,7 @@ class ChannelSchedule(Stages[Tissue]):
         """The light or view that would help this channel most, in one sentence."""
         self.pause()
         sensor = Sensor(self.spec.sensor_noise_relative, self.spec.sensor_noise_floor)
-        given = folder, self.media, sensor, self.files.weight, fit.samples, self.spec.pixel_step
+        given = folder, self.media, sensor, self.files.weight, fit.samples
         found, _ = self.journal.once(f"{self.scope}/next-capture", lambda: advice(fit.problem, fit.known, *given)[0])
         return str(found)
 
