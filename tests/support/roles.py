@@ -34,6 +34,8 @@ _WORKER = (
     *_COMMANDS,
     "services.cli.dask",
     "services.pipeline.stages",
+    "services.cli.board",
+    "services.cli.calibrate",
     "services.preprocess.stage",
     "services.fit.stage",
     "services.fit.execution.engine_host",

@@ -192,6 +192,15 @@ def test_the_distortion_model_is_the_one_that_the_lens_has() -> None:
     assert choice.held_out_px["pinhole"] > 1.5 * choice.held_out_px["radial-tangential-4"]
 
 
+def test_of_few_boards_the_model_is_held() -> None:
+    random = np.random.default_rng(8)
+    views = [view for view in photographed(true_rig(random, n_places=4), 0.1, random) if view.camera == 1]
+    choice = choose_lens(views, SIZE, "middle")
+    assert (choice.lens.model, choice.held_out_px) == ("radial-tangential-4", {})
+    with pytest.raises(CaptureInputError, match="Camera middle shows 2 boards"):
+        choose_lens(views[:2], SIZE, "middle")
+
+
 def test_corners_lie_on_the_plate_as_opencv_counts_them() -> None:
     corners = corners_on_board(CHESSBOARD)
     assert corners[:2].tolist() == [[0, 0, 0], [12, 0, 0]]

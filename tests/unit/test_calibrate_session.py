@@ -113,7 +113,9 @@ def test_a_wrong_radius_is_named(made: tuple[Path, Truth], session: Session) -> 
         for one in folder.sphere
     )
     wrong = folder.model_copy(update={"sphere": spheres})
-    assert "measure radius_mm again" in suspicions(session, wrong, with_lights(session, made[0], wrong))
+    assert "measure the sphere's radius_mm and the board's square_mm again" in suspicions(
+        session, wrong, with_lights(session, made[0], wrong)
+    )
 
 
 @pytest.mark.slow

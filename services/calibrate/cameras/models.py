@@ -18,6 +18,9 @@ FOLDS = 5
 MODEL_FOR_OUTLIERS = "radial-tangential-5"
 """OpenCV's default: rich enough that bad corners stand out, and determined by any session that can be used."""
 
+MIN_BOARDS, MODEL_OF_FEW = 6, "radial-tangential-4"
+"""With fewer boards nothing can be left out and judged; four coefficients serve all lenses but wide ones."""
+
 
 @dataclass(frozen=True)
 class ModelChoice:
@@ -25,7 +28,7 @@ class ModelChoice:
 
     Attributes:
         lens: of the chosen model, from all boards.
-        held_out_px: rms distance of the corners of boards that were left out, by model.
+        held_out_px: rms distance of the corners of boards that were left out, by model; empty where there were too few boards.
         bad_corners: names of the photographs with corners that fit nowhere, and how many.
     """
 
@@ -47,8 +50,13 @@ def choose_lens(
 
     Corners that fit nowhere are left out first. Each fold then leaves every ``folds``-th board out, fits the others, and judges
     the lens by how well it draws the left out boards with a pose of their own. The difference of two models is a mean over
-    boards, and so is its standard error.
+    boards, and so is its standard error. Of fewer than six boards none can be left out, and the model is held.
+
+    Raises:
+        CaptureInputError: the camera shows fewer than three boards.
     """
+    if len(usable(views)) < MIN_BOARDS:
+        return ModelChoice(first_lens(usable(views), size, MODEL_OF_FEW, name), {}, {})
     fit = fit_lens(views, size, MODEL_FOR_OUTLIERS, name)
     good, bad = without_outliers(of_one_camera(usable(views)), fit)
     errors = {model: _cross_validated(good, size, model, name, min(folds, len(good) // 2)) for model in models}

@@ -118,6 +118,8 @@ def _renumbered(views: Sequence[View]) -> list[View]:
 
 def model_told(choice: ModelChoice) -> str:
     """How a lens' model was chosen, in words."""
+    if not choice.held_out_px:
+        return f"{choice.lens.model}, held, as there are too few boards to leave any out"
     told = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())
     plain = " (OpenCV's default)" if choice.lens.model == MODEL_FOR_OUTLIERS else ""
     return f"{choice.lens.model}{plain}; on boards that were left out: {told}"

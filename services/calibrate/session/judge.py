@@ -132,7 +132,7 @@ def _suspicions(folder: RawFolder, cameras: CamerasStep, lights: LightsStep | No
         if abs(shift) > MOST_EDGE_SHIFT_PX:
             yield (
                 f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
-                "measure radius_mm again."
+                "measure the sphere's radius_mm and the board's square_mm again."
             )
     for outlier in fit.outliers:
         yield (

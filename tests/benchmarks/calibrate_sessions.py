@@ -1,0 +1,205 @@
+"""Whole calibration sessions with drawn errors: how far off cameras, lights, intensities and colours come out, and whether they know it.
+
+``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time a draw and goes on
+where a file already holds draws. Boards are drawn by projection with normal errors of 0.1 px, spheres by their formulae (outlines
+0.1 px and shifted alike by up to 0.2 px, highlights 0.05 px, white pixels 1 % shot noise), and every chart patch is off by 0.3 %.
+Each step gets what the step before found, never the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.boards import corners_on_board
+from services.calibrate.cameras.bundle import fit_bundle, pose_apply
+from services.calibrate.cameras.start import first_lens, first_rig
+from services.calibrate.colour.transform import fit_colour
+from services.calibrate.lights.centres import OutlineView, fit_centres
+from services.calibrate.lights.intensity import WhitePhoto, WhiteSphere, fit_intensity, shading
+from services.calibrate.lights.mirror import Eye, highlight_points
+from services.calibrate.lights.positions import fit_lights
+from services.calibrate.lights.problem import SphereView
+from services.calibrate.reweighted import solve_reweighted
+from tests.support.board_sessions import CHESSBOARD, SIZE, photographed, true_rig
+from tests.support.sphere_sessions import STEEPEST, dome_lights, outline_points
+from tests.support.virtual_session import XYZ_FROM_SENSOR
+
+Floats = NDArray[np.float64]
+NAMES = ["left", "middle", "right"]
+N_PLACES, N_LIGHTS = 20, 12
+MIRROR_MM, WHITE_MM = 28.0, 20.0
+PLACES_MM = np.array([[-62.0, -38, -30], [62, -38, 30], [-62, 38, 30], [62, 38, -30], [0, 0, 60], [0, 0, -60]])
+"""Of the spheres' centres about the teeth: as far apart as all three cameras see."""
+REFLECTANCE = np.array([0.92, 0.9, 0.88])
+SHOT, PATCH_ERROR = 0.01, 0.003
+
+
+def one_session(seed: int) -> dict[str, Any]:
+    """Errors of one session: rms, and whitened or normalised scores."""
+    random = np.random.default_rng(1000 + seed)
+    rig = true_rig(random, N_PLACES)
+    # The teeth are where the boards were turned about: the middle of the board at the first place.
+    teeth = corners_on_board(CHESSBOARD).mean(axis=0)
+    views = photographed(rig, 0.1, random)
+    lenses = [
+        first_lens([view for view in views if view.camera == k], SIZE, "radial-tangential-4", name)
+        for k, name in enumerate(NAMES)
+    ]
+    fit = fit_bundle(views, first_rig(views, lenses, NAMES))
+    layout = fit.layout
+    columns = np.concatenate([np.r_[layout.lens_columns(k), layout.camera_columns(k)] for k in range(3)])
+    covariance = fit.covariance[np.ix_(columns, columns)]
+    true = tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+    found = tuple(Eye(lens, pose) for lens, pose in zip(fit.rig.lenses, fit.rig.cameras, strict=True))
+    error = layout.pack(fit.rig) - layout.pack(rig)
+    shift_mm, turn_deg = _seen_at_the_teeth(true, found, teeth)
+    told: dict[str, Any] = {"seed": seed, "shift_mm": shift_mm, "turn_deg": turn_deg}
+    told["z_cameras"] = _whitened(error[columns], covariance)
+    # The dome shines from the cameras' side of the teeth.
+    away = np.mean([eye.centre_mm for eye in true], axis=0) - teeth
+    lights = _turned(dome_lights(N_LIGHTS, random), away) + teeth
+    centres = _turned(PLACES_MM, away) + teeth + random.normal(0, 2, PLACES_MM.shape)
+    told |= _lights_and_intensity(random, true, found, covariance, lights, centres)
+    told["delta_e"] = _colour(random)
+    return told
+
+
+def _lights_and_intensity(
+    random: np.random.Generator,
+    true: tuple[Eye, ...],
+    found: tuple[Eye, ...],
+    covariance: Floats,
+    lights: Floats,
+    centres: Floats,
+) -> dict[str, Any]:
+    shifts = random.uniform(-0.2, 0.2, 3)
+    views, white = [], []
+    for place, centre in enumerate(centres):
+        for camera, eye in enumerate(true):
+            for radius, into in ((MIRROR_MM, views), (WHITE_MM, white)):
+                edge, outward = outline_points(eye, centre, radius, 90)
+                edge = edge + outward * (shifts[camera] + random.normal(0, 0.1, (90, 1)))
+                if radius == WHITE_MM:
+                    into.append(OutlineView(camera, place, radius, edge))
+                    continue
+                points = highlight_points(eye.centre_mm, lights, centre, radius)
+                to_eye = (eye.centre_mm - points) / np.linalg.norm(eye.centre_mm - points, axis=1, keepdims=True)
+                seen = np.flatnonzero(((points - centre) / radius * to_eye).sum(axis=1) > STEEPEST)
+                pixels = eye.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
+                into.append(SphereView(camera, place, radius, edge, seen, pixels))
+    names = [f"L{n}" for n in range(N_LIGHTS)]
+    fit = fit_lights(views, found, names, covariance)
+    off = fit.positions_mm - lights[fit.lights]
+    count = 3 * len(fit.lights)
+    told = {"lights_mm": float(np.sqrt((off**2).sum(axis=1).mean()))}
+    told |= {"lights_se_mm": float(np.sqrt(np.trace(fit.covariance[:count, :count]) / len(fit.lights)))}
+    scores = {"z_lights": _whitened(off.ravel(), fit.covariance[:count, :count])}
+    # White spheres in the first three places, seen through the cameras that boards and mirror spheres gave.
+    intensity = random.uniform(0.6, 1.4, (N_LIGHTS, 3))
+    intensity /= intensity.mean(axis=0)
+    photos = [
+        _photo(random, eye, centres[place], camera, place, light, lights[light], intensity[light])
+        for place in range(3)
+        for camera, eye in enumerate(true)
+        for light in range(N_LIGHTS)
+    ]
+    believed = fit_centres([one for one in white if one.place < 3], fit.eyes)
+    spheres = [WhiteSphere(centre, WHITE_MM, REFLECTANCE) for centre in believed]
+    answer = fit_intensity(photos, fit.eyes, spheres, fit.positions_mm, names, fit.covariance[:count, :count])
+    logs = np.log(answer.intensity / intensity)
+    scores["z_intensity"] = (logs.ravel() / np.sqrt(np.diag(answer.covariance))).tolist()
+    return told | scores | {"intensity": float(np.sqrt(np.mean(logs**2)))}
+
+
+def _photo(
+    random: np.random.Generator,
+    eye: Eye,
+    centre: Floats,
+    camera: int,
+    place: int,
+    light: int,
+    light_mm: Floats,
+    intensity: Floats,
+) -> WhitePhoto:
+    aim = eye.project(centre[None])[0]
+    grid = np.stack(np.meshgrid(*(np.arange(-150, 151, 15.0),) * 2), axis=-1).reshape(-1, 2) + aim
+    factor, usable = shading(eye, WhiteSphere(centre, WHITE_MM, REFLECTANCE), light_mm, grid)
+    clean = 1e3 * factor[:, None] * REFLECTANCE * intensity
+    level = clean[usable].mean() if usable.any() else 0.0
+    noise = SHOT * np.sqrt(np.maximum(clean, 0) * level)
+    return WhitePhoto(camera, place, light, grid, clean + random.normal(size=clean.shape) * noise)
+
+
+def _colour(random: np.random.Generator) -> float:
+    """Median ΔE2000 of left out patches."""
+    rgb = random.uniform(0.04, 0.85, (24, 3))
+    seen = rgb * (1 + random.normal(0, PATCH_ERROR, rgb.shape))
+    return float(np.median(fit_colour(seen, rgb @ XYZ_FROM_SENSOR.T, "camera").held_out))
+
+
+def _seen_at_the_teeth(true: tuple[Eye, ...], found: tuple[Eye, ...], teeth: Floats) -> tuple[float, float]:
+    """By how much teeth of 10 mm would seem moved (mm) and turned (deg), if the found cameras were taken for the true ones."""
+    points = np.array([[x, y, z] for x in (-5.0, 5) for y in (-5.0, 5) for z in (-5.0, 5)])
+    drawn = [eye.project(points + teeth) for eye in true]
+
+    def off(pose: Floats) -> Floats:
+        moved = pose_apply(pose, points) + teeth
+        return np.concatenate([(eye.project(moved) - seen).ravel() for eye, seen in zip(found, drawn, strict=True)])
+
+    def slope(pose: Floats) -> Floats:
+        steps = 1e-5 * np.eye(6)
+        return np.stack([(off(pose + step) - off(pose - step)) / 2e-5 for step in steps], axis=1)
+
+    pose = solve_reweighted(off, slope, np.zeros(6))
+    return float(np.linalg.norm(pose[3:])), float(np.rad2deg(np.linalg.norm(pose[:3])))
+
+
+def _turned(points: Floats, away: Floats) -> Floats:
+    """Points about the origin whose z axis is turned to a direction."""
+    z = away / np.linalg.norm(away)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.asarray(points @ np.array([x, np.cross(z, x), z]))
+
+
+def _whitened(error: Floats, covariance: Floats) -> list[float]:
+    scale = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(scale, scale))
+    return [float(one) for one in np.linalg.solve(factor, error / scale)]
+
+
+def summary(draws: list[dict[str, Any]]) -> dict[str, float]:
+    """Rms over the draws, and rms of pooled scores."""
+    told = {"draws": float(len(draws))}
+    for key in ("shift_mm", "turn_deg", "lights_mm", "lights_se_mm", "intensity", "delta_e"):
+        told[f"rms_{key}"] = float(np.sqrt(np.mean([draw[key] ** 2 for draw in draws])))
+    for key in ("z_cameras", "z_lights", "z_intensity"):
+        told[f"rms_{key}"] = float(np.sqrt(np.mean(np.concatenate([draw[key] for draw in draws]) ** 2)))
+    return told
+
+
+def main() -> None:
+    """Draw sessions and print their summary."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--json", type=Path, default=None)
+    options = parser.parse_args()
+    draws: list[dict[str, Any]] = []
+    if options.json is not None and options.json.exists():
+        draws = json.loads(options.json.read_text())["draws"]
+    for seed in range(len(draws), options.draws):
+        draws.append(one_session(seed))
+        if options.json is not None:
+            options.json.write_text(json.dumps({"summary": summary(draws), "draws": draws}))
+        print(seed, {key: round(value, 5) for key, value in draws[-1].items() if isinstance(value, float)}, flush=True)
+    print(json.dumps(summary(draws), indent=1))
+
+
+if __name__ == "__main__":
+    main()
