@@ -146,7 +146,7 @@ class Desk:
         picture = self.workshop.folder / "quality" / f"{camera.name}_{lamp.name}.png"
         write_picture(picture, image.radiance, bits)
         return ImageDone(
-            quality=assess(camera.name, lamp.name, bits, footprint.covered, image.motion_px),
+            quality=assess(camera.name, lamp.name, bits, footprint.covered, image.motion_px, image.motion_error_px),
             tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
             light=shown,
             colour=image.colour,

@@ -48,12 +48,17 @@ class Displacement:
     Attributes:
         coefficients: (bodies, TERMS, 2).
         median_px: median length over the teeth.
-        error_px: estimated error of its interpolation in time.
+        error_px: estimated error of its interpolation in time; 0 where nothing tells.
     """
 
     coefficients: FloatArray
     median_px: float
     error_px: float
+
+    @property
+    def told_error_px(self) -> float | None:
+        """The error, or None where nothing tells it."""
+        return self.error_px or None
 
 
 class ViewMotion:

@@ -12,7 +12,7 @@ from services.preprocess.masks import HandMasks
 from services.preprocess.motion import stored_step
 from services.preprocess.source import Source
 
-FORMAT = 3
+FORMAT = 4
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
 INDIFFERENT = frozenset({"workers", "priority"})
 """Options that change no pixel."""

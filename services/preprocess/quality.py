@@ -31,6 +31,9 @@ class ImageQuality(Record):
     camera: str
     light: str
     motion_px: float | None = Field(description="median displacement removed; null where not measured")
+    motion_error_px: float | None = Field(
+        default=None, description="estimated error of it; null where nothing tells, as without three tracking frames"
+    )
     tooth_pixels: int = Field(description="pixels whose whole footprint is to be fitted")
     valid_pixels: int
     masked: dict[str, float] = Field(description="mask bit -> fraction of the tooth pixels")
@@ -43,7 +46,12 @@ class QualityReport(Record):
 
 
 def assess(
-    camera: str, light: str, bits: NDArray[np.uint16], covered: NDArray[np.bool_], motion_px: float | None
+    camera: str,
+    light: str,
+    bits: NDArray[np.uint16],
+    covered: NDArray[np.bool_],
+    motion_px: float | None,
+    motion_error_px: float | None = None,
 ) -> ImageQuality:
     """Count what was masked among the tooth's pixels."""
     pixels = int(np.count_nonzero(covered))
@@ -59,6 +67,7 @@ def assess(
         camera=camera,
         light=light,
         motion_px=motion_px,
+        motion_error_px=motion_error_px,
         tooth_pixels=pixels,
         valid_pixels=int(np.count_nonzero(bits == 0)),
         masked={name: share for name, share in masked.items() if share > 0},

@@ -160,7 +160,16 @@ def _image(
     if max(move.error_px for move in moves) > UNCERTAIN_PX:
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)
-    return LightImage(radiance, variance, bits, motion.stored(farthest), farthest.median_px, any(is_warped))
+    told = [error for move in moves if (error := move.told_error_px) is not None]
+    return LightImage(
+        radiance,
+        variance,
+        bits,
+        motion.stored(farthest),
+        farthest.median_px,
+        any(is_warped),
+        motion_error_px=max(told, default=None),
+    )
 
 
 def _resampled(

@@ -52,6 +52,7 @@ class LightImage:
         bits: (H, W), what the source knows: saturated, moved, not finite.
         displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not measured.
         motion_px: median over the teeth; None where motion is not measured.
+        motion_error_px: by how much the motion may be wrong where the teeth are, as its interpolation in time tells; None where nothing tells.
         warped: whether the pixels were resampled.
         colour: of a frame whose order of channels may be wrong; None where nothing tells.
     """
@@ -63,6 +64,7 @@ class LightImage:
     motion_px: float | None = None
     warped: bool = False
     colour: FrameColour | None = None
+    motion_error_px: float | None = None
 
 
 class Source(Protocol):

@@ -23,15 +23,16 @@ Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 
-# 1, x, y, relief, x², xy, y²; the ridge is relative to the mean curvature of the cost
+# 1, x, y, relief, x², xy, y²
 TERMS = 7
 Feature = Literal["texture", "edges"]
-RIDGE: dict[Feature, tuple[float, ...]] = {
-    # Same light: contrast fixes every term, the ridge only tames those a flat or small region leaves open
-    "texture": (0, 1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2),
-    # Another light: edges of the lit side alone are left, so all but the shift is held
-    "edges": (0, 10, 10, 100, 100, 100, 100),
-}
+# Same light: the terms' standard deviations before anything is seen, as shares of the body's shorter side; the shift is free.
+# A nod or turn by a few degrees moves a tooth's outline by this much.
+LIKELY_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
+# Features are made with Gaussians of 2 px, so that residuals of about 4π 2² pixels are one observation
+CORRELATED_PX = 50.0
+# Another light: edges of the lit side alone are left, so all but the shift is held; relative to the mean curvature of the cost
+EDGE_RIDGE = (0, 10, 10, 100, 100, 100, 100)
 # Matching runs near the fit's 1/5 of 20 megapixels, and on evenly strided pixels: a few coefficients need no more
 SOLVE_PIXELS = 800_000
 MATCHED_PIXELS = 200_000
@@ -134,6 +135,7 @@ class Aligner:
     def __init__(self, flow: SurfaceFlow, reference: NDArray[np.generic], feature: Feature, level: float = 0.0) -> None:
         self._feature: Feature = feature
         self._zero = level
+        self._extent_px = flow.extent_px
         self._factor = int(np.ceil(np.sqrt(reference.shape[0] * reference.shape[1] / SOLVE_PIXELS)))
         region, terms = flow.reduced(self._factor)
         self._levels = []
@@ -152,7 +154,6 @@ class Aligner:
         import cv2
 
         coefficients = np.zeros((TERMS, 2))
-        ridge = np.tile(RIDGE[self._feature], 2)
         grey = reduce_grey(frame, self._factor, self._zero)
         for level, moving in reversed(list(zip(self._levels, _pyramid(grey, self._feature), strict=True))):
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
@@ -173,13 +174,24 @@ class Aligner:
                 weight = 1 / (1 + (residual / scale) ** 2) ** 2
                 jacobian = np.concatenate([slope[:, :1] * basis, slope[:, 1:] * basis], axis=1).astype(np.float64)
                 hessian = (jacobian * weight[:, None]).T @ jacobian
-                damping = ridge * np.trace(hessian) / (2 * TERMS) + 1e-12
+                damping = self._damping(scale, hessian)
                 gradient = (jacobian * weight[:, None]).T @ residual + damping * coefficients.T.ravel()
                 update = -np.linalg.solve(hessian + np.diag(damping), gradient).reshape(2, TERMS).T
                 coefficients = coefficients + update
                 if np.abs(update).max() < 2e-3 * level.pixel_px:
                     break
         return coefficients
+
+    def _damping(self, scale: float, hessian: FloatArray) -> FloatArray:
+        """What is added to the cost's curvature (2 TERMS,), 1/px² of ``scale``², and pulls each term towards no motion.
+
+        Between frames of one light the estimate is the most likely one: contrast speaks with its residuals' standard deviation ``scale``, and
+        what it does not tell stays near no motion.
+        """
+        if self._feature == "edges":
+            return np.asarray(np.tile(EDGE_RIDGE, 2) * np.trace(hessian) / (2 * TERMS) + 1e-12)
+        precision = np.concatenate([[0], (self._extent_px * np.asarray(LIKELY_SHARE)) ** -2.0])
+        return np.asarray(CORRELATED_PX * scale**2 * np.tile(precision, 2) + 1e-12)
 
 
 def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:

@@ -172,6 +172,8 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
     assert done[-1] == 1
     assert (events[0].kind, events[-1].kind) == ("started", "finished")
     report = read_record(root / "prepared" / "quality.json", QualityReport)
+    # Interpolated between four tracking frames, its own error is told and small
+    assert all(image.motion_error_px is not None and image.motion_error_px < 0.5 for image in report.images)
     assert len(report.images) == 2 * LIGHTS
     assert (
         sum(image.valid_pixels for image in report.images) / sum(image.tooth_pixels for image in report.images)

@@ -82,7 +82,8 @@ class RawView:
         colour = colour_of(frames[0], self._channels, radiance[usable])
         farthest = max(moves, key=lambda move: move.median_px)
         moved = self.motion.stored(farthest), farthest.median_px, any(is_warped)
-        return LightImage(radiance, variance, bits, *moved, colour)
+        told = [error for move in moves if (error := move.told_error_px) is not None]
+        return LightImage(radiance, variance, bits, *moved, colour, max(told, default=None))
 
     def _groups(
         self, exposures: Sequence[Exposure], moves: Sequence[Displacement]
