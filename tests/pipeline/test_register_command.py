@@ -109,9 +109,9 @@ def test_what_is_missing_is_named(mouth: RawMouth, tmp_path: Path, change: Tree,
 
 def test_contradicting_landmarks_are_refused_with_a_picture(mouth: RawMouth, tmp_path: Path) -> None:
     landmarks = json.loads(json.dumps(mouth.tree["landmark"]))
-    places = [one["xyz_mm"] for one in landmarks]
-    for one, place in zip(landmarks, places[1:] + places[:1], strict=True):
-        one["xyz_mm"] = place
+    seen = [one["pixels"] for one in landmarks]
+    for one, pixels in zip(landmarks, seen[1:] + seen[:1], strict=True):
+        one["pixels"] = pixels
     root = altered(mouth, tmp_path / "raw", {"landmark": landmarks})
     with pytest.raises(CaptureInputError, match=r"landmarks contradict .*refused_c0\.png.* show it\."):
         register_folder(root)

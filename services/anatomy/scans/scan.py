@@ -17,10 +17,11 @@ from services.core.files.scans import SIDECARS, ScanFile, read_scan_file, read_s
 from services.core.geometry import Mesh
 
 Numbering = Literal["universal", "fdi", "either"]
-"""How labels name teeth; ``either`` takes FDI numbers where the labels name teeth of one jaw in them, else Universal ones."""
+"""How labels name teeth; ``either`` takes FDI numbers where the labels can be these and name one jaw, else Universal ones."""
 Jaw = Literal["upper", "lower"]
 
 GINGIVA = 0
+HIGHEST_UNIVERSAL = 32
 EXTENT_MM = (8.0, 200.0)
 """Of a scan with two teeth at least."""
 
@@ -156,7 +157,7 @@ def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) 
     names = {fdi_from_universal(n): n for n in range(1, 33)}
     labels, index = np.unique(values, return_inverse=True)
     if numbering == "either":
-        numbering = "fdi" if _names_one_jaw(labels, frozenset(names)) else "universal"
+        numbering = "fdi" if _are_fdi(labels, frozenset(names)) else "universal"
     number_of = {float(GINGIVA): GINGIVA} | {
         float(n if numbering == "universal" else fdi): fdi for fdi, n in names.items()
     }
@@ -169,6 +170,9 @@ def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) 
     return np.array([number_of[float(label)] for label in labels], dtype=np.int64)[index.reshape(-1)]
 
 
-def _names_one_jaw(labels: NDArray[np.float64], fdi: frozenset[int]) -> bool:
+def _are_fdi(labels: NDArray[np.float64], fdi: frozenset[int]) -> bool:
+    # They name teeth of one jaw in it, or such as Universal Numbering does not have.
     teeth = [float(label) for label in labels if label != GINGIVA]
-    return all(label in fdi for label in teeth) and len({is_upper(int(label)) for label in teeth}) <= 1
+    return all(label in fdi for label in teeth) and (
+        len({is_upper(int(label)) for label in teeth}) <= 1 or max(teeth) > HIGHEST_UNIVERSAL
+    )

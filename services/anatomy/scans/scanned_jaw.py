@@ -31,6 +31,8 @@ from services.core.geometry import Mesh, Tooth
 
 LARGEST_SHARE = 0.8
 """Of a tooth's area that has to be in one piece; the rest is taken for specks."""
+SMALLEST_CROWN_MM2 = 15.0
+"""Area of a crown that is taken for one; a lower incisor shows some 100, one that breaks through some 20."""
 STEEPEST_TILT_DEG = 25.0
 """Of a tooth's axis off the arch's normal: upper front teeth lean about so far to the front."""
 FLAT = 0.2
@@ -126,6 +128,11 @@ def _require_whole_teeth(scan: LabelledScan) -> None:
     area = areas_mm2(scan.mesh)
     for number in scan.teeth:
         own = scan.fdi == number
+        if area[own].sum() < SMALLEST_CROWN_MM2:
+            raise CaptureInputError(
+                f"The label of tooth {number} covers {area[own].sum():.2g} mm², less than any tooth shows; "
+                "label the tooth, or give the label's triangles to what they are of."
+            )
         size = np.bincount(touching_pieces(scan.mesh.faces[own]), weights=area[own])
         if size.max() < LARGEST_SHARE * size.sum():
             raise CaptureInputError(

@@ -72,7 +72,8 @@ def _steps(
     own = np.where(between, np.where(depth_one <= depth_two, first, second), np.maximum(first, second))
     x = column + (0.5 if axis == 0 else 1.0)
     y = row + (1.0 if axis == 0 else 0.5)
-    return x, y, np.minimum(depth_one, depth_two), own.astype(np.int64), between
+    nearer = np.minimum(depth_one, depth_two).astype(np.float64)
+    return x.astype(np.float64), y.astype(np.float64), nearer, own.astype(np.int64), between
 
 
 def _outward(mask: NDArray[np.bool_], x: Floats, y: Floats) -> Floats:

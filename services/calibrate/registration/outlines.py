@@ -79,7 +79,7 @@ def pose_from_outlines(
     Raises:
         CaptureInputError: most outlines have no edge in the photographs.
     """
-    pose, prior = start.pose, np.linalg.inv(start.covariance)
+    pose, prior = start.pose, np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     appearances: list[Appearance] = []
     found: list[Found] = []
     normal, spread = prior, {}
@@ -104,7 +104,7 @@ def pose_from_outlines(
             jacobian, residual, weight, spread[view.camera.name] = _equations(view.camera, one, centre)
             normal += jacobian.T @ (weight[:, None] * jacobian)
             right += jacobian.T @ (weight * residual)
-        step = np.linalg.solve(normal, right)
+        step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         pose = pose.moved(step, centre)
         if reach <= 3.0 and np.abs(step).max() < 1e-4:
             break

@@ -46,7 +46,8 @@ def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict
                 f"Camera {raw.name} has no frame of kind tracking or light; add one that shows the teeth, or remove the camera."
             )
         black = _black_counts(root, folder, raw.name, camera)
-        mean = np.mean([_image(root, folder, frame, black) for frame in frames], axis=0, dtype=np.float32)
+        images = [_image(root, folder, frame, black) for frame in frames]
+        mean = np.asarray(np.mean(images, axis=0), dtype=np.float32)
         views[raw.name] = _undistorted(mean, camera)
     return views
 
@@ -131,8 +132,8 @@ def _lens(camera: CalibratedCamera) -> Lens:
 
 
 def _some(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_LIGHTS)).astype(int)) if frames else []
-    return [frames[k] for k in chosen]
+    count = min(len(frames), MOST_LIGHTS)
+    return [frames[k * len(frames) // count] for k in range(count)]
 
 
 def _black_counts(root: Path, folder: RawFolder, name: str, camera: CalibratedCamera) -> float:

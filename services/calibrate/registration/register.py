@@ -27,6 +27,8 @@ from services.core.store import read_record, write_atomic, write_record
 from services.core.uncertainty import TWIST, CalibrationUncertainty
 
 PICTURES, PAGE = "registration", "registration.html"
+FARTHEST_LANDMARK_MM = 2.0
+"""Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre apart."""
 REACH_MM = 1.5
 """How far outlines are looked for at first: clicks leave a pose open by less."""
 MOST_MISFIT_MM = 0.12
@@ -76,7 +78,7 @@ def register_folder(
     calibration_path, calibration = _calibration(root, folder, calibration_file)
     scanned = scanned_teeth(root, folder)
     views, clicks = photographs(root, folder, calibration), clicks_of(folder, calibration)
-    _require_known_teeth(clicks, scanned)
+    require_on_their_teeth(clicks, scanned)
     steps, cut, misfit_mm = _registered(views, clicks, scanned, out / PICTURES, most_misfit_mm)
 
     pose = steps[-1].pose
@@ -110,7 +112,7 @@ def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
         raise CaptureInputError(f"Scan {scan.file} is of both jaws; export the jaw that is photographed alone.")
     read = read_scan(root / scan.file, "either", scan.labels or "Label", units=scan.units, jaw=scan.jaw)
     jaw: ScannedJaw = jaw_from_scan(read, "whole")
-    scan_from_arch = np.linalg.inv(jaw.arch_from_scan)
+    scan_from_arch = np.asarray(np.linalg.inv(jaw.arch_from_scan), dtype=np.float64)
     back = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
     teeth = tuple(_placed(tooth.outer, back) for tooth in jaw.teeth)
     fdi = tuple(tooth.fdi for tooth in jaw.teeth)
@@ -163,12 +165,24 @@ def _calibration(root: Path, folder: RawFolder, given: Path | None) -> tuple[Pat
     return path, read_record(path, Calibration)
 
 
-def _require_known_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> None:
+def require_on_their_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> None:
+    """Refuse landmarks of teeth that the scan does not have, or that lie elsewhere.
+
+    Raises:
+        CaptureInputError: names the first one.
+    """
     for one in clicks:
         if int(one.name.split()[0]) not in scanned.fdi:
             raise CaptureInputError(
                 f"Landmark {one.name} is of a tooth that the scan does not have ({', '.join(map(str, scanned.fdi))}); "
                 "correct its tooth, or remove it."
+            )
+        mesh = scanned.teeth[scanned.fdi.index(int(one.name.split()[0]))]
+        off_mm = float(np.linalg.norm(mesh.vertices_mm - one.point_mm, axis=1).min())
+        if off_mm > FARTHEST_LANDMARK_MM:
+            raise CaptureInputError(
+                f"Landmark {one.name} lies {off_mm:.3g} mm from its tooth in the scan; give xyz_mm in the scan's own coordinates, "
+                "in mm, and see whether its tooth is right."
             )
 
 
