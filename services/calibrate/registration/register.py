@@ -31,9 +31,9 @@ FARTHEST_LANDMARK_MM = 2.0
 """Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre apart."""
 REACH_MM = 1.5
 """How far outlines are looked for at first: clicks leave a pose open by less."""
-MOST_MISFIT_MM = 0.12
+MOST_MISFIT_MM = 0.10
 """Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.06 mm in a
-calibrated rig, those of others to 0.18 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
+calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
 
 
 @dataclass(frozen=True)
