@@ -20,7 +20,7 @@ from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.merge import Exposure, merge
 from services.preprocess.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
-from services.preprocess.raw.response import Linearity, Series, measure_linearity
+from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -191,14 +191,17 @@ class CameraFrames:
         ladders = [own for own in _ladders(flats) if len(own) > 1]
         if not ladders:
             ladders = [own for own in _ladders(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1]
-        for pair in [pair for own in ladders for pair in pairwise(own)][:FRAMES_MEASURED]:
+        pairs = [pair for own in ladders for pair in pairwise(own)]
+        # From all ladders alike, as some lights are brighter than others
+        for pair in pairs[:: max(1, len(pairs) // FRAMES_MEASURED)]:
             shorter, longer = (self.exposure(frame) for frame in pair)
             require_like_exposures(self._root, pair, (shorter, longer), self._folder.channels)
             yield Series(self._by_colour(shorter), self._by_colour(longer), longer.factor / shorter.factor)
 
     def _by_colour(self, exposure: Exposure) -> Image:
-        """Counts above black with the four pixels of a mosaic's pattern apart, NaN where full."""
-        signal = _unsaturated(exposure)
+        """Counts above black with the four pixels of a mosaic's pattern apart, NaN where about full."""
+        near_full = exposure.headroom < (1 - NEAR_FULL) * self._full
+        signal = np.where(near_full, np.nan, exposure.signal).astype(np.float32)
         if self.raw.mosaic == "none":
             return signal
         height, width = (length // 2 * 2 for length in signal.shape)

@@ -18,6 +18,8 @@ Image = NDArray[np.float32]
 
 EXPOSURE_OFF = 1.5
 """Factor by which a frame may be brighter or darker than another exposure of its light lets expect."""
+CUT_SHARE = 0.8
+"""Of full scale, at which counts are cut off for that: sensors bend above."""
 TELLING_SHARE = 0.01
 """Of full scale: darker frames tell nothing of their exposure."""
 TELLING_CONTRAST = 0.2
@@ -94,19 +96,19 @@ def require_like_exposures(
 
 
 def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
-    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to tell."""
-    seen = (first.headroom > 0) & (headroom > 0)
-    count = np.atleast_1d(seen.sum(axis=(0, 1)))
-    if not count.all():
+    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to tell.
+
+    Both are cut off below full, so that pixels which are full in the longer one, or would be, agree.
+    """
+    full = float(np.max(headroom + signal))
+    if not np.isfinite(full):
         return None
-    means = [
-        np.atleast_1d(np.where(seen, one, 0).sum(axis=(0, 1), dtype=np.float64)) / count
-        for one in (first.signal, signal)
-    ]
-    full = float(np.max((headroom + signal)[seen]))
-    if not np.isfinite(full) or min(mean.min() for mean in means) < TELLING_SHARE * full:
+    most = np.float32(CUT_SHARE * full)
+    expected = np.minimum(first.signal * np.float32(factor / first.factor), most)
+    means = [np.atleast_1d(np.mean(one, axis=(0, 1), dtype=np.float64)) for one in (expected, np.minimum(signal, most))]
+    if min(mean.min() for mean in means) < TELLING_SHARE * full:
         return None
-    return np.asarray(np.log(means[1] / means[0] * first.factor / factor))
+    return np.asarray(np.log(means[1] / means[0]))
 
 
 def _shows_the_same(first: Exposure, second: Exposure) -> bool:
