@@ -26,6 +26,7 @@ LIGHT_DRIFT = 1e-4
 def record_of(
     folder: RawFolder,
     black: Mapping[str, Black],
+    falls: Mapping[str, tuple[float, float, float]],
     cameras: CamerasStep,
     lights: LightsStep | None,
     intensity: IntensityStep | None,
@@ -41,7 +42,13 @@ def record_of(
         units="mm",
         channels=folder.channels,
         cameras=tuple(
-            _camera(name, eye, black[name], None if intensity is None else intensity.fit.radiance_per_count[number])
+            _camera(
+                name,
+                eye,
+                black[name],
+                falls.get(name),
+                None if intensity is None else intensity.fit.radiance_per_count[number],
+            )
             for number, (name, eye) in enumerate(zip(cameras.names, eyes, strict=True))
         ),
         lights=tuple(
@@ -141,7 +148,9 @@ def _camera_rows(names: Sequence[str], eyes: Sequence[Eye]) -> tuple[list[str], 
     return told, np.concatenate(blocks)
 
 
-def _camera(name: str, eye: Eye, black: Black, scale: Floats | None) -> CalibratedCamera:
+def _camera(
+    name: str, eye: Eye, black: Black, fall: tuple[float, float, float] | None, scale: Floats | None
+) -> CalibratedCamera:
     return CalibratedCamera.model_validate(
         {
             "name": name,
@@ -149,6 +158,7 @@ def _camera(name: str, eye: Eye, black: Black, scale: Floats | None) -> Calibrat
             "K": eye.lens.matrix.tolist(),
             "distortion": eye.lens.distortion.tolist() or None,
             "camera_from_world": pose_matrix(eye.pose).tolist(),
+            "vignetting": fall,
             "radiance_per_count": None if scale is None else scale.tolist(),
             "black_counts": black.counts,
             "read_noise_counts": black.noise,

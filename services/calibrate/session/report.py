@@ -126,7 +126,9 @@ def _colours(session: Session) -> list[dict[str, Any]]:
 
 def _assumed(session: Session) -> Iterator[str]:
     yield "Counts are linear in light above black."
-    yield "The fall of light towards the image's corners was not measured: no vignetting is in the record."
+    for camera in session.record.cameras:
+        if camera.vignetting is None:
+            yield f"Camera {camera.name} has no flat frame: light is taken to be even over its image."
     if session.lights is None:
         yield "No mirror sphere was photographed: lights stand where raw.toml lists them, in the frame of the first board."
     if session.intensity is None:
@@ -134,4 +136,4 @@ def _assumed(session: Session) -> Iterator[str]:
     elif session.intensity.fit.exponent == 0:
         yield "Lights shine alike in all directions: the white spheres' places tell of no lobe."
     if session.colours is not None:
-        yield "Light on the chart is even; its white is that of its grey patches."
+        yield "Light on the chart is even, also in the image; its white is that of its grey patches."

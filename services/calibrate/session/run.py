@@ -14,6 +14,7 @@ import numpy as np
 
 from services.calibrate.session.boards import CamerasStep, calibrate_cameras
 from services.calibrate.session.charts import ColourStep, calibrate_colours
+from services.calibrate.session.flats import fall_of_light
 from services.calibrate.session.judge import Judgement, judge
 from services.calibrate.session.photos import Photos
 from services.calibrate.session.record import light_positions, record_of
@@ -61,13 +62,18 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     positions = np.full((len(folder.light), 3), np.nan)
     for number, where in light_positions(folder, lights).items():
         positions[number] = where
-    intensity = measure_intensity(photos, eyes, positions, cameras.distance_mm)
+    falls = {
+        name: fall
+        for name, eye in zip(cameras.names, eyes, strict=True)
+        if (fall := fall_of_light(photos, name, eye.lens.values[2:4])) is not None
+    }
+    intensity = measure_intensity(photos, eyes, positions, cameras.distance_mm, falls)
     tell("colours: charts")
     colours = calibrate_colours(photos)
     used = [root / DESCRIPTION, *(root / frame.file for frame in folder.frame if _is_used(frame.kind))]
     inputs = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in used}
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    record = record_of(folder, photos.black, cameras, lights, intensity, colours, made, valid_days, inputs)
+    record = record_of(folder, photos.black, falls, cameras, lights, intensity, colours, made, valid_days, inputs)
     judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty)
     return Session(record, cameras, lights, intensity, colours, judgement)
 
@@ -80,7 +86,7 @@ def write_session(session: Session, out: Path) -> None:
 
 
 def _is_used(kind: str) -> bool:
-    return kind in {"black", "board", "mirror-sphere", "white-sphere", "chart"}
+    return kind in {"black", "flat", "board", "mirror-sphere", "white-sphere", "chart"}
 
 
 def _residuals(session: Session) -> dict[str, Any]:

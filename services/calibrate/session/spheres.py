@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,13 @@ from services.calibrate.lights.listed import AlignedList, align_list
 from services.calibrate.lights.mirror import Eye
 from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.calibrate.lights.problem import SphereView
+from services.calibrate.session.flats import relative_square
 from services.calibrate.session.photos import Photos
 from services.core.errors import CaptureInputError
 from services.core.raw.records import FrameKind, RawFrame
 
 Floats = NDArray[np.float64]
+Fall = tuple[float, float, float]
 WHITE_PIXELS_ACROSS = 60
 """A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit it."""
 
@@ -84,9 +87,21 @@ def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distanc
 
 
 def measure_intensity(
-    photos: Photos, eyes: Sequence[Eye], lights_mm: Floats, distance_mm: float
+    photos: Photos,
+    eyes: Sequence[Eye],
+    lights_mm: Floats,
+    distance_mm: float,
+    falls: Mapping[str, Fall] = MappingProxyType({}),
 ) -> IntensityStep | None:
-    """Intensities of the lights from the folder's white spheres; None without any."""
+    """Intensities of the lights from the folder's white spheres; None without any.
+
+    Args:
+        photos: the folder.
+        eyes: calibrated cameras.
+        lights_mm: positions (L, 3), NaN where not known.
+        distance_mm: of the spheres, roughly.
+        falls: a, b, c of the fall of light by camera.
+    """
     groups = _groups(photos, "white-sphere")
     if not groups:
         return None
@@ -104,6 +119,9 @@ def measure_intensity(
         for frame in frames:
             number = lights.index(str(frame.light))
             pixels, values = _sampled(photos, frame, outline)
+            if (fall := falls.get(camera)) is not None:
+                q = relative_square(pixels, eye.lens.size, eye.lens.values[2:4])
+                values = values / (1 + q * (fall[0] + q * (fall[1] + q * fall[2])))[:, None]
             found.append(WhitePhoto(cameras.index(camera), places.index(place), number, pixels, values))
     centres = fit_centres(outlines, eyes)
     spheres = [
