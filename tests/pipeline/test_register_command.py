@@ -15,7 +15,7 @@ from services.calibrate.registration.pose import RigidPose
 from services.calibrate.registration.register import register_folder
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import read_mesh, read_teeth
-from services.core.registration import Registration
+from services.core.raw.registration import Registration
 from services.core.store import read_record
 from tests.support.raw_folders import Tree, write_toml
 from tests.support.raw_mouth import RawMouth, write_raw_mouth

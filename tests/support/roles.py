@@ -36,6 +36,7 @@ _WORKER = (
     "services.pipeline.stages",
     "services.cli.board",
     "services.cli.calibrate",
+    "services.cli.register",
     "services.preprocess.stage",
     "services.fit.stage",
     "services.fit.execution.engine_host",

@@ -14,7 +14,7 @@ from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.core.geometry import Mesh
-from services.core.registration import Registration
+from services.core.raw.registration import Registration
 from services.core.store import write_atomic
 
 BRIGHT_PERCENT = 99.0

@@ -22,7 +22,7 @@ from services.core.files.meshes import write_mesh
 from services.core.geometry import Matrix4, Mesh, teeth_folder
 from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.raw.records import RawFolder
-from services.core.registration import REGISTRATION, Registration, RegistrationStep
+from services.core.raw.registration import REGISTRATION, Registration, RegistrationStep
 from services.core.store import read_record, write_atomic, write_record
 from services.core.uncertainty import TWIST, CalibrationUncertainty
 
