@@ -89,9 +89,10 @@ def require_like_exposures(
                 raise CaptureInputError(
                     f"{what} has red and blue exchanged against {shorter.file}; export both with the same order of channels."
                 )
+        found = "brighter" if off[np.argmax(np.abs(off))] > 0 else "darker"
         raise CaptureInputError(
-            f"{what} is {np.exp(off[np.argmax(np.abs(off))]):.3g} times as bright as {shorter.file} lets expect from exposure_s, "
-            "gain and level; correct these, or the order of its bytes, bits or channels."
+            f"{what} is clearly {found} than {shorter.file} lets expect from exposure_s, gain and level; correct these, "
+            "or the order of its bytes, bits or channels."
         )
 
 
