@@ -14,8 +14,8 @@ MAX_PARTS = 12
 TEXTS = frozenset({".csv", ".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
-DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "slab.json"})
-"""One of these makes a folder a capture: one made by anyone, one that the capture stage published, or that of a material's cell."""
+DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "raw.toml", "slab.json"})
+"""One of these makes a folder a capture: linear images, what the capture stage published, raw photographs, or a material's cell."""
 
 _CHUNK = re.compile(r"(.*/)?[^/]+\.zarr/(.*/)?c(/\d+)+")
 

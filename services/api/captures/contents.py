@@ -9,8 +9,11 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import from_json
 
+from services.core.errors import CaptureInputError
 from services.core.files.image_headers import declared
 from services.core.files.image_metadata import metadata_fault
+from services.core.raw.folder import DESCRIPTION, parse_raw_folder
+from services.core.raw.records import RawFolder
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
 from services.core.slab.folder import SlabFolder
@@ -43,6 +46,8 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
     try:
         if name == "capture.json":
             return _description_fault(name, FolderCapture.model_validate_json(path.read_bytes()), limits, names)
+        if name == DESCRIPTION:
+            return _raw_fault(name, parse_raw_folder(path.read_bytes(), name), limits, names)
         if name == "slab.json":
             return _slab_fault(name, SlabFolder.model_validate_json(path.read_bytes()), limits, names)
         if name == "manifest.json":
@@ -50,6 +55,8 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
         if pure.name == "zarr.json":
             return _array_fault(name, from_json(path.read_bytes()), limits)
         return _image_fault(path, name, pure.suffix.lower(), limits)
+    except CaptureInputError as problem:
+        return problem.message
     except ValidationError as problem:
         first = problem.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the file"
@@ -86,6 +93,21 @@ def _description_fault(
             if file is not None and str(PurePosixPath(file)) not in names:
                 return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
     return None
+
+
+def _raw_fault(name: str, folder: RawFolder, limits: UploadLimits, names: frozenset[str]) -> str | None:
+    for camera in folder.camera:
+        if math.prod(camera.size) * len(camera.channels) * _PIXEL_BYTES > limits.largest_image_bytes:
+            size = " x ".join(map(str, camera.size))
+            return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
+    files = [(f"image file {frame.file}", frame.file) for frame in folder.frame]
+    files += [(f"reference {chart.reference}", chart.reference) for chart in folder.chart]
+    files += [] if folder.scan is None else [(f"scan {folder.scan.file}", folder.scan.file)]
+    files += [] if folder.calibration is None else [(f"calibration {folder.calibration.file}", folder.calibration.file)]
+    absent = next((what for what, file in files if str(PurePosixPath(file)) not in names), None)
+    return (
+        None if absent is None else f"{name} names {absent}, which is not among the files; add it or remove its entry."
+    )
 
 
 def _slab_fault(name: str, folder: SlabFolder, limits: UploadLimits, names: frozenset[str]) -> str | None:

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Protocol
 
 from services.api.captures.contents import content_fault
-from services.core.calibration import MAX_LIGHTS, Calibration, read_description
+from services.core.calibration import MAX_LIGHTS, Calibration
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
+from services.core.raw.description import read_any_description
+from services.core.raw.folder import DESCRIPTION
 from services.core.settings import UploadLimits
 from services.core.store import MANIFEST
 
@@ -17,7 +19,7 @@ MAX_DESCRIPTION_BYTES = 4 * 2**20
 """Of a JSON file that is parsed: five thousand images with the longest names, under a thousand lights, take a third of it."""
 MAX_CAMERAS = 1000
 """More than any rig has; with as many lights, what is told of a capture stays below a megabyte."""
-_PLACES = ("capture.json", MANIFEST, f"capture/{MANIFEST}")
+_PLACES = ("capture.json", DESCRIPTION, MANIFEST, f"capture/{MANIFEST}")
 
 
 class Described(Record):
@@ -75,7 +77,7 @@ def describe(capture: Path) -> Described:
         raise CaptureInputError(
             f"{path} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed; leave out what describes no image."
         )
-    description = read_description(capture)
+    description = read_any_description(capture)
     for what, count, most in (
         ("cameras", len(description.cameras), MAX_CAMERAS),
         ("lights", len(description.lights), MAX_LIGHTS),

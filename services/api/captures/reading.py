@@ -33,7 +33,7 @@ MAX_ANSWER_BYTES = 4 * 2**20
 """Four times what the cameras and lights of the largest rig take."""
 BATCH = 256
 """Files of which only headers are read that are asked for at once."""
-_PARSED = frozenset({".json"})
+_PARSED = frozenset({".json", ".toml"})
 
 
 class CostlyFileError(Exception):
@@ -112,7 +112,7 @@ class ReadApart:
             if is_parsed and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
                 yield (
                     name,
-                    f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a JSON file; leave out what describes no image.",
+                    f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a description; leave out what describes no image.",
                 )
                 continue
             asked = [(str(path), name) for path, name in batch]

@@ -36,7 +36,7 @@ WORKER_BYTES = 3 * 2**29
 """Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
 MAX_FILES = 5_000
 """Of a capture that are looked at."""
-_DESCRIPTIONS = ("capture.json", "slab.json", MANIFEST, f"capture/{MANIFEST}")
+_DESCRIPTIONS = ("capture.json", "raw.toml", "slab.json", MANIFEST, f"capture/{MANIFEST}")
 """One of these makes a folder a capture, or a job that holds one."""
 KEPT_FREE_BYTES = 256 * 2**20
 """Disk that no job may count on."""

@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibrated import CalibratedCamera
-from services.core.calibration import Calibration, require_consistent
-from services.core.errors import CaptureInputError
 from services.core.files.meshes import fdi_numbers
-from services.core.raw.folder import DESCRIPTION, read_raw_folder
-from services.core.raw.records import RawFolder, RawFrame
-from services.core.records import FolderCapture, FrameRecord
-from services.core.store import read_record
+from services.core.raw.description import described, read_calibration
+from services.core.raw.folder import read_raw_folder
+from services.core.raw.records import RawFrame
+from services.core.records import FrameRecord
 from services.preprocess.motion import ViewMotion, frames_to_match, jaws
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
@@ -44,9 +41,9 @@ class RawSource:
         self.root, self._noise = root, (noise_relative, noise_floor)
         self._measured: dict[str, CameraFrames] = {}
         self._folder = read_raw_folder(root)
-        self._calibration = _read_calibration(root, self._folder, calibration)
+        self._calibration = read_calibration(root, self._folder, calibration)
         self._cameras = {camera.name: camera for camera in self._calibration.cameras}
-        self.description = _description(root, self._folder, self._calibration)
+        self.description = described(root, self._folder, self._calibration)
         self._frames = _in_time(frame for frame in self._folder.frame if frame.kind in {"light", "tracking"})
         self.notes: tuple[str, ...] = tuple(missing_exposures(self._folder))
         fewest = min(sum(frame.kind == "tracking" for frame in self._of(camera.name)) for camera in self._folder.camera)
@@ -120,57 +117,3 @@ def _in_time(frames: Iterator[RawFrame]) -> list[RawFrame]:
     if any(frame.time_s is None for frame in listed):
         return listed
     return sorted(listed, key=lambda frame: frame.time_s or 0.0)
-
-
-def _read_calibration(root: Path, folder: RawFolder, chosen: Path | None) -> Calibration:
-    if chosen is None and folder.calibration is None:
-        raise CaptureInputError(
-            f"{root / DESCRIPTION} names no calibration, so where its cameras and lights are is unknown; "
-            "add [calibration] file, or give the job one by its option 'calibration'."
-        )
-    path = chosen if chosen is not None else root / (folder.calibration.file if folder.calibration else "")
-    calibration = read_record(path, Calibration)
-    require_consistent(calibration, f"Calibration {path}")
-    cameras: dict[str, CalibratedCamera] = {camera.name: camera for camera in calibration.cameras}
-    for camera in folder.camera:
-        if (own := cameras.get(camera.name)) is None:
-            raise CaptureInputError(
-                f"Calibration {path} lacks camera {camera.name} of {root}; choose the calibration of this rig."
-            )
-        if own.size != camera.size:
-            theirs, ours = (" x ".join(map(str, size)) for size in (own.size, camera.size))
-            raise CaptureInputError(
-                f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but {root} has {ours}; calibrate anew."
-            )
-        if own.radiance_per_count is None:
-            raise CaptureInputError(
-                f"Calibration {path} does not say radiance_per_count of camera {camera.name}, so its counts have no scale; "
-                "calibrate the lights by a white sphere, or add it by hand."
-            )
-    if calibration.channels != folder.channels:
-        theirs, ours = ", ".join(calibration.channels), ", ".join(folder.channels)
-        raise CaptureInputError(
-            f"Calibration {path} is for channels {theirs}, but {root} has {ours}; choose that of this rig."
-        )
-    return calibration
-
-
-def _description(root: Path, folder: RawFolder, calibration: Calibration) -> FolderCapture:
-    """The cameras and those lights that frames were taken under, with the calibration's places."""
-    lit = {frame.light for frame in folder.frame if frame.kind == "light"}
-    if not lit:
-        raise CaptureInputError(f"{root / DESCRIPTION} lists no frame of kind light; add the photographs of the teeth.")
-    known = {light.name: light for light in calibration.lights}
-    if absent := [light.name for light in folder.light if light.name in lit and light.name not in known]:
-        file = next(frame.file for frame in folder.frame if frame.light == absent[0])
-        raise CaptureInputError(
-            f"The calibration of {root} lacks light {absent[0]}, under which frame {file} was taken; choose that of this rig."
-        )
-    by_name = {camera.name: camera for camera in calibration.cameras}
-    return FolderCapture(
-        units="mm",
-        channels=folder.channels,
-        cameras=tuple(by_name[camera.name] for camera in folder.camera),
-        lights=tuple(known[light.name] for light in folder.light if light.name in lit),
-        uncertainty=calibration.uncertainty,
-    )
