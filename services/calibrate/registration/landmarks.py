@@ -1,8 +1,9 @@
 """First pose of a scan: clicked points in the scan and in photographs, over all cameras at once.
 
-A start comes from one camera's points by perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal
-Solution to the Perspective-n-Point Problem", ECCV 2020), from all of them and from drawn triples, so that a wrong click spoils
-only some starts. The start that most clicks of all cameras agree with is refined by robust least squares over all.
+Starts come from landmarks that several cameras see, whose lines of sight meet in the rig, and from one camera's points by
+perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the Perspective-n-Point
+Problem", ECCV 2020); each from all points and from drawn few, so that a wrong click spoils only some starts. The starts that most
+clicks of all cameras agree with are refined by robust least squares over all, and the best of them is taken.
 """
 
 from __future__ import annotations
@@ -24,6 +25,12 @@ DRAWS = 60
 """Triples: with a third of the clicks wrong, 60 hold a right one but for 1 in 10^9."""
 LEAST = 4
 """Clicks that are needed: three leave up to four poses, and no way to see a wrong one."""
+LEAST_POINTS = 3
+"""Landmarks in several cameras from which a start follows: three points fix a rigid pose."""
+PARALLEL = 1e4
+"""Condition of the normal equations of lines of sight above which they are too parallel to meet anywhere."""
+FLAT = 1e-3
+"""Spread of points across their line, relative to that along it and squared, below which the turn about it is open."""
 TRIED = 12
 """Starts that are refined over all cameras."""
 MOST_WRONG = 1 / 3
@@ -131,9 +138,42 @@ def _best(
     return [poses[k] for k in np.argsort([float((error**2).sum()) for error in errors])[:count]]
 
 
+def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tuple[Floats, Floats]:
+    # Landmarks (N, 3) that several cameras see: in the scan, and in the rig where their lines of sight come nearest to each other.
+    scan, rig = [], []
+    for name in dict.fromkeys(one.name for one in clicks):
+        own = [one for one in clicks if one.name == name]
+        if len(own) < 2:
+            continue
+        normal, right = np.zeros((3, 3)), np.zeros(3)
+        for one in own:
+            origin, direction = cameras[one.camera].rays(one.pixel[:1], one.pixel[1:])
+            across = np.eye(3) - np.outer(direction[0], direction[0])
+            normal, right = normal + across, right + across @ origin
+        if np.linalg.cond(normal) < PARALLEL:
+            scan.append(own[0].point_mm)
+            rig.append(np.linalg.solve(normal, right))
+    return np.array(scan).reshape(-1, 3), np.array(rig).reshape(-1, 3)
+
+
+def _starts_from_points(scan_mm: Floats, rig_mm: Floats) -> Iterator[RigidPose]:
+    # The rotation and move between points (Kabsch 1976), from all of them and from drawn triples.
+    if len(scan_mm) < LEAST_POINTS:
+        return
+    rng = np.random.default_rng(0)
+    draws = [rng.choice(len(scan_mm), LEAST_POINTS, replace=False) for _ in range(DRAWS)]
+    for chosen in [np.arange(len(scan_mm)), *(draws if len(scan_mm) > LEAST_POINTS else [])]:
+        one, two = scan_mm[chosen], rig_mm[chosen]
+        left, size, right = np.linalg.svd((two - two.mean(axis=0)).T @ (one - one.mean(axis=0)))
+        if size[1] > FLAT * size[0]:
+            turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+            yield RigidPose(turn, two.mean(axis=0) - turn @ one.mean(axis=0))
+
+
 def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[RigidPose]:
     import cv2
 
+    yield from _starts_from_points(*_triangulated(cameras, clicks))
     rng = np.random.default_rng(0)
     for name, camera in cameras.items():
         own = [one for one in clicks if one.camera == name]
