@@ -9,6 +9,7 @@ from services.core.calibration import Calibration, read_description, require_con
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import DESCRIPTION, is_raw_folder, read_raw_folder
 from services.core.raw.records import RawFolder
+from services.core.raw.registration import with_registration
 from services.core.records import FolderCapture
 from services.core.store import read_record
 
@@ -87,5 +88,5 @@ def described(root: Path, folder: RawFolder, calibration: Calibration) -> Folder
         channels=folder.channels,
         cameras=tuple(by_name[camera.name] for camera in folder.camera),
         lights=tuple(known[light.name] for light in folder.light if light.name in lit),
-        uncertainty=calibration.uncertainty,
+        uncertainty=with_registration(root, calibration.uncertainty),
     )

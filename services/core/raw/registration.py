@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from services.core.geometry import Matrix4, Record, Vector3
+from services.core.store import read_record
 from services.core.uncertainty import CalibrationUncertainty
 
 REGISTRATION = "registration.json"
@@ -41,3 +44,26 @@ class Registration(Record):
     repairs: str = Field(description="what was mended in the scan, in words")
     inputs: dict[str, str] = Field(description="SHA-256 of the scan and of the calibration, by file name")
     pictures: tuple[str, ...] = Field(description="overlays, one a camera")
+
+
+def with_registration(root: Path, uncertainty: CalibrationUncertainty | None) -> CalibrationUncertainty | None:
+    """A calibration's uncertainty with that of the teeth's pose, where the teeth of a raw folder come from a registration.
+
+    What the calibration itself says of the teeth is replaced. Both are taken for independent.
+
+    Raises:
+        CaptureInputError: the registration's record cannot be read.
+    """
+    path = root / REGISTRATION
+    if not path.is_file():
+        return uncertainty
+    own = read_record(path, Registration).uncertainty
+    if uncertainty is None:
+        return own
+    kept = [k for k, name in enumerate(uncertainty.names) if name not in own.names]
+    count = len(kept)
+    matrix = np.zeros((count + len(own.names),) * 2)
+    matrix[:count, :count] = uncertainty.matrix[np.ix_(kept, kept)]
+    matrix[count:, count:] = own.matrix
+    names = (*(uncertainty.names[k] for k in kept), *own.names)
+    return CalibrationUncertainty(names=names, covariance=tuple(map(tuple, matrix.tolist())))
