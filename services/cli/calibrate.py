@@ -15,6 +15,9 @@ def calibrate_command(
     raw: Annotated[Path, typer.Argument(metavar="RAW", help="Folder with raw.toml and its frames.")],
     out: Annotated[Path, typer.Option(help="Folder of calibration.json, residuals.json and report.html.")],
     valid_days: Annotated[float, typer.Option(min=1, help="After how many days the calibration is old.")] = 30.0,
+    against: Annotated[
+        Path | None, typer.Option(help="An earlier calibration.json of this rig: tell what changed.")
+    ] = None,
     accept: Annotated[bool, typer.Option("--accept", help="End well though a limit is not kept.")] = False,
 ) -> None:
     """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status 9."""
@@ -25,9 +28,23 @@ def calibrate_command(
     write_session(session, out)
     write_report(session, out)
     _tell(session)
+    if against is not None:
+        _tell_drift(session, against)
     print(f"calibration: {out / 'calibration.json'}, report: {out / 'report.html'}")
     if session.judgement.broken and not accept:
         raise typer.Exit(9)
+
+
+def _tell_drift(session: Session, against: Path) -> None:
+    from services.calibrate.session.drift import changes
+    from services.core.calibration import Calibration
+    from services.core.store import read_record
+
+    found = changes(read_record(against, Calibration), session.record)
+    clear = [one for one in found if one.is_clear]
+    print(f"against {against}: {len(clear)} of {len(found)} quantities changed beyond their errors")
+    for one in clear:
+        print(f"  {one.sentence}")
 
 
 def _tell(session: Session) -> None:

@@ -1,0 +1,103 @@
+"""What changed between two calibrations of one rig, each change over its ±.
+
+Both have a world of their own, that of their first board, so only what no choice of world moves is compared: lenses, the lights' distances
+from their common middle, and their intensities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibration import Calibration
+
+Floats = NDArray[np.float64]
+CLEAR_SIGMAS = 4.0
+"""Of 400 values that did not change one passes 3 σ, and in forty comparisons one passes 4 σ."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One quantity's change, new minus old, its standard error from both calibrations together, and their unit."""
+
+    what: str
+    change: float
+    se: float
+    unit: str
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it is beyond what both calibrations' errors explain."""
+        return abs(self.change) > CLEAR_SIGMAS * self.se
+
+    @property
+    def sentence(self) -> str:
+        """The change in words."""
+        return f"{self.what} changed by {self.change:+.3g} {self.unit} (± {self.se:.2g})"
+
+
+def changes(old: Calibration, new: Calibration) -> list[Change]:
+    """Changes of what both calibrations have with a ±, the clearest first."""
+    found = [*_lenses(old, new), *_lights(old, new)]
+    return sorted(found, key=lambda one: -abs(one.change) / one.se)
+
+
+def _lenses(old: Calibration, new: Calibration) -> Iterator[Change]:
+    before = {camera.name: camera for camera in old.cameras}
+    for camera in new.cameras:
+        if camera.name not in before:
+            continue
+        for key, row, column, unit in (("fx", 0, 0, "%"), ("fy", 1, 1, "%"), ("cx", 0, 2, "px"), ("cy", 1, 2, "px")):
+            was, now = before[camera.name].K[row][column], camera.K[row][column]
+            change, scale = ((now / was - 1) * 100, 100.0) if unit == "%" else (now - was, 1.0)
+            names = [f"camera.{camera.name}.{key}"]
+            if (se := _joint_se(old, new, names, names, np.array([scale]), np.array([scale]))) is not None:
+                yield Change(f"{key} of camera {camera.name}", change, se, unit)
+
+
+def _lights(old: Calibration, new: Calibration) -> Iterator[Change]:
+    before = {light.name: light for light in old.lights}
+    common = [light for light in new.lights if light.name in before]
+    places = [
+        np.array([light.position_mm for light in lights]) for lights in ([before[c.name] for c in common], common)
+    ]
+    names = [f"light.{light.name}.{axis}" for light in common for axis in "xyz"]
+    for number, light in enumerate(common):
+        (was, back), (now, forth) = (_from_middle(one, number) for one in places)
+        if (se := _joint_se(old, new, names, names, back, forth)) is not None:
+            yield Change(f"distance of light {light.name} from the lights' middle", now - was, se, "mm")
+        for channel, (dim, bright) in enumerate(zip(before[light.name].intensity, light.intensity, strict=True)):
+            gain = [f"light_gain.{light.name}.{new.channels[channel]}"]
+            percent = np.array([100.0])
+            if (se := _joint_se(old, new, gain, gain, percent, percent)) is not None:
+                told = f"intensity of light {light.name} in {new.channels[channel]}"
+                yield Change(told, 100 * float(np.log(bright / dim)), se, "%")
+
+
+def _from_middle(places: Floats, number: int) -> tuple[float, Floats]:
+    """A light's distance from the mean of all, and its derivative to all their coordinates (3 L,)."""
+    off = places[number] - places.mean(axis=0)
+    distance = float(np.linalg.norm(off))
+    towards = off / max(distance, 1e-12)
+    share = np.full(len(places), -1 / len(places))
+    share[number] += 1
+    return distance, np.asarray((share[:, None] * towards).ravel())
+
+
+def _joint_se(
+    old: Calibration, new: Calibration, old_names: Sequence[str], new_names: Sequence[str], back: Floats, forth: Floats
+) -> float | None:
+    """Standard error of a difference of two independent calibrations' quantities; None where one does not state it."""
+    total = 0.0
+    for calibration, names, slope in ((old, old_names, back), (new, new_names, forth)):
+        if calibration.uncertainty is None:
+            return None
+        place = {name: n for n, name in enumerate(calibration.uncertainty.names)}
+        if not set(names) <= place.keys():
+            return None
+        chosen = [place[name] for name in names]
+        total += float(slope @ calibration.uncertainty.matrix[np.ix_(chosen, chosen)] @ slope)
+    return total**0.5 if total > 0 else None
