@@ -25,7 +25,7 @@ from services.fit.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.solve.normal import smoothed_variance
+from services.fit.slab.solve.weights import smoothed_variance
 from tests.pipeline.test_slab_fit import NOISE, errors_of, noisy_truth
 from tests.support.shared_data import shared_path
 

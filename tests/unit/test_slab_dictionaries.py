@@ -31,7 +31,8 @@ from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.kept import fingerprint
 from services.fit.slab.results.result import SlabFit
 from services.fit.slab.solve.mixture import Mixture, Mixtures, unit_atoms
-from services.fit.slab.solve.normal import derivative_rows, smoothed_variance
+from services.fit.slab.solve.normal import derivative_rows
+from services.fit.slab.solve.weights import smoothed_variance
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description, small_rig, write_folder
 

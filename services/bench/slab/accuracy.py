@@ -37,7 +37,8 @@ GOLDEN = 0.6180339887498949
 FITS = 12
 FITTED_THICKNESSES, FITTED_ALBEDOS = (0.1, 10.0), (0.3, 1.0)
 BOUND_PATHS = 2000
-PHOTONS = 2_000_000
+PHOTONS = 1_000_000
+"""Of each image."""
 
 
 PHASES: dict[str, Callable[[Array], Array]] = {

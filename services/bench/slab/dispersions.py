@@ -37,7 +37,8 @@ DILUTIONS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
 """Of the full strength, as a laboratory makes them."""
 THICK = (("R", 200.0), ("G", 200.0), ("B", 200.0))
 """Also measured undiluted: sigma_t w is 5 to 12."""
-PHOTONS, QUICK_PHOTONS = 8_000_000, 400_000
+PHOTONS, QUICK_PHOTONS = 4_000_000, 200_000
+"""Of each image."""
 
 Keep = Callable[[list[dict[str, Any]]], None]
 

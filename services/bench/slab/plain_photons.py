@@ -1,9 +1,10 @@
 """Images of a cell by the plainest walk of photons: a truth for the slab's fit that shares no code with its kernel.
 
 Every photon starts in the beam's profile, is refracted at the face, flies exponential distances, is reflected inside by chance
-as Fresnel says, and turns by a finely tabulated phase function. From every collision it sends to every camera what would
+as Fresnel says, and turns by a finely tabulated phase function. From every collision it sends to its camera what would
 reach it directly and after up to three internal reflections; a fourth would add less than 1e-5 at an index of 1.5. Nothing is
-forced, split, scored or done by quadrature.
+forced, split, scored or done by quadrature. Every image has photons of its own, so that its noise is its own as well: photons
+that reach all cameras of a light err alike in all of them, as no measurement does.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def plain_images(
 
     Args:
         phase_per_sr: of the scattering angle in rad; its scale is free.
-        photons: of each light, in all.
+        photons: of each image, in all.
     """
     angles = np.linspace(0.0, math.pi, NODES)
     phase, cosines = _normalised(phase_per_sr(angles), angles)
@@ -58,22 +59,19 @@ def plain_images(
             seen = [k for k, entry in enumerate(folder.images) if entry.light == light.name]
             if not seen:
                 continue
-            views = np.array([_leaving(cameras[folder.images[k].camera], index) for k in seen])
             beam = _arriving(folder, light, index)
-            seeds = [(seed, number, batch) for batch in range(BATCHES)]
+            places = [(k, (seed, number, k, batch)) for batch in range(BATCHES) for k in seen]
 
-            def batch(
-                one: tuple[int, int, int],
-                beam: tuple[float, ...] = beam,
-                views: Array = views,
-                shape: tuple[int, ...] = shape,
-            ) -> Array:
-                images = np.zeros((len(views), *shape[1:]))
-                _trace(np.random.default_rng(one), photons // BATCHES, beam, views, extinction_per_mm, albedo, phase, cosines,
+            def batch(place: tuple[int, tuple[int, ...]], beam: tuple[float, ...] = beam) -> Array:
+                image, one = place
+                view = np.array([_leaving(cameras[folder.images[image].camera], index)])
+                images = np.zeros((1, *shape[1:]))
+                _trace(np.random.default_rng(one), photons // BATCHES, beam, view, extinction_per_mm, albedo, phase, cosines,
                        cell.width_mm, index, grid, images)  # fmt: skip
-                return images
+                return np.asarray(images[0])
 
-            batches = np.stack(list(pool.map(batch, seeds))) * folder.beam.power / (photons // BATCHES)
+            batches = np.stack(list(pool.map(batch, places))) * folder.beam.power / (photons // BATCHES)
+            batches = batches.reshape(BATCHES, len(seen), *shape[1:])
             means[seen] = batches.mean(axis=0)
             variances[seen] = batches.var(axis=0, ddof=1) / BATCHES
     return means, variances

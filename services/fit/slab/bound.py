@@ -18,8 +18,9 @@ from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import flag_scales, precision, scales_for
+from services.fit.slab.solve.prior import Quadratic, flag_scales, precision, scales_for
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
+from services.fit.slab.solve.weights import independent_weights
 
 Array = NDArray[np.float64]
 
@@ -66,18 +67,31 @@ def bound_of(
         variances: of the measurement beside its shot noise (images, values), such as a reference's own.
         scale: of the smoothness prior, per rad2; the loosest for this optical thickness where it is not given.
     """
+    quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
+    x = Knots().unknowns(material)
+    if scale is None:
+        scale = max(scales_for(material.extinction_per_mm * rig.width_mm))
+    chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
+    uncertainty = Uncertainty(chosen, alone, (chosen, alone))
+    return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)
+
+
+def curvature_of(
+    rig: Rig,
+    material: Material,
+    *,
+    noise: float,
+    variances: Array | None = None,
+    seed: int = 1,
+    paths: int = PATHS,
+    blocks: Blocks = map,
+) -> Quadratic:
+    """What images tell of ln f and sigma_a; arguments as of ``bound_of``."""
     batches = render(
         rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths, scores=True, blocks=blocks
     )
     mean = batches.mean
     halves = 2 if rig.grid.folded else 1
     shot = np.stack([shot_noise(image, noise) for image in mean]) / halves
-    weights = 1 / (shot + (0 if variances is None else variances))
-    equations = normal_equations(batches, material, mean, weights)
-    x = Knots().unknowns(material)
-    quadratic = quadratic_at(x, equations)
-    if scale is None:
-        scale = max(scales_for(material.extinction_per_mm * rig.width_mm))
-    chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
-    uncertainty = Uncertainty(chosen, alone, (chosen, alone))
-    return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)
+    weights = independent_weights(shot + (0 if variances is None else variances), np.zeros_like(shot))
+    return quadratic_at(Knots().unknowns(material), normal_equations(batches, material, mean, weights))

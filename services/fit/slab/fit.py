@@ -18,6 +18,7 @@ from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.next_measurement import next_measurement
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
@@ -78,6 +79,11 @@ def fit_images(
     solver = GaussNewton(rig, measured, options.seed, _budget(options, dictionary), blocks, dictionary.coordinates)
     solution = solver.solve(start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
+    advice = (
+        next_measurement(folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks)
+        if not dictionary.names
+        else ""
+    )
     phase = phase_of(material, uncertainty)
     first, second = last_look(rig, material, solver.budget, options.seed, blocks)
     fit = SlabFit(
@@ -88,7 +94,8 @@ def fit_images(
         notes=measured.faults
         + sample_faults(material, rig.width_mm)
         + mixture_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
-        + _notes(measured, phase, converged=solution.converged),
+        + _notes(measured, phase, converged=solution.converged)
+        + ((advice,) if advice else ()),
         converged=solution.converged,
         steps=solution.steps,
         paths=solution.paths,

@@ -99,7 +99,7 @@ def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) ->
             value=values[name],
             se=uncertainty.standard_error(slope),
             unit="1" if name == "g" else "1/mm",
-            determined=uncertainty.undetermined_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
+            determined=uncertainty.whole_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
         )
     return Parameters(**told, index=Quantity(value=index.value, se=index.se, unit="1", determined=True))
 

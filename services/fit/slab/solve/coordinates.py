@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.model.dictionary import KNOTS, Material
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
 from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import RIDGE, Quadratic, flag_scales, precision, scales_for
 
@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 LARGEST_CHANGE = 1.0
 """Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
+
+BROAD = 9
+"""Multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells tell of none that is smaller."""
 
 
 class Coordinates(Protocol):
@@ -45,6 +48,9 @@ class Coordinates(Protocol):
 
     def weak_precision(self, material: Material) -> Array:
         """The same of a prior so weak that what it tells is not taken for a measurement."""
+
+    def broad(self) -> Array:
+        """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where unknowns are few."""
 
     def minimum(self, matrix: Array, right: Array) -> Array:
         """The x within bounds at which x^T matrix x / 2 - right^T x is least."""
@@ -87,6 +93,13 @@ class Knots:
     def weak_precision(self, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
         """Of a ln f that may bend as sharply as any."""
         return precision(flag_scales())
+
+    def broad(self) -> Array:
+        """Cosines of multiples of the angle, of which the first is sigma_s and the second about g, and the absorption."""
+        directions = np.zeros((UNKNOWNS, BROAD + 1))
+        directions[:KNOTS, :BROAD] = np.cos(np.outer(ANGLES_RAD, np.arange(BROAD)))
+        directions[KNOTS, BROAD] = 1
+        return directions
 
     def minimum(self, matrix: Array, right: Array) -> Array:
         """For all unknowns; where the absorption comes out negative, for the others with none."""

@@ -18,8 +18,10 @@ from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Coordinates
-from services.fit.slab.solve.normal import NormalEquations, normal_equations, smoothed_variance
-from services.fit.slab.solve.prior import RIDGE, Quadratic
+from services.fit.slab.solve.normal import NormalEquations, normal_equations
+from services.fit.slab.solve.prior import THICK, Quadratic
+from services.fit.slab.solve.seen import broad_step, step_matrix
+from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
 
@@ -28,8 +30,9 @@ TOLERATED_RISE = 2.0
 MAX_HALVINGS = 4
 WORTHWHILE = 2.0
 """A step that promises less than so many times what noise alone does waits for more paths."""
-UNFINISHED = 5.0
-"""At the end, a step that promised more than so many times what noise does is followed by another."""
+UNFINISHED, UNFINISHED_THICK = 5.0, 1.0
+"""At the end, a step that promised more than so many times what noise does is followed by another. Where sigma_t w exceeds ``prior.THICK``,
+what is left along sigma_s at a constant sigma_s' promises little beside the noise of all directions and is still a tenth of sigma_s."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it strayed."""
 
@@ -44,7 +47,7 @@ class Budget:
     """At most, until the last step."""
     last: tuple[tuple[int, int], ...] = ((15000, 16), (30000, 24))
     """Paths and batches of the stages at the end."""
-    most_last: int = 4
+    most_last: int = 8
     """Steps of a stage."""
     most_steps: int = 10
 
@@ -78,6 +81,10 @@ class Solution:
     misfit: float
     """Half of the weighted squares before the last step, Monte Carlo noise of the images left out."""
     misfit_se: float
+    data_noise: Array
+    """Covariance of the last gradient's noise by the measurements (U, U)."""
+    unsure: Array
+    """What the last step may have been wrong by as the matrix is noisy, before it is solved for (U,)."""
 
 
 @dataclass
@@ -92,8 +99,8 @@ class GaussNewton:
     coordinates: Coordinates
     renders: int = 0
     paths: int = 0
-    path_variance: Array | None = None
-    """Monte Carlo variance of one path (images, pixels), a running mean over the renders before."""
+    path_noise: tuple[Array, ...] | None = None
+    """Monte Carlo covariance of one path by light (pixels, C, C), a running mean over the renders before."""
 
     def solve(self, material: Material) -> Solution:
         """Iterate from a guess to the solution."""
@@ -147,23 +154,35 @@ class GaussNewton:
                 change = self.change(quadratic, prior, material, DAMPING)
                 material = self.coordinates.material_at(x + change)
                 noise = noise_of_promise(quadratic, prior, equations.gradient_noise)
-                if promised(quadratic, prior, x, change) < UNFINISHED * noise:
+                thick = material.extinction_per_mm * self.rig.width_mm > THICK
+                promise = promised(quadratic, prior, x, change)
+                finished = promise < UNFINISHED * noise
+                if promise < (UNFINISHED_THICK if thick else UNFINISHED) * noise:
                     break
         return Solution(
-            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged, self.paths,
-            self.coordinates, equations.misfit, equations.misfit_se,
+            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged and finished, self.paths,
+            self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
+            equations.matrix_error @ (self.coordinates.unknowns(material) - x),
         )  # fmt: skip
 
     def change(self, quadratic: Quadratic, prior: Array, around: Material, damping: float) -> Array:
         """The step to the damped minimum, no unknown further than is good.
 
-        The Levenberg term is ``damping`` times the noise about the present point: what noise may have bent is held there. It
-        moves no fixed point, so that repeated steps from fresh paths end where an undamped one would.
+        The Levenberg term is about the present point: what noise may have bent is held there. It moves no fixed point, so that
+        repeated steps from fresh paths end where an undamped one would.
         """
-        x = self.coordinates.unknowns(around)
-        held = damping * quadratic.noise + RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(len(x))
-        least = self.coordinates.minimum(quadratic.matrix + prior + held, held @ x - quadratic.linear)
-        return self.coordinates.held_back(least - x, around)
+        x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
+        if around.extinction_per_mm * self.rig.width_mm <= THICK:
+            broad = broad[:, :0]  # in a thin cell signals stand out, and a second step only adds noise
+        matrix = step_matrix(quadratic, prior, damping)
+        slope = quadratic.linear + (quadratic.matrix + prior) @ x
+        first = x + self.coordinates.held_back(self.coordinates.minimum(matrix, matrix @ x - slope) - x, around)
+        second = first + broad_step(quadratic, prior, broad, first)
+        if second[-1] < 0 and broad.size:
+            # No absorption below zero: the others go where they are best with none.
+            first[-1] = 0
+            second = first + broad_step(quadratic, prior, broad[:, :-1], first)
+        return self.coordinates.held_back(second - x, around)
 
     def linearised(self, material: Material, paths: int, batches: int) -> NormalEquations:
         """Normal equations of fresh batches."""
@@ -179,14 +198,14 @@ class GaussNewton:
             scores=True,
             blocks=self.blocks,
         )
-        own = smoothed_variance(estimates.images, (self.rig.grid.rows, self.rig.grid.columns)) * batches * paths
+        shape, seen = (self.rig.grid.rows, self.rig.grid.columns), [views.images for views in self.rig.lights]
+        own = tuple(smoothed_covariance(estimates.images[:, some], shape) * batches * paths for some in seen)
         # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and weights that
         # share them with the residuals bent sigma_s' up by several per cent.
-        known = own if self.path_variance is None else self.path_variance
-        weights = np.where(
-            self.measured.held_out[:, None], 0, 1 / (self.measured.variances + known / (batches * paths))
-        )
-        self.path_variance = (own + known) / 2
+        known = own if self.path_noise is None else self.path_noise
+        variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
+        weights = weights_of(seen, variances, [one / (batches * paths) for one in known])
+        self.path_noise = tuple((first + second) / 2 for first, second in zip(own, known, strict=True))
         equations = normal_equations(estimates, material, self.measured.values, weights)
         return equations.chained(self.coordinates.chain(material))
 
@@ -198,6 +217,7 @@ def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:
         equations.gradient - equations.matrix @ x,
         equations.noise,
         equations.noise_gradient - equations.noise @ x,
+        equations.matrix_error,
     )
 
 

@@ -89,6 +89,10 @@ class Mixtures:
         """Of weights that may all be many times what there is."""
         return self.precision(WEAK_SHARE * material.scattering_per_mm)
 
+    def broad(self) -> Array:
+        """None: atoms are few, and each is judged by its bound."""
+        return np.zeros((self.atoms.shape[1] + 1, 0))
+
     def minimum(self, matrix: Array, right: Array) -> Array:
         """By non-negative least squares: with matrix = R^T R, |R x - R^-T right|^2 is least."""
         # In units in which the diagonal is 1, as an absorption and a weight differ.

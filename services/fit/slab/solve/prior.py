@@ -68,3 +68,5 @@ class Quadratic:
     """What the Monte Carlo noise of the derivatives would add to the matrix, positive semidefinite."""
     noise_linear: Array
     """And to the linear term."""
+    error: Array
+    """By about as much the matrix may be off by chance (U, U), of either sign."""

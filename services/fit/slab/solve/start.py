@@ -11,7 +11,8 @@ from services.fit.slab.images import Measurements
 from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein, hg_values
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
-from services.fit.slab.solve.normal import normal_equations, smoothed_variance
+from services.fit.slab.solve.normal import normal_equations
+from services.fit.slab.solve.weights import independent_weights, smoothed_variance
 
 Array = NDArray[np.float64]
 
@@ -58,8 +59,8 @@ def _improved(
     batches = render(
         rig, material, seed=seed, step=step + 2**31, batches=BATCHES, paths=STEP_PATHS, scores=True, blocks=blocks
     )
-    weights = 1 / (tolerated + smoothed_variance(batches.images, (rig.grid.rows, rig.grid.columns)))
-    equations = normal_equations(batches, material, measured.values, weights)
+    noise = smoothed_variance(batches.images, (rig.grid.rows, rig.grid.columns))
+    equations = normal_equations(batches, material, measured.values, independent_weights(tolerated, noise))
 
     # Chain rule from ln f and sigma_a to the three numbers; the cosine's column by differences of ln p.
     chain = np.zeros((KNOTS + 1, 3))

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from services.fit.slab.model.dictionary import KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.gauss_newton import Solution
-from services.fit.slab.solve.prior import RIDGE, Quadratic
+from services.fit.slab.solve.prior import Quadratic
+from services.fit.slab.solve.seen import seen_of
 
 Array = NDArray[np.float64]
 
-MIN_SIGNAL = 0.1
-"""Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
 LARGEST_SHARE = 0.1
 """Standard error, as a share of the value, up to which a value of the phase function is determined."""
 LARGEST_COEFFICIENT_SHARE = 0.05
@@ -41,34 +39,51 @@ class Uncertainty:
         """The same as far as the images alone tell."""
         return float(np.sqrt(slope @ self.images_alone @ slope))
 
+    def whole_error(self, slope: Array) -> float:
+        """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may say more under the weak prior."""
+        return max(self.standard_error(slope), self.undetermined_error(slope))
+
 
 def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
     The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
-    directions whose curvature stands out count. The images' Monte Carlo noise is in the weights, as the shot noise is.
+    directions whose curvature stands out count. The gradient's noise is taken as it was seen between batches: paths reach all
+    cameras of a light, so what they add to different images is not independent, as the weights have it.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
+    noise = solution.data_noise + solution.gradient_noise + np.outer(solution.unsure, solution.unsure)
     priors = coordinates.precision(solution.scale), coordinates.weak_precision(material)
-    chosen, alone = (
-        covariance_of(quadratic, prior, _half_lines(quadratic, prior, x, coordinates.is_bound(x))) for prior in priors
+    (believed, held), (weakly, weakly_held) = (
+        (seen_of(quadratic, prior), np.diag(_half_lines(quadratic, prior, x, coordinates.is_bound(x))))
+        for prior in priors
     )
+    inverse = np.linalg.inv(believed.total + held)
+    chosen = inverse @ (believed.noise(noise) + priors[0] + held) @ inverse
+    left = _left(solution, x, priors[0], chosen)
+    # Flags ask what the prior adds, so the weak one's directions count as far as the weights have it.
+    chosen, alone = chosen + left, np.linalg.inv(weakly.total + weakly_held) + left
     if (chain := coordinates.chain(material)) is None:
         return Uncertainty(chosen, alone, (chosen, alone))
     return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
 
 
-def covariance_of(quadratic: Quadratic, prior: Array, held: Array | None = None) -> Array:
-    """Posterior covariance of the unknowns under a prior's precision (U, U), and one more of each unknown (U,)."""
-    ridge = RIDGE * float(np.abs(np.diag(quadratic.matrix)).max()) * np.eye(len(prior))
-    reference = prior + quadratic.noise + ridge
-    signals, vectors = linalg.eigh(quadratic.matrix, reference)
-    # With vectors V, V^T reference V = 1, so that matrix = reference V signals V^T reference.
-    told = reference @ vectors
-    curvature = (told * np.where(signals > MIN_SIGNAL, signals, 0)) @ told.T
-    total = curvature + prior + ridge
-    return np.asarray(np.linalg.inv(total if held is None else total + np.diag(held)))
+def _left(solution: Solution, x: Array, prior: Array, known: Array) -> Array:
+    """Square (U, U) of what is left of the way to the minimum within bounds, less what noise alone leaves of it on average."""
+    coordinates, quadratic = solution.coordinates, solution.quadratic
+    seen = seen_of(quadratic, prior)
+    slope = seen.projected(quadratic.linear + quadratic.matrix @ x)
+    left = coordinates.minimum(seen.total, seen.curvature @ x - slope) - x
+    # In units of the covariance (U, U) that is known without it, noise leaves one for each direction that is seen.
+    length = float(left @ np.linalg.lstsq(known, left)[0])
+    share = max(0.0, 1 - len(seen.signals) / max(length, 1e-300))
+    return np.asarray(share * np.outer(left, left))
+
+
+def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
+    """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights hold all noise there is."""
+    return np.asarray(np.linalg.inv(seen_of(quadratic, prior).total))
 
 
 def _half_lines(quadratic: Quadratic, prior: Array, x: Array, bound: NDArray[np.bool_]) -> Array:
@@ -106,4 +121,4 @@ def phase_errors(material: Material, uncertainty: Uncertainty) -> tuple[Array, N
         np.sqrt(np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True))
         for covariance in (uncertainty.covariance, uncertainty.images_alone)
     )
-    return errors * material.phase_per_sr, alone <= LARGEST_SHARE
+    return errors * material.phase_per_sr, np.maximum(errors, alone) <= LARGEST_SHARE

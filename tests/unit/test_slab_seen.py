@@ -1,0 +1,72 @@
+"""What a noisy normal matrix is believed of, on random matrices whose signal and noise are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.normal import UNKNOWNS
+from services.fit.slab.solve.prior import Quadratic
+from services.fit.slab.solve.seen import broad_step, seen_of, step_matrix
+
+BROAD = Knots().broad()
+WEAK = BROAD[:, 0] / np.linalg.norm(BROAD[:, 0])
+"""sigma_s at a constant shape: the direction that holds the only signal here."""
+SPREAD = 0.02
+"""Standard deviation of a matrix's entries. Eigenvalues of such noise reach 2 SPREAD sqrt(UNKNOWNS) = 0.57 (Wigner's semicircle),
+those of ten directions 0.13."""
+SIGNAL = 0.3
+PRIOR = 0.01 * np.eye(UNKNOWNS)
+
+
+def chance(rng: np.random.Generator) -> np.ndarray:
+    half = rng.standard_normal((UNKNOWNS, UNKNOWNS))
+    return SPREAD * (half + half.T) / np.sqrt(2)
+
+
+def quadratic(seed: int, signal: float = SIGNAL) -> Quadratic:
+    """Noise of J that is one in every direction, and a matrix that is off by chance."""
+    rng = np.random.default_rng(seed)
+    matrix = signal * np.outer(WEAK, WEAK) + chance(rng)
+    return Quadratic(matrix, -matrix @ WEAK, np.eye(UNKNOWNS), np.zeros(UNKNOWNS), chance(rng))
+
+
+def test_what_exceeds_a_tenth_of_the_noise_is_believed_as_it_is() -> None:
+    seen = seen_of(quadratic(1, signal=3.0), PRIOR)
+    # Reference is 1.01 in every direction, and chance changes an entry by 0.02: four times that.
+    assert float(WEAK @ seen.curvature @ WEAK) == pytest.approx(3.0, abs=0.08)
+    assert seen.signals.min() > 0.1
+    gradient = np.random.default_rng(2).standard_normal(UNKNOWNS)
+    np.testing.assert_allclose(seen.projected(seen.projected(gradient)), seen.projected(gradient))
+    noise = seen.noise(np.outer(gradient, gradient))
+    np.testing.assert_allclose(noise, np.outer(seen.projected(gradient), seen.projected(gradient)), atol=1e-9)
+
+
+def test_two_steps_go_most_of_the_way_along_a_broad_direction() -> None:
+    # The minimum lies one WEAK away; a step held by all of the noise alone goes 0.3 / 1.3 = 23 % of the way.
+    alone, both = [], []
+    for seed in range(10):
+        one = quadratic(seed)
+        matrix = step_matrix(one, PRIOR, 1.0)
+        assert np.linalg.eigvalsh(matrix)[0] > 0
+        first = np.linalg.solve(matrix, -one.linear)
+        alone.append(float(first @ WEAK))
+        both.append(float((first + broad_step(one, PRIOR, BROAD, first)) @ WEAK))
+    # Chance makes a single way shorter or longer, by about 0.1 in 0.3; ten of them show the mean.
+    assert np.mean(alone) < 0.3
+    assert np.mean(both) > 1.8 * np.mean(alone)
+    assert max(both) < 1.3
+
+
+def test_a_broad_step_moves_nothing_else_and_not_where_chance_bends_the_matrix_down() -> None:
+    other = np.zeros(UNKNOWNS)
+    other[50:52] = np.sqrt(0.5), -np.sqrt(0.5)
+    step = broad_step(quadratic(1), PRIOR, BROAD, np.zeros(UNKNOWNS))
+    # Cosines of up to eight times the angle differ by less than 8 times a knot's 0.9 degrees between neighbours.
+    assert abs(other @ step) < 0.13 * np.abs(step).max()
+    bent = replace(quadratic(1), matrix=-np.eye(UNKNOWNS))
+    assert not broad_step(bent, PRIOR, BROAD, np.ones(UNKNOWNS)).any()
+    assert not broad_step(quadratic(1), PRIOR, BROAD[:, :0], np.ones(UNKNOWNS)).any()

@@ -1,0 +1,57 @@
+"""± of a slab's fit: by the gradient's noise as it was seen, and by what is left of the way where a fit ended short."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.fit.slab.model.dictionary import KNOTS, henyey_greenstein
+from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.gauss_newton import Solution
+from services.fit.slab.solve.normal import UNKNOWNS
+from services.fit.slab.solve.prior import Quadratic
+from services.fit.slab.solve.uncertainty import uncertainty_of
+
+MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
+CURVATURE = 1e4
+"""Of every unknown, so strong that no prior matters: an unknown's variance is that of its gradient over the square of this."""
+
+
+def solution(short: np.ndarray, rendering: float) -> Solution:
+    """A fit that ended ``short`` (U,) of its minimum.
+
+    Args:
+        rendering: variance of each part of the gradient by the paths, in units of that by the measurements.
+    """
+    x = Knots().unknowns(MATERIAL)
+    matrix, nothing = CURVATURE * np.eye(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS))
+    quadratic = Quadratic(matrix, -matrix @ (x + short), nothing, np.zeros(UNKNOWNS), nothing)
+    return Solution(
+        MATERIAL, quadratic, rendering * matrix, 30.0, used=1, steps=1, converged=True, paths=1, coordinates=Knots(),
+        misfit=0.0, misfit_se=0.0, data_noise=matrix, unsure=np.zeros(UNKNOWNS),
+    )  # fmt: skip
+
+
+def standard_error(one: Solution) -> float:
+    """Of the mean of ln f, of which smoothness says nothing."""
+    return uncertainty_of(one).standard_error(np.append(np.full(KNOTS, 1 / KNOTS), 0.0))
+
+
+def test_noise_of_the_paths_widens_the_errors() -> None:
+    exact, noisy = (standard_error(solution(np.zeros(UNKNOWNS), rendering)) for rendering in (0.0, 3.0))
+    assert exact == pytest.approx((KNOTS * CURVATURE) ** -0.5, rel=1e-3)
+    assert noisy == pytest.approx(2 * exact, rel=1e-3)
+
+
+def test_a_way_that_is_left_counts_as_error() -> None:
+    # All of ln f is 5 % short: sigma_s is as well.
+    short = np.append(np.full(KNOTS, 0.05), 0.0)
+    assert standard_error(solution(short, 0.0)) == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_way_that_noise_explains_does_not() -> None:
+    # Each unknown off by one of its own standard errors, as noise leaves it: 200 of them, so the square of their length is known to 10 %.
+    short = np.random.default_rng(1).standard_normal(UNKNOWNS) * 1e-2
+    short[-1] = 0.0
+    still = standard_error(solution(np.zeros(UNKNOWNS), 0.0))
+    assert standard_error(solution(short, 0.0)) == pytest.approx(still, rel=0.25)
