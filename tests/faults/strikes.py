@@ -121,7 +121,7 @@ def api_without_scheduler(held: Held) -> Iterator[None]:
     with _cut(held, HERE, "scheduler"):
         yield
         held.outlast()
-        held.require_bad("scheduler")
+        held.require_bad("scheduler", "workers")  # nobody is left that could work for it
 
 
 @contextmanager
