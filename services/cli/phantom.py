@@ -63,12 +63,15 @@ def phantom(
     ] = False,
     gums: Annotated[bool, typer.Option("--gums", help="Cover the root with gums.")] = False,
     stains: Annotated[bool, typer.Option("--stains", help="Paint stains on the enamel.")] = False,
+    lips: Annotated[
+        bool, typer.Option("--lips", help="Put lips and a retractor before the teeth, which throw shadows.")
+    ] = False,
 ) -> None:
     """Render a virtual mouth for the simulated cameras to look at."""
     from services.core.files.folders import require_folder
 
     require_folder(out, "--out")
-    of_jaw = {"--scan": scan is not None}
+    of_jaw = {"--scan": scan is not None, "--lips": lips}
     of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--fdi": fdi is not None}
     of_tooth |= {"--highlights": highlights, "--gums": gums, "--stains": stains}
     for option, given in (of_tooth if jaw else of_jaw).items():
@@ -92,7 +95,7 @@ def phantom(
     if jaw:
         from services.phantom.jaw import write_jaw_phantom
 
-        write_jaw_phantom(out, subject=subject, scan=scan, **rig)
+        write_jaw_phantom(out, subject=subject, scan=scan, lips=lips, **rig)
     else:
         from services.phantom.tooth import write_phantom
 

@@ -207,6 +207,10 @@ class JobSpec(Record):
     )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
+    shadows: bool = Field(
+        default=False,
+        description="leave out pixels that a camera's other lights show to lie in the shadow of lips, retractor or a hand",
+    )
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
     samples_per_pixel: Whole = Field(
         default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs"

@@ -34,6 +34,7 @@ from services.phantom.files import (
     write_images,
 )
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
+from services.phantom.lips import joined, lips_and_retractor
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.tooth import IOR
 
@@ -54,6 +55,14 @@ class JawSurfaces:
     cavity: Mesh | None = None
     weights: dict[int, tuple[float, ...]] | None = None
     """Blend weights of each dentin that was made up; None where all are known."""
+    lips: Mesh | None = None
+    """Lips and a retractor before the teeth, which no scan shows."""
+
+    @property
+    def opaque(self) -> Mesh | None:
+        """All that reflects and lets no light in: the wall of the mouth, lips and retractor."""
+        parts = [mesh for mesh in (self.cavity, self.lips) if mesh is not None]
+        return joined(parts) if parts else None
 
     def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
         """The scene for the project's engine; dentin stays as it is."""
@@ -73,7 +82,7 @@ class JawSurfaces:
             IOR,
             gums=self.gums,
             gums_ior=GUMS_IOR,
-            cavity=self.cavity,
+            cavity=self.opaque,
         )
 
 
@@ -126,6 +135,7 @@ def write_jaw_phantom(
     seed: int = 1,
     samples: int = 1024,
     renderer: Renderer = "engine",
+    lips: bool = False,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``teeth/``, ``gums.ply``, ``cavity.ply``) and ``truth.json`` with its optics.
 
@@ -138,16 +148,21 @@ def write_jaw_phantom(
         seed: of the rendering and of the lights' brightness.
         samples: paths per pixel.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
+        lips: put lips and a retractor before the teeth, which throw shadows; their surface, which a capture does not know, is in ``truth_lips.ply``.
 
     Raises:
         InputError: impossible combination of options. CaptureInputError: the scan cannot be read. MeshError: a surface cannot bound a medium.
     """
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
     jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]
+    if lips:
+        jaw = replace(jaw, lips=lips_and_retractor([tooth.outer for tooth in jaw.teeth]))
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, tuple(tooth.outer for tooth in jaw.teeth))
     mouths = {name: known_mouth(jaw, name, subject) for name in names}
     write_jaw_meshes(out, jaw)
+    if jaw.lips is not None:
+        write_mesh(out / "truth_lips.ply", jaw.lips)
 
     entries, kept = [], held_out_lights(lights, held_out)
     with TemporaryDirectory() as folder:
@@ -206,7 +221,7 @@ def _channel_truth(jaw: JawSurfaces, mouth: Mouth) -> dict[str, Any]:
 def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
     """A subject's media in one channel, in the order of the jaw's teeth."""
     mouth = jaw_mouth([tooth.fdi for tooth in jaw.teeth], channel, subject)
-    return mouth if jaw.cavity is not None else replace(mouth, reflectance=None)
+    return mouth if jaw.opaque is not None else replace(mouth, reflectance=None)
 
 
 def _by_engine(
@@ -227,7 +242,7 @@ def _by_mitsuba(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light,
     from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 
     prepare_device()
-    files, fdi = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.cavity), tuple(tooth.fdi for tooth in jaw.teeth)
+    files, fdi = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.opaque), tuple(tooth.fdi for tooth in jaw.teeth)
 
     def painter(channel: int, mouth: Mouth) -> Painter:
         def paint(camera: Camera, samples: int, seed: int) -> Stack:

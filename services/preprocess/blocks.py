@@ -2,7 +2,7 @@
 
 ::
 
-    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights)
+    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows are asked for
 
 One block writes an image's shards and no other does.
 """
@@ -25,12 +25,13 @@ from services.preprocess.motion import stored_step
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, write_picture
 from services.preprocess.records import FrameMotion, ImageDone
+from services.preprocess.shade import shade
 from services.preprocess.source import Bits, LightImage, Source, View
 from services.preprocess.subject import NOTHING, Subject, read_subject
 from services.preprocess.valid import require_seen, valid_bits
 from services.preprocess.workshop import Workshop
 
-Step = Literal["look", "match", "develop"]
+Step = Literal["look", "match", "develop", "shade"]
 BLOCKS_PER_THREAD = 4
 """So many blocks for each thread leave none without work for long at the end."""
 LARGEST_BLOCK = 8
@@ -72,6 +73,9 @@ class Block:
                 motion = FrameMotion(coefficients=coefficients.tolist())
                 self.workshop.put_motion(self.camera, frame, motion)
                 context.raise_if_cancelled()
+            return
+        if self.step == "shade":
+            shade(self.workshop, source, subject, view, context)
             return
         lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
         motions = self.workshop.motions(self.camera, source.matched(self.camera))

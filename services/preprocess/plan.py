@@ -20,8 +20,8 @@ CHUNK_ROWS = 256
 """Rows of the pieces of a shard, which are read or left empty at once; whole rows are written fastest."""
 
 
-def create_arrays(store: Path, source: Source) -> None:
-    """Radiance, variance, valid, surface and, where it is measured, motion; one shard per image, so that each has one writer."""
+def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
+    """Radiance, variance, valid, surface and, where they are asked for or measured, shadow and motion; one shard per image, so that each has one writer."""
     description = source.description
     height, width = (max(camera.size[axis] for camera in description.cameras) for axis in (1, 0))
     planes = (len(description.cameras), len(description.lights), height, width)
@@ -42,6 +42,8 @@ def create_arrays(store: Path, source: Source) -> None:
         )
     create_array(store, "valid", planes, (1, 1, height, width), "uint16", stack, codec="lz4")
     create_array(store, "surface", (planes[0], height, width), (1, height, width), "int16", ("camera", "y", "x"))
+    if with_shadows:
+        create_array(store, "shadow", planes, (1, 1, height, width), "uint8", stack)
     if not source.measures_motion:
         return
     step = stored_step((height, width))

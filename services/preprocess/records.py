@@ -46,3 +46,6 @@ class ImageDone(Record):
     files: dict[str, StoredFile] = Field(description="by path in the stage's folder")
     notes: tuple[str, ...] = Field(default=(), description="what the source said of the camera when it read the image")
     seconds: float = Field(description="how long it took")
+    shaded: bool = Field(
+        default=False, description="whether shadows were looked for, which needs all of the camera's images"
+    )

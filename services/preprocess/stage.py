@@ -62,7 +62,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     workshop = Workshop(StageWriter(context.root, STAGE, context.attempt))
     digest = digest_of_inputs(spec, source, masks)
     if not workshop.begin(digest):
-        create_arrays(workshop.folder / "prepared.zarr", source)
+        create_arrays(workshop.folder / "prepared.zarr", source, with_shadows=spec.shadows)
         workshop.announce(digest)
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
@@ -83,6 +83,10 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             for done in images_of(block, workshop):
                 progress.tell(done)
             context.raise_if_cancelled()
+        if spec.shadows:
+            unshaded = [k for k, own in enumerate(lights) if not all(workshop.is_shaded(k, j) for j in own)]
+            for _ in workers.run([Block(spec, workshop, "shade", k) for k in unshaded]):
+                context.raise_if_cancelled()
 
     manifest, known = summarise(workshop, source, subject, held_out, masks.digest, context)
     workshop.writer.publish(manifest, known)

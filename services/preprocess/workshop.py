@@ -138,6 +138,11 @@ class Workshop:
         )
         return done if is_whole else None
 
+    def is_shaded(self, camera: int, light: int) -> bool:
+        """Whether an image is stored and shadows were looked for in it."""
+        done = self.image(camera, light)
+        return done is not None and done.shaded
+
     def files_of(self, camera: int, light: int, picture: Path) -> dict[str, StoredFile]:
         """The files of an image as they are now."""
         shards = sorted((self.folder / "prepared.zarr").glob(f"*/c/{camera}/{light}/**/*"))

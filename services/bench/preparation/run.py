@@ -81,7 +81,7 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     subject = read_subject(source.root, whole=False)
     workshop = Workshop(StageWriter(scene.root, STAGE, 1))
     workshop.begin("")
-    create_arrays(workshop.folder / "prepared.zarr", source)
+    create_arrays(workshop.folder / "prepared.zarr", source, with_shadows=False)
     camera, light = source.description.cameras[0], source.description.lights[LIGHT]
     workshop.put_view(subject.view_of(0, camera))
     view = workshop.view(0, camera)

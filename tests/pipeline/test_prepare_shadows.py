@@ -1,0 +1,75 @@
+"""The flag for shadows in a prepared store, where a job asks for it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from services.core.files.meshes import write_mesh
+from services.core.records import MaskBit
+from services.preprocess.projection import project
+from services.preprocess.quality import QualityReport
+from services.preprocess.shadows import expected_irradiance
+from tests.support.folder_captures import prepare
+from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
+
+CAMERA = camera(0.125)
+"""Pixels half as large as those in which shadows are looked for."""
+SHADED, RADIUS_MM = 3, 2.5
+"""The light before which a ball stands that no file of the capture shows."""
+
+
+def write_capture(root: Path, lights: int) -> NDArray[np.bool_]:
+    """A folder capture of a ball; returns which pixels lie in the shadow."""
+    write_mesh(root / "teeth" / "11" / "outer.ply", ball(BALL_MM))
+    view, rng = project(CAMERA, [ball(BALL_MM)]), np.random.default_rng(5)
+    points = view.points_mm(CAMERA, slice(None))
+    tree = {"units": "mm", "channels": ["green"], "cameras": [CAMERA.model_dump()], "lights": [], "images": []}
+    for k, place in enumerate(lights_mm(lights)):
+        irradiance = 1e6 * expected_irradiance(points, view.normal, tuple(place.tolist()), None)
+        shadow = behind_ball(points.astype(np.float64), place, before_ball(lights_mm(lights)[SHADED], 9.0), RADIUS_MM)
+        image = np.where(view.covered & ~shadow, albedo(points.astype(np.float64)) * irradiance, 0)
+        image += (0.02 * image + 0.002) * rng.standard_normal(image.shape)
+        np.save(root / f"{k}.npy", image[..., None].astype(np.float32))
+        tree["lights"].append({"name": f"l{k}", "position_mm": place.tolist(), "intensity": [1e6]})
+        tree["images"].append({"camera": "front", "light": f"l{k}", "file": f"{k}.npy", "held_out": k == 0})
+        if k == SHADED:
+            lit = view.covered & (irradiance > 0.15)
+            of_light = shadow & lit
+    (root / "capture.json").write_text(json.dumps(tree))
+    return np.asarray(of_light)
+
+
+def shadows(root: Path) -> NDArray[np.bool_]:
+    valid = np.asarray(zarr.open_array(root / "prepared" / "prepared.zarr" / "valid", mode="r")[0])
+    return valid & np.uint16(MaskBit.SHADOW) > 0
+
+
+def test_shadows_are_flagged_where_a_job_asks(tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    shadow = write_capture(tmp_path / "capture", lights=8)
+    prepare(tmp_path / "capture", tmp_path / "plain")
+    prepare(tmp_path / "capture", tmp_path / "asked", shadows=True)
+    assert not shadows(tmp_path / "plain").any()
+    flagged = shadows(tmp_path / "asked")
+    assert shadow.sum() > 500
+    assert flagged[SHADED][shadow].mean() > 0.9
+    others = np.delete(flagged, SHADED, axis=0)
+    outside = zarr.open_array(tmp_path / "asked" / "prepared" / "prepared.zarr" / "valid", mode="r")[0, 0]
+    assert others[:, np.asarray(outside) & np.uint16(MaskBit.OUTSIDE) == 0].mean() < 0.03
+    sure = np.asarray(zarr.open_array(tmp_path / "asked" / "prepared" / "prepared.zarr" / "shadow", mode="r")[0])
+    assert (sure[flagged] >= 50).all()
+    report = QualityReport.model_validate_json((tmp_path / "asked" / "prepared" / "quality.json").read_text())
+    shares = {image.light: image.masked.get("shadow", 0.0) for image in report.images}
+    assert max(shares, key=lambda light: shares[light]) == f"l{SHADED}"
+
+
+def test_few_lights_tell_of_no_shadow(tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    write_capture(tmp_path / "capture", lights=5)
+    prepare(tmp_path / "capture", tmp_path / "asked", shadows=True)
+    assert not shadows(tmp_path / "asked").any()
