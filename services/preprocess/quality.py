@@ -36,6 +36,7 @@ class ImageQuality(Record):
     )
     tooth_pixels: int = Field(description="pixels whose whole footprint is to be fitted")
     valid_pixels: int
+    valid_by_tooth: dict[int, int] = Field(default={}, description="FDI number -> valid pixels that show the tooth")
     masked: dict[str, float] = Field(description="mask bit -> fraction of the tooth pixels")
 
 

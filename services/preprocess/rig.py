@@ -142,7 +142,7 @@ def _image(
     bits = np.zeros((height, width), dtype=np.uint16)
     is_warped = [move.median_px > STILL_PX for move in moves]
     inner = window.within(motion.window)
-    for rows in bands((height, width * channels)):
+    for rows in bands((height, width)):
         merged, beyond = Merge(), None
         for frame, move, taken, warped in zip(frames, moves, read, is_warped, strict=True):
             if warped:
@@ -187,11 +187,11 @@ def _resampled(
     height, width = counts.shape[:2]
     x, y = places
     beyond = (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
-    # Only the rows that are sampled, and one more on each side
-    top = int(np.clip(np.floor(y.min()), 1, height) - 1)
-    source = slice(top, max(int(np.clip(np.ceil(y.max()), 0, height - 2) + 2), top + 1))
-    y -= np.float32(source.start)
-    radiance, variance, saturated = radiometry.at(source, slice(None)).radiance(counts[source], frame)
+    # Only what is sampled
+    rows, columns = _reached(y, height), _reached(x, width)
+    y -= np.float32(rows.start)
+    x -= np.float32(columns.start)
+    radiance, variance, saturated = radiometry.at(rows, columns).radiance(counts[rows, columns], frame)
 
     def sampled(image: NDArray[Any]) -> Image:
         shape = (*x.shape, *image.shape[2:])
@@ -201,3 +201,9 @@ def _resampled(
 
     lost = sampled(saturated.astype(np.float32)) > 0 if saturated.any() else np.zeros(x.shape, dtype=bool)
     return (sampled(radiance), sampled(variance), lost), beyond
+
+
+def _reached(places: Image, size: int) -> slice:
+    """Rows or columns of an image between which samples lie, and one more on each side."""
+    first = int(np.clip(np.floor(places.min()), 1, size) - 1)
+    return slice(first, max(int(np.clip(np.ceil(places.max()), 0, size - 2) + 2), first + 1))

@@ -65,7 +65,11 @@ def summarise(
         notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
     for note in notes:
         context.report(StageEvent(stage="prepare", kind="log", message=note))
-    write_record(workshop.folder / "quality.json", QualityReport(images=tuple(reports)))
+    covered = tuple(
+        done.quality.model_copy(update={"valid_by_tooth": dict(zip(fdi, done.tooth_pixels, strict=True))})
+        for done in images
+    )
+    write_record(workshop.folder / "quality.json", QualityReport(images=covered))
     _copy_meshes(source.root, workshop.folder, fdi)
     # What a kill has left of a file that was being written
     for partial in workshop.folder.rglob("*.partial"):

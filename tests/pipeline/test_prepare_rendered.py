@@ -172,6 +172,7 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
     assert done[-1] == 1
     assert (events[0].kind, events[-1].kind) == ("started", "finished")
     report = read_record(root / "prepared" / "quality.json", QualityReport)
+    assert sum(image.valid_by_tooth[11] for image in report.images) == manifest.tooth_pixels[0]
     # Interpolated between four tracking frames, its own error is told and small
     assert all(image.motion_error_px is not None and image.motion_error_px < 0.5 for image in report.images)
     assert len(report.images) == 2 * LIGHTS

@@ -13,12 +13,15 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.preparation.scene import Scene, make_scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SIZES = {True: (1280, 960), False: (5120, 3840)}
 """Width and height by ``quick``."""
@@ -42,6 +45,21 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
     seconds, bare_s = (sum(row[key] for row in counted) for key in ("seconds", "bare_s"))
     rows.append({"step": "all but flow and footprint", "seconds": seconds, "bare_s": bare_s, "ratio": seconds / bare_s})
     return [*rows, {"step": "memory", "peak_gib": peak_gib}]
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Seconds of each step and of its bare calls."""
+    from services.bench.plots import grid
+
+    drawn = [row for row in rows if "seconds" in row][::-1]
+    figure, (axes,) = grid(1)
+    names = [row["step"] for row in drawn]
+    axes.plot([row["seconds"] for row in drawn], names, "o", label="dentine")
+    axes.plot([row.get("bare_s", np.nan) for row in drawn], names, "|", markersize=12, label="bare calls")
+    axes.set(xlabel="processor time of an image, s", xlim=(0, None))
+    axes.grid(alpha=0.25)
+    axes.legend(fontsize=8)
+    return figure
 
 
 def _row(name: str, size: tuple[int, int], ours: Work, bare: Work | None) -> dict[str, Any]:
