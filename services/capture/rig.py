@@ -15,7 +15,7 @@ from services.capture.dome.address import dome_address
 from services.capture.dome.driver import ModbusDome
 from services.capture.dome.protocol import ExposureBudget
 from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
-from services.core.calibration import require_consistent
+from services.core.calibration.record import require_consistent
 from services.core.choices import chosen
 from services.core.errors import CaptureInputError, RigError, SettingsError
 from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec

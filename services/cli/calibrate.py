@@ -37,7 +37,7 @@ def calibrate_command(
 
 def _tell_drift(session: Session, against: Path) -> None:
     from services.calibrate.session.drift import changes
-    from services.core.calibration import Calibration
+    from services.core.calibration.record import Calibration
     from services.core.store import read_record
 
     found = changes(read_record(against, Calibration), session.record)

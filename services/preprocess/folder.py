@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibration import require_consistent
+from services.core.calibration.record import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.files.arrays import as_float32, map_radiance
 from services.core.records import FolderCapture, ImageEntry, MaskBit

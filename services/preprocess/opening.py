@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.core.calibration import published_capture, recalibrated
+from services.core.calibration.record import published_capture, recalibrated
 from services.core.raw.folder import is_raw_folder
 from services.core.records import CaptureManifest, JobSpec
 from services.core.store import open_stage

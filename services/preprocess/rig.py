@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibration import require_consistent
+from services.core.calibration.record import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
 from services.core.store import MANIFEST, StoredArray
-from services.preprocess.motion import Displacement, ViewMotion, frames_to_match, jaws
 from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import write_array
 from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws
 from services.preprocess.window import Window, bands
 
 # Below this, resampling would blur more than it aligns

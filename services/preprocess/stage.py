@@ -21,7 +21,7 @@ def check() -> None:
         PlatformError: something is missing.
     """
     require_packages(PACKAGES, "preprocess")
-    for module in ("blocks", "opening", "plan", "progress", "spread", "summary"):
+    for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.spread", "tasks.summary"):
         importlib.import_module(f"services.preprocess.{module}")
 
 
@@ -34,16 +34,16 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         CaptureInputError: a file, frame, camera or light is missing or malformed. MeshError: a surface cannot bound a medium.
         SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged. JobCancelledError.
     """
-    from services.preprocess.blocks import Block, blocks_of, images_of
-    from services.preprocess.masks import HandMasks
+    from services.preprocess.masking.masks import HandMasks
+    from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
-    from services.preprocess.plan import create_arrays, digest_of_inputs, held_out_images
-    from services.preprocess.progress import Progress
-    from services.preprocess.spread import spread
     from services.preprocess.subject import read_subject
-    from services.preprocess.summary import summarise
-    from services.preprocess.valid import require_plausible_scale
-    from services.preprocess.workshop import STAGE, Workshop
+    from services.preprocess.tasks.blocks import Block, blocks_of, images_of
+    from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
+    from services.preprocess.tasks.progress import Progress
+    from services.preprocess.tasks.spread import spread
+    from services.preprocess.tasks.summary import summarise
+    from services.preprocess.tasks.workshop import STAGE, Workshop
 
     # Check everything that needs no pixel
     source = open_source(spec, context.root)

@@ -11,11 +11,11 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from services.core.calibration.uncertainty import TWIST
 from services.core.records import JobSpec, PreparedManifest
 from services.core.results import Estimate, FitReport
 from services.core.stage import LocalContext
 from services.core.store import MANIFEST
-from services.core.uncertainty import TWIST
 from services.fit.inputs.observations import Observations, ViewStack, read_channel
 from services.fit.stage import export, run
 from tests.support.prepared import TRUTH, write_prepared

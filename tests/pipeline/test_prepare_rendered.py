@@ -21,7 +21,7 @@ from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage, read_record
 from services.preprocess.projection import Footprint, project
 from services.preprocess.quality import QualityReport
-from services.preprocess.stabilise import warp
+from services.preprocess.stabilisation.stabilise import warp
 from services.preprocess.stage import run
 from tests.support.rig_capture import Rendered, write_capture
 

@@ -21,8 +21,8 @@ from services.core.placement import STAGES, UNLIMITED
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter
-from services.preprocess import blocks, workshop
 from services.preprocess.stage import run
+from services.preprocess.tasks import blocks, workshop
 from tests.support.folder_captures import write_folder, write_tree
 
 KILLS = 50

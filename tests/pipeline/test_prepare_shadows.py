@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from services.core.files.meshes import write_mesh
 from services.core.records import MaskBit
+from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.projection import project
 from services.preprocess.quality import QualityReport
-from services.preprocess.shadows import expected_irradiance
 from tests.support.folder_captures import prepare
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 from services.core.records import FolderCapture
 from services.core.store import read_record
 from tests.support.raw_folders import Tree, write_toml

@@ -9,8 +9,8 @@ import numpy as np
 
 from services.anatomy.templates.jaw import build_jaw
 from services.calibrate.registration.pose import RigidPose
-from services.core.calibrated import CalibratedCamera, CalibratedLight
-from services.core.calibration import Calibration
+from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
+from services.core.calibration.record import Calibration
 from services.core.geometry import Mesh
 from services.core.store import write_record
 from tests.support.labelled_scan import write_labelled_ply

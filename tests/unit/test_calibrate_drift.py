@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from services.calibrate.cameras.rotations import rotation_matrix
 from services.calibrate.session.drift import changes
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 
 LIGHTS = 1000 * np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0.5, 0.5, 0.7]])
 POSITION_SE_MM, GAIN_SE, FOCAL_SE = 1.5, 0.003, 2e-4

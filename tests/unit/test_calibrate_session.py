@@ -22,7 +22,7 @@ from services.calibrate.session.report import write_report
 from services.calibrate.session.run import Session, calibrate, write_session
 from services.calibrate.session.spheres import LightsStep, find_lights
 from services.cli.app import build_app
-from services.core.calibration import Calibration, require_consistent
+from services.core.calibration.record import Calibration, require_consistent
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFolder

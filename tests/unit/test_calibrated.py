@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from services.core.calibrated import CalibratedCamera
-from services.core.calibration import Calibration, require_consistent
+from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.calibration.record import Calibration, require_consistent
 from services.core.errors import CaptureInputError
 
 CAMERA: dict[str, Any] = {

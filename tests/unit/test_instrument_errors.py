@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.core.calibration import require_consistent
+from services.core.calibration.record import require_consistent
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.errors import CaptureInputError
 from services.core.geometry import Light
 from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
-from services.core.uncertainty import CalibrationUncertainty
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
 from services.fit.instrument.columns import columns, photographed

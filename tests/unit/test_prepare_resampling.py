@@ -7,9 +7,9 @@ from typing import Any, cast
 import numpy as np
 
 from services.core.records import CaptureManifest, FolderCapture, FrameRecord, MaskBit
-from services.preprocess.motion import Displacement
 from services.preprocess.radiometry import Radiometry
 from services.preprocess.rig import _image
+from services.preprocess.stabilisation.motion import Displacement
 from services.preprocess.window import Window
 
 SHAPE = (6, 12)

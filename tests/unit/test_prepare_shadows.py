@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.preprocess.masking.shadows import expected_irradiance, reached_by, shadow_confidence
 from services.preprocess.projection import Footprint, project
-from services.preprocess.shadows import expected_irradiance, reached_by, shadow_confidence
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 
 PIXEL_MM = 0.25

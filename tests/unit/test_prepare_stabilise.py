@@ -11,10 +11,10 @@ import pytest
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.records import FrameRecord
-from services.preprocess.motion import ViewMotion, jaws, stored_step
 from services.preprocess.projection import Footprint
 from services.preprocess.source import View
-from services.preprocess.stabilise import TERMS, Aligner, SurfaceFlow, interpolate, warp
+from services.preprocess.stabilisation.motion import ViewMotion, jaws, stored_step
+from services.preprocess.stabilisation.stabilise import TERMS, Aligner, SurfaceFlow, interpolate, warp
 from services.preprocess.window import Window
 from tests.support.shared_data import shared_path
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from services.core.calibrated import CalibratedCamera
+from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance
 from services.preprocess.raw.lens import Lens, Sampler, fitted_vignetting
 from services.preprocess.raw.merge import Exposure, merge

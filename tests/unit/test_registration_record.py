@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.raw.registration import REGISTRATION, Registration, with_registration
 from services.core.store import write_record
-from services.core.uncertainty import TWIST, CalibrationUncertainty
 
 TEETH = tuple(f"teeth.{axis}" for axis in TWIST)
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from pydantic import Field
 
 from services.client.errors import CalibrationTakenError, UnknownCalibrationError
-from services.core.calibration import Calibration, require_consistent
+from services.core.calibration.record import Calibration, require_consistent
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer

@@ -11,7 +11,7 @@ from services.api.captures.captures import Captures
 from services.api.http.bodies import BodyRoute, Sent
 from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import refusals
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 
 Name = Annotated[str, PathParameter(pattern=f"^{NAME}$", description="1 to 60 letters, digits, '.', '_', '-'")]
 

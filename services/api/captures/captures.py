@@ -39,7 +39,7 @@ from services.client.errors import (
     TooLargeError,
     UnknownCaptureError,
 )
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 from services.core.errors import DiskFullError, SettingsError
 from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec

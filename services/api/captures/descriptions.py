@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from services.api.captures.contents import content_fault
-from services.core.calibration import MAX_LIGHTS, Calibration
+from services.core.calibration.record import MAX_LIGHTS, Calibration
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 from services.core.raw.description import read_any_description

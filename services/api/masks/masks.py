@@ -14,7 +14,7 @@ from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Job
 from services.api.masks.images import picture_of, require_mask
 from services.client.errors import JobStateError, MaskError, UnknownMaskError
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 from services.core.files.image_metadata import plain_png
 from services.core.geometry import Camera, Record
 from services.core.masks import ALL_LIGHTS, LONGEST_NAME, is_stale, mask_path, read_masks

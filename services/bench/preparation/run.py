@@ -87,13 +87,13 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     """Each step and its bare calls, and the peak memory in GiB of one image from counts to files."""
     from services.core.records import JobSpec
     from services.core.store import StageWriter
-    from services.preprocess.blocks import Desk
-    from services.preprocess.masks import HandMasks
+    from services.preprocess.masking.masks import HandMasks
+    from services.preprocess.masking.valid import valid_bits
     from services.preprocess.opening import open_source
-    from services.preprocess.plan import create_arrays
     from services.preprocess.subject import read_subject
-    from services.preprocess.valid import valid_bits
-    from services.preprocess.workshop import STAGE, Workshop
+    from services.preprocess.tasks.blocks import Desk
+    from services.preprocess.tasks.plan import create_arrays
+    from services.preprocess.tasks.workshop import STAGE, Workshop
 
     source = open_source(JobSpec(capture=scene.root), scene.root)
     subject = read_subject(source.root, whole=False)

@@ -13,8 +13,8 @@ from services.calibrate.cameras.lens import HALF_PIXEL, Lens
 from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import Floats, RigidPose
-from services.core.calibrated import CalibratedCamera
-from services.core.calibration import Calibration
+from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.calibration.record import Calibration
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.raw.frames import read_counts

@@ -16,7 +16,8 @@ from services.calibrate.registration.outlines import View, outline_misfit_mm, po
 from services.calibrate.registration.overlay import report_page, write_overlay
 from services.calibrate.registration.photographs import cameras_of, clicks_of, cut_out, photographs, require_facing
 from services.calibrate.registration.pose import Floats, PoseStep, RigidPose
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
+from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Matrix4, Mesh, teeth_folder
@@ -24,7 +25,6 @@ from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.raw.records import RawFolder
 from services.core.raw.registration import REGISTRATION, Registration, RegistrationStep
 from services.core.store import read_record, write_atomic, write_record
-from services.core.uncertainty import TWIST, CalibrationUncertainty
 
 PICTURES, PAGE = "registration", "registration.html"
 FARTHEST_LANDMARK_MM = 2.0

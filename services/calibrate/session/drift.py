@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 
 Floats = NDArray[np.float64]
 CLEAR_SIGMAS = 4.0

@@ -14,8 +14,8 @@ from services.calibrate.lights.listed import swapped_names
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
 from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.raw.records import RawFolder
-from services.core.uncertainty import CalibrationUncertainty
 
 Floats = NDArray[np.float64]
 GRID = (8, 6)

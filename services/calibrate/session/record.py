@@ -13,10 +13,10 @@ from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
 from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
-from services.core.calibrated import CalibratedCamera, CalibratedLight, CameraColour, Lobe
-from services.core.calibration import Calibration
+from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight, CameraColour, Lobe
+from services.core.calibration.record import Calibration
+from services.core.calibration.uncertainty import LENS, TWIST, CalibrationUncertainty
 from services.core.raw.records import RawFolder
-from services.core.uncertainty import LENS, TWIST, CalibrationUncertainty
 
 Floats = NDArray[np.float64]
 LIGHT_DRIFT = 1e-4

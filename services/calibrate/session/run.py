@@ -19,7 +19,7 @@ from services.calibrate.session.judge import Judgement, judge
 from services.calibrate.session.photos import Photos
 from services.calibrate.session.record import light_positions, record_of
 from services.calibrate.session.spheres import IntensityStep, LightsStep, find_lights, measure_intensity
-from services.core.calibration import Calibration
+from services.core.calibration.record import Calibration
 from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.store import write_atomic, write_record
 

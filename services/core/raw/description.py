@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.core.calibrated import CalibratedCamera
-from services.core.calibration import Calibration, read_description, require_consistent
+from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.calibration.record import Calibration, read_description, require_consistent
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import DESCRIPTION, is_raw_folder, read_raw_folder
 from services.core.raw.records import RawFolder

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Matrix4, Record, Vector3
 from services.core.store import read_record
-from services.core.uncertainty import CalibrationUncertainty
 
 REGISTRATION = "registration.json"
 

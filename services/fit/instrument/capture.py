@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec, PreparedManifest
-from services.core.uncertainty import CalibrationUncertainty
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
 from services.fit.instrument.moves import Move, move_covariance, write_moves

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.uncertainty import CalibrationUncertainty
+from services.core.calibration.uncertainty import CalibrationUncertainty
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.geometry import Camera
-from services.core.uncertainty import TWIST, CalibrationUncertainty
 from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_recipe
 from services.fit.execution.engine_host import EngineHost
 from services.fit.instrument.errors import DEFAULT_MOVE_SE

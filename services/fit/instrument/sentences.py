@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
-from services.core.uncertainty import CalibrationUncertainty
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, kind_of_error
 from services.fit.instrument.moves import move_covariance
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibrated import CalibratedCamera
+from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.errors import CaptureInputError
 from services.core.raw.frames import read_counts
 from services.core.raw.mosaic import sites

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibrated import CalibratedCamera
+from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]

@@ -13,12 +13,12 @@ from services.core.raw.description import described, read_calibration
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFrame
 from services.core.records import FrameRecord
-from services.preprocess.motion import ViewMotion, frames_to_match, jaws
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView
 from services.preprocess.rig import MIN_TRACKING
 from services.preprocess.source import LightImage, Motions, View
+from services.preprocess.stabilisation.motion import ViewMotion, frames_to_match, jaws
 
 
 class RawSource:

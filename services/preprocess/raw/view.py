@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from services.core.raw.records import RawFrame
 from services.core.records import MaskBit
-from services.preprocess.motion import Displacement, ViewMotion
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance, spoiled
@@ -18,6 +17,7 @@ from services.preprocess.raw.lens import Sampler
 from services.preprocess.raw.merge import Exposure, merge
 from services.preprocess.rig import STILL_PX, UNCERTAIN_PX
 from services.preprocess.source import Image, LightImage, View
+from services.preprocess.stabilisation.motion import Displacement, ViewMotion
 from services.preprocess.window import bands
 
 BoolArray = NDArray[np.bool_]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from services.core.calibrated import CalibratedCamera
+from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.mosaic import sites
 from services.preprocess.raw.camera import CameraFrames

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from services.core.stage import StageContext, StageEvent
-from services.preprocess.records import ImageDone
+from services.preprocess.tasks.records import ImageDone
 
 ENOUGH = 3
 """Images before a time is told: the first ones also load libraries."""

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Light
 from services.core.records import MaskBit
 from services.core.stage import StageContext
+from services.preprocess.masking.shadows import expected_irradiance, reached_by, shadow_confidence
 from services.preprocess.projection import Footprint
 from services.preprocess.quality import assess, write_picture
-from services.preprocess.shadows import expected_irradiance, reached_by, shadow_confidence
 from services.preprocess.source import Image, Source, View
 from services.preprocess.subject import Subject
-from services.preprocess.workshop import Workshop
+from services.preprocess.tasks.workshop import Workshop
 
 PIXEL_MM = 0.25
 """Shadows are looked for in images averaged to about this pixel: finer than their edges, which light inside a tooth makes soft."""

@@ -8,9 +8,9 @@ from pathlib import Path
 from services.core.errors import SettingsError
 from services.core.records import JobSpec
 from services.core.store import create_array
-from services.preprocess.masks import HandMasks
-from services.preprocess.motion import stored_step
+from services.preprocess.masking.masks import HandMasks
 from services.preprocess.source import Source
+from services.preprocess.stabilisation.motion import stored_step
 
 FORMAT = 5
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""

@@ -20,16 +20,16 @@ import zarr
 from services.core.records import JobSpec, MaskBit
 from services.core.stage import LocalContext
 from services.preprocess.brightness import light_of
-from services.preprocess.masks import HandMasks
-from services.preprocess.motion import stored_step
+from services.preprocess.masking.masks import HandMasks
+from services.preprocess.masking.shade import shade
+from services.preprocess.masking.valid import require_seen, valid_bits
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, write_picture
-from services.preprocess.records import FrameMotion, ImageDone
-from services.preprocess.shade import shade
 from services.preprocess.source import Bits, LightImage, Source, View
+from services.preprocess.stabilisation.motion import stored_step
 from services.preprocess.subject import NOTHING, Subject, read_subject
-from services.preprocess.valid import require_seen, valid_bits
-from services.preprocess.workshop import Workshop
+from services.preprocess.tasks.records import FrameMotion, ImageDone
+from services.preprocess.tasks.workshop import Workshop
 
 Step = Literal["look", "match", "develop", "shade"]
 BLOCKS_PER_THREAD = 4

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
 from services.core.records import MaskBit
-from services.preprocess.highlights import half_cosines, highlight_mask
+from services.preprocess.masking.highlights import half_cosines, highlight_mask
 from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage
 

@@ -24,9 +24,9 @@ import numpy as np
 from services.core.geometry import Camera, Record
 from services.core.store import StageWriter, write_atomic, write_record
 from services.preprocess.projection import Footprint
-from services.preprocess.records import FrameMotion, ImageDone, StoredFile, ViewDone
 from services.preprocess.scratch import write_array
 from services.preprocess.source import Motions, View
+from services.preprocess.tasks.records import FrameMotion, ImageDone, StoredFile, ViewDone
 
 R = TypeVar("R", bound=Record)
 STAGE = "prepared"

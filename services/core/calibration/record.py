@@ -8,12 +8,12 @@ from typing import Literal
 
 from pydantic import Field
 
-from services.core.calibrated import CalibratedCamera, CalibratedLight, CameraColour, is_absent
+from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight, CameraColour, is_absent
+from services.core.calibration.uncertainty import CalibrationUncertainty, require_known_names
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Record
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
-from services.core.uncertainty import CalibrationUncertainty, require_known_names
 
 RAW_DESCRIPTION = "raw.toml"
 """Makes a folder of photographs a capture; see ``services.core.raw``."""

@@ -12,7 +12,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import Motions, View
-from services.preprocess.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
+from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]

@@ -15,10 +15,10 @@ from services.core.store import write_record
 from services.preprocess.brightness import Brightness
 from services.preprocess.colours import require_like_colours
 from services.preprocess.quality import QualityReport, unusable_note
-from services.preprocess.records import ImageDone
 from services.preprocess.source import Source
 from services.preprocess.subject import Subject
-from services.preprocess.workshop import Workshop
+from services.preprocess.tasks.records import ImageDone
+from services.preprocess.tasks.workshop import Workshop
 
 Known = dict[str, tuple[int, str]]
 """Size and SHA-256 of files by their path in the store."""

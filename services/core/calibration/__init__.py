@@ -1,0 +1,1 @@
+"""What a calibration has measured of a rig, and how sure it is."""

@@ -1,0 +1,1 @@
+"""Which pixels a fit may use: highlights, shadows, masks by hand."""

@@ -1,0 +1,1 @@
+"""How the jaws moved between frames, and frames as if they had not."""
