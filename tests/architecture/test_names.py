@@ -82,3 +82,37 @@ def test_no_folder_is_so_full_that_a_file_cannot_be_found() -> None:
         for folder in {path.parent for path in sources("services")}
     }
     assert not {str(folder.relative_to(ROOT)): count for folder, count in counts.items() if count > MAX_SIDE_BY_SIDE}
+
+
+def test_every_name_that_is_imported_is_there() -> None:
+    """Benchmarks and fault matrices are imported by no other test, so that a name that has moved would be missed in them alone."""
+    defined: dict[str, set[str]] = {}
+    asked: list[tuple[Path, str, str]] = []
+    for path in sources("services", "tests", "dentine"):
+        tree = ast.parse(path.read_text())
+        defined[module_of(path)] = names_bound_in(tree)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module is not None:
+                asked += [(path, node.module, alias.name) for alias in node.names]
+    missing = [
+        f"{path.relative_to(ROOT)}: {module}.{name}"
+        for path, module, name in asked
+        if module in defined and name not in defined[module] and f"{module}.{name}" not in defined
+    ]
+    assert missing == []
+
+
+def names_bound_in(tree: ast.Module) -> set[str]:
+    """What a module defines, assigns or imports at any depth; a module with ``__getattr__`` may offer what its ``__all__`` lists."""
+    bound: set[str] = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                bound.add(node.name)
+            case ast.Name(id=name, ctx=ast.Store()):
+                bound.add(name)
+            case ast.Import() | ast.ImportFrom():
+                bound |= {alias.asname or alias.name for alias in node.names}
+            case ast.Constant(value=str(text)):
+                bound.add(text)
+    return bound

@@ -34,9 +34,9 @@ from requests.structures import CaseInsensitiveDict
 
 from services.api.auth.tokens import Scope
 from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
-from tests.contracts.existing_ids import Living
+from tests.contracts.existing_ids import ExistingIds
 from tests.contracts.generated_requests import Sender, served
-from tests.contracts.kept_data import Witnesses, leave_witnesses
+from tests.contracts.kept_data import KeptData, leave_witnesses
 from tests.load.open_loop import Answer, offer, poisson, run
 from tests.load.processes import Served
 from tests.load.request_mix import Ask
@@ -118,7 +118,7 @@ def measure(folder: Path, inputs: int, pairs: int, seed: int) -> Row:
         witnesses = leave_witnesses(client, folder / "data", folder / "capture")
         write_mouth(folder / "mouth", lights=2)
         address, server = str(client.base_url).rstrip("/"), psutil.Process(process.pid)
-        sender = Sender(address, tokens, Living(witnesses, folder / "data", folder / "mouth"))
+        sender = Sender(address, tokens, ExistingIds(witnesses, folder / "data", folder / "mouth"))
         recorded: list[Recorded] = []
         sender._session.hooks["response"].append(lambda answer, **_: _record(answer, recorded))
         began = time.monotonic()
@@ -213,7 +213,7 @@ def _settle(client: httpx.Client) -> None:
         time.sleep(0.2)
 
 
-def _reads(witnesses: Witnesses) -> list[Ask]:
+def _reads(witnesses: KeptData) -> list[Ask]:
     job = f"/v1/jobs/{witnesses.job['id']}"
     paths = (
         "/v1/jobs",

@@ -24,7 +24,7 @@ from services.core.settings import ServerSettings
 from services.pipeline.logs import configure_logs
 from tests.load.bare_server import build
 from tests.load.library import fill
-from tests.load.request_mix import Ask, Mix
+from tests.load.request_mix import Ask, RequestMix
 from tests.support.guarded_server import make_token
 
 Row = dict[str, Any]
@@ -55,7 +55,7 @@ async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
     library = fill(work, work / "capture", jobs=1000, fitted=10)
     headers = {"Authorization": f"Bearer {make_token(work, 'cost', Scope.SUBMIT)}"} if options.tokens else {}
     settings = ServerSettings(data=work, access="tokens" if options.tokens else "open", job_roots="/")
-    mix = Mix(library, random.Random(options.seed), "cost")
+    mix = RequestMix(library, random.Random(options.seed), "cost")
     drawn = (mix.draw() for _ in count())
     asks = list(islice((ask for ask in drawn if options.only in {None, ask.kind}), options.requests))
     bare = build(str(settings.database_url).removeprefix("sqlite:///"))
