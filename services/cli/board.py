@@ -21,7 +21,7 @@ def board_command(
 
     from services.calibrate.cameras.printing import board_pdf
     from services.core.errors import SettingsError
-    from services.core.raw.things import Board
+    from services.core.raw.targets import Board
     from services.core.store import write_atomic
 
     told: dict[str, object] = {"name": "board", "type": kind, "squares": squares, "square_mm": square_mm}

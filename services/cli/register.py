@@ -18,7 +18,7 @@ def register(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write teeth, record and pictures to; default: the raw folder.")
     ] = None,
-    most_misfit_mm: Annotated[
+    max_misfit_mm: Annotated[
         float | None,
         typer.Option(
             min=0.0,
@@ -32,7 +32,7 @@ def register(
 
     if out is not None:
         require_folder(out, "--out")
-    record = register_folder(raw, calibration, out, MOST_MISFIT_MM if most_misfit_mm is None else most_misfit_mm)
+    record = register_folder(raw, calibration, out, MOST_MISFIT_MM if max_misfit_mm is None else max_misfit_mm)
     for step in record.steps:
         print(f"{step.name}: {step.points} points, {step.residual_mm:.3f} mm in the median")
         for text in step.left_out:

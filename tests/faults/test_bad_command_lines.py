@@ -198,7 +198,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "token revoke": ("--data",),
     "dome-sim": ("--port", "--lights", "--watchdog-s", "--host"),
     "worker": ("--nthreads",),
-    "register": ("--calibration", "--out", "--most-misfit-mm"),
+    "register": ("--calibration", "--out", "--max-misfit-mm"),
 }
 WORDS = (
     "", ".", "/", "/dev/null", "/dev/full", "no/such/thing", "JOB.toml", "TEXT.toml", "mouth", "x" * 300, "ä ö", "-1", "0",

@@ -14,7 +14,7 @@ from services.calibrate.cameras.bundle import Rig, draw
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 from services.calibrate.cameras.sightings import View, joined
-from services.core.raw.things import Board
+from services.core.raw.targets import Board
 
 CHESSBOARD = Board(name="plate", type="chessboard", squares=(9, 7), square_mm=12.0)
 SIZE = (1600, 1200)

@@ -14,7 +14,7 @@ from services.calibrate.cameras.bundle import pose_apply
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import inverse_pose, pose_matrix, pose_vector, rotation_matrix
 from services.calibrate.lights.mirror import Eye, highlight_points
-from services.core.raw.things import Board
+from services.core.raw.targets import Board
 from tests.support.board_sessions import looking
 from tests.support.raw_folders import write_toml
 from tests.support.sphere_sessions import dome_lights

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.calibrate.cameras.lens import HALF_PIXEL
 from services.core.errors import CaptureInputError
-from services.core.raw.things import Board
+from services.core.raw.targets import Board
 
 Floats = NDArray[np.float64]
 

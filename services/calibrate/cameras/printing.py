@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.boards import opencv_board
-from services.core.raw.things import Board
+from services.core.raw.targets import Board
 
 POINTS_PER_MM = 72 / 25.4
 MARGIN_MM = 10.0

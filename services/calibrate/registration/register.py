@@ -56,7 +56,7 @@ def register_folder(
     root: Path,
     calibration_file: Path | None = None,
     out: Path | None = None,
-    most_misfit_mm: float = MOST_MISFIT_MM,
+    max_misfit_mm: float = MOST_MISFIT_MM,
 ) -> Registration:
     """Register the scan of a raw folder and write teeth, gums, record, pictures and page.
 
@@ -64,7 +64,7 @@ def register_folder(
         root: the folder of ``raw.toml``.
         calibration_file: in place of the one that ``raw.toml`` names.
         out: where to write; the raw folder itself by default, whose teeth they then are.
-        most_misfit_mm: median distance of outlines beyond which the scan is refused.
+        max_misfit_mm: median distance of outlines beyond which the scan is refused.
 
     Raises:
         CaptureInputError: something is missing or contradicts, or the pose is not to be believed; where a picture shows
@@ -79,7 +79,7 @@ def register_folder(
     scanned = scanned_teeth(root, folder)
     views, clicks = photographs(root, folder, calibration), clicks_of(folder, calibration)
     require_on_their_teeth(clicks, scanned)
-    steps, cut, misfit_mm = _registered(views, clicks, scanned, out / PICTURES, most_misfit_mm)
+    steps, cut, misfit_mm = _registered(views, clicks, scanned, out / PICTURES, max_misfit_mm)
 
     pose = steps[-1].pose
     pictures = []
@@ -120,7 +120,7 @@ def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
 
 
 def _registered(
-    views: Mapping[str, View], clicks: Sequence[Click], scanned: ScannedTeeth, pictures: Path, most_misfit_mm: float
+    views: Mapping[str, View], clicks: Sequence[Click], scanned: ScannedTeeth, pictures: Path, max_misfit_mm: float
 ) -> tuple[list[PoseStep], list[View], float]:
     first, contradiction = fit_landmarks(cameras_of(views), clicks, scanned.centre_mm)
     steps = [first]
@@ -132,7 +132,7 @@ def _registered(
         reach_px = REACH_MM / min(view.camera.pixel_mm(placed.mean(axis=0)) for view in cut)
         steps.append(pose_from_outlines(cut, scanned.teeth, [scanned.gums], steps[0], scanned.centre_mm, reach_px))
         misfit_mm = outline_misfit_mm(cut, scanned.teeth, [scanned.gums], steps[-1].pose)
-        _require_small(misfit_mm, most_misfit_mm)
+        _require_small(misfit_mm, max_misfit_mm)
     except CaptureInputError as problem:
         names = []
         for view in cut:

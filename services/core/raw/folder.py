@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
-from services.core.raw.things import Board, CalibrationFile, Chart, Landmark, ScanFile, SeenPoint, Sphere
+from services.core.raw.targets import Board, CalibrationFile, Chart, Landmark, ScanFile, SeenPoint, Sphere
 
 DESCRIPTION = "raw.toml"
 MAX_DESCRIPTION_BYTES = 16 * 2**20

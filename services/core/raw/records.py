@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from services.core.geometry import Name, Record, Vector3
-from services.core.raw.things import Board, CalibrationFile, Chart, Label, Landmark, Pixel, ScanFile, Sphere
+from services.core.raw.targets import Board, CalibrationFile, Chart, Label, Landmark, Pixel, ScanFile, Sphere
 from services.core.records import FileName, Number, Positive, Unit, Whole
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
