@@ -16,8 +16,12 @@ Counts = NDArray[np.uint16] | NDArray[np.float32]
 _LETTERS = {"red": "R", "green": "G", "blue": "B"}
 GREENS_APART = 4.0
 """How many times further apart the two green pixels of a mosaic may be than its red and blue ones before it is taken for another."""
+BRIGHT_PERCENT = 75
+"""Cells brighter than so many others are looked at: the rest may be black."""
+MIN_CELLS = 32
+"""Cells without which nothing is said."""
 CLEARLY_APART = 0.05
-"""Relative difference of the green pixels' means below which nothing is said: sensors' two greens differ by 1 or 2 %."""
+"""Half of the relative difference of a cell's green pixels below which nothing is said: sensors' two greens differ by 1 or 2 %."""
 
 
 def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
@@ -124,12 +128,17 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
         return
     if min(counts.shape) < 2:
         raise ValueError("is too small to hold a mosaic; correct mosaic")
-    # Both greens see the same light; where they differ and the other two agree, the pattern begins one pixel further.
-    means = [float(counts[k // 2 :: 2, k % 2 :: 2].mean()) for k in range(4)]
-    greens = [mean for mean, letter in zip(means, camera.mosaic, strict=True) if letter == "G"]
-    others = [mean for mean, letter in zip(means, camera.mosaic, strict=True) if letter != "G"]
-    apart, expected = abs(greens[0] - greens[1]), abs(others[0] - others[1])
-    if apart > GREENS_APART * expected and apart > CLEARLY_APART * sum(greens):
+    # Both greens see the same light. Where they differ in most cells and the other two agree, the pattern begins one pixel further.
+    height, width = (length // 2 * 2 for length in counts.shape)
+    cells = [counts[k // 2 : height : 2, k % 2 : width : 2].astype(np.float32) for k in range(4)]
+    bright = sum(cells) >= np.percentile(sum(cells), BRIGHT_PERCENT)
+    greens, others = (
+        [cell[bright] for cell, letter in zip(cells, camera.mosaic, strict=True) if (letter == "G") == wanted]
+        for wanted in (True, False)
+    )
+    # Medians, as edges make single cells differ to either side.
+    apart, expected = (abs(float(np.median((a - b) / np.maximum(a + b, 1)))) for a, b in (greens, others))
+    if len(greens[0]) >= MIN_CELLS and apart > GREENS_APART * expected and apart > CLEARLY_APART:
         raise ValueError(
-            f"has green pixels that differ by {apart / (0.5 * sum(greens)):.0%}, so it does not begin {camera.mosaic}; correct mosaic"
+            f"has green pixels that differ by {2 * apart:.0%}, so it does not begin {camera.mosaic}; correct mosaic"
         )
