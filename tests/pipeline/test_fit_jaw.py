@@ -191,6 +191,7 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
     assert 0.1 < thickness.mean() < 2.0
 
 
+@pytest.mark.slow
 def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
     # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
     write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)

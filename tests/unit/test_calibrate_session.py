@@ -44,6 +44,7 @@ def session(made: tuple[Path, Truth]) -> Session:
     return calibrate(made[0])
 
 
+@pytest.mark.slow
 def test_cameras_are_where_they_were(made: tuple[Path, Truth], session: Session) -> None:
     truth, fit = made[1], session.cameras.fit
     for number, eye in enumerate(truth.eyes):

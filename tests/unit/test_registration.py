@@ -62,6 +62,7 @@ def test_a_twist_leads_from_one_pose_to_the_other() -> None:
     np.testing.assert_allclose(there.matrix, two.matrix, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_landmarks_give_the_pose_and_honest_errors() -> None:
     scores = []
     for seed in range(12):
