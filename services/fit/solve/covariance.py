@@ -33,13 +33,10 @@ from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
-
 NOISE_FACTOR = 3.0
 """An eigenvalue below so many of its own standard deviations is not told from zero."""
 MIN_DATA_SHARE = 0.5
 """A parameter is determined where data, not prior, give at least this part of the information."""
-
-
 DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
     {
         "sigma_s_reduced": ("1/mm", lambda m: m.sigma_s_reduced),
