@@ -47,8 +47,10 @@ class Budget:
     """At most, until the last step."""
     last: tuple[tuple[int, int], ...] = ((15000, 16), (30000, 24))
     """Paths and batches of the stages at the end."""
-    most_last: int = 8
+    most_last: int = 4
     """Steps of a stage."""
+    most_last_thick: int = 8
+    """The same where sigma_t w exceeds ``prior.THICK``."""
     most_steps: int = 10
 
 
@@ -83,6 +85,8 @@ class Solution:
     misfit_se: float
     data_noise: Array
     """Covariance of the last gradient's noise by the measurements (U, U)."""
+    thick: bool
+    """See ``GaussNewton.is_thick``."""
     unsure: Array
     """What the last step may have been wrong by as the matrix is noisy, before it is solved for (U,)."""
 
@@ -145,7 +149,7 @@ class GaussNewton:
         """Steps from many paths, then from the most: each stage until its paths tell of nothing more."""
         material = state.material
         for paths, batches in self.budget.last:
-            for _ in range(self.budget.most_last):
+            for _ in range(self.budget.most_last_thick if self.is_thick(material) else self.budget.most_last):
                 equations = self.linearised(material, paths, batches)
                 x = self.coordinates.unknowns(material)
                 quadratic = quadratic_at(x, equations)
@@ -154,16 +158,20 @@ class GaussNewton:
                 change = self.change(quadratic, prior, material, DAMPING)
                 material = self.coordinates.material_at(x + change)
                 noise = noise_of_promise(quadratic, prior, equations.gradient_noise)
-                thick = material.extinction_per_mm * self.rig.width_mm > THICK
                 promise = promised(quadratic, prior, x, change)
                 finished = promise < UNFINISHED * noise
-                if promise < (UNFINISHED_THICK if thick else UNFINISHED) * noise:
+                if promise < (UNFINISHED_THICK if self.is_thick(material) else UNFINISHED) * noise:
                     break
         return Solution(
             material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged and finished, self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
+            self.is_thick(material),
             equations.matrix_error @ (self.coordinates.unknowns(material) - x),
         )  # fmt: skip
+
+    def is_thick(self, material: Material) -> bool:
+        """Whether cameras of one side see nearly the same of every path, and sigma_s and g are hardly told apart."""
+        return material.extinction_per_mm * self.rig.width_mm > THICK
 
     def change(self, quadratic: Quadratic, prior: Array, around: Material, damping: float) -> Array:
         """The step to the damped minimum, no unknown further than is good.
@@ -172,7 +180,7 @@ class GaussNewton:
         repeated steps from fresh paths end where an undamped one would.
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
-        if around.extinction_per_mm * self.rig.width_mm <= THICK:
+        if not self.is_thick(around):
             broad = broad[:, :0]  # in a thin cell signals stand out, and a second step only adds noise
         matrix = step_matrix(quadratic, prior, damping)
         slope = quadratic.linear + (quadratic.matrix + prior) @ x
@@ -204,7 +212,11 @@ class GaussNewton:
         # share them with the residuals bent sigma_s' up by several per cent.
         known = own if self.path_noise is None else self.path_noise
         variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
-        weights = weights_of(seen, variances, [one / (batches * paths) for one in known])
+        noise = [one / (batches * paths) for one in known]
+        if not self.is_thick(material):
+            # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would only add noise.
+            noise = [one * np.eye(one.shape[1]) for one in noise]
+        weights = weights_of(seen, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, known, strict=True))
         equations = normal_equations(estimates, material, self.measured.values, weights)
         return equations.chained(self.coordinates.chain(material))

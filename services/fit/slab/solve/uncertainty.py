@@ -48,22 +48,25 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
     The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
-    directions whose curvature stands out count. The gradient's noise is taken as it was seen between batches: paths reach all
-    cameras of a light, so what they add to different images is not independent, as the weights have it.
+    directions whose curvature stands out count. In thin cells the images' Monte Carlo noise is in the weights, as the shot noise
+    is. In thick ones, where it is the larger part, the gradient's noise is taken as it was seen between batches, and what is left
+    of the way to the minimum counts as error.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
-    noise = solution.data_noise + solution.gradient_noise + np.outer(solution.unsure, solution.unsure)
     priors = coordinates.precision(solution.scale), coordinates.weak_precision(material)
     (believed, held), (weakly, weakly_held) = (
         (seen_of(quadratic, prior), np.diag(_half_lines(quadratic, prior, x, coordinates.is_bound(x))))
         for prior in priors
     )
-    inverse = np.linalg.inv(believed.total + held)
-    chosen = inverse @ (believed.noise(noise) + priors[0] + held) @ inverse
-    left = _left(solution, x, priors[0], chosen)
-    # Flags ask what the prior adds, so the weak one's directions count as far as the weights have it.
-    chosen, alone = chosen + left, np.linalg.inv(weakly.total + weakly_held) + left
+    chosen: Array = np.asarray(np.linalg.inv(believed.total + held), dtype=np.float64)
+    alone: Array = np.asarray(np.linalg.inv(weakly.total + weakly_held), dtype=np.float64)
+    if solution.thick:
+        noise = solution.data_noise + solution.gradient_noise + np.outer(solution.unsure, solution.unsure)
+        chosen = chosen @ (believed.noise(noise) + priors[0] + held) @ chosen
+        left = _left(solution, x, priors[0], chosen)
+        # Flags ask what the prior adds, so the weak one's directions count as far as the weights have it.
+        chosen, alone = chosen + left, alone + left
     if (chain := coordinates.chain(material)) is None:
         return Uncertainty(chosen, alone, (chosen, alone))
     return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
@@ -121,4 +124,4 @@ def phase_errors(material: Material, uncertainty: Uncertainty) -> tuple[Array, N
         np.sqrt(np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True))
         for covariance in (uncertainty.covariance, uncertainty.images_alone)
     )
-    return errors * material.phase_per_sr, np.maximum(errors, alone) <= LARGEST_SHARE
+    return errors * material.phase_per_sr, alone <= LARGEST_SHARE
