@@ -26,11 +26,12 @@ class KeptData:
     @classmethod
     def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> KeptData:
         """What is there now."""
+        told = client.get(f"/v1/jobs/{job}").raise_for_status().json()
         paths = [file["path"] for file in client.get(f"/v1/jobs/{job}/artifacts").raise_for_status().json()]
         return cls(
             client.get(f"/v1/captures/{capture}").raise_for_status().json(),
             contents_of(data / "captures" / capture),
-            client.get(f"/v1/jobs/{job}").raise_for_status().json(),
+            {key: value for key, value in told.items() if key != "name"},  # which whoever may submit jobs may change
             {
                 path: hashlib.sha256(
                     client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content
@@ -48,7 +49,22 @@ class KeptData:
         except httpx.HTTPError as problem:
             return [f"the witnesses cannot be read: {problem}"]
         of = ("capture", "contents", "job", "artifacts", "events", "previews")
-        return [f"{name} of the witnesses changed" for name in of if getattr(now, name) != getattr(self, name)]
+        return [
+            f"{name} of the witnesses changed{_where(getattr(self, name), getattr(now, name))}"
+            for name in of
+            if getattr(now, name) != getattr(self, name)
+        ]
+
+
+def _where(before: object, now: object) -> str:
+    """The entries of two mappings that differ; nothing for other things."""
+    if not isinstance(before, dict) or not isinstance(now, dict):
+        return ""
+    return ": " + ", ".join(
+        f"{key} from {str(before.get(key))[:80]} to {str(now.get(key))[:80]}"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key)
+    )
 
 
 def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> KeptData:

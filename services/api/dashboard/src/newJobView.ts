@@ -30,7 +30,7 @@ export class NewJobView {
         card("Run the demo", "A simulated dome lights a virtual incisor, and the fit finds its optics again. Nothing is needed; some minutes on two cores.", this.run, this.refusal),
         card(
           "Upload a capture",
-          "A folder with capture.json, its images and its meshes. Only what the server does not know yet is sent; an upload that breaks goes on when you choose the folder again.",
+          "A folder with capture.json, or raw.toml and photographs as cameras write them, with its meshes. Only what the server does not know yet is sent; an upload that breaks goes on when you choose the folder again.",
           this.upload.root,
           this.ready,
           element("p", { class: "soft" }, "Or ", options, "."),
