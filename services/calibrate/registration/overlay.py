@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.core.geometry import Mesh
+from services.core.page import page_template
 from services.core.raw.registration import Registration
 from services.core.store import write_atomic
 
@@ -54,22 +54,24 @@ def write_overlay(
 
 def report_page(record: Registration) -> str:
     """An HTML page of the record and its pictures, which lie beside it."""
-    rows = "".join(
-        f"<tr><td>{escape(step.name)}</td><td>{step.points}</td><td>{step.residual_mm:.3f}</td>"
-        f"<td>{escape(', '.join(f'{name} {value:.2f}' for name, value in step.residual_px.items()))}</td>"
-        f"<td>{_errors(step.covariance)}</td><td>{escape('; '.join(step.left_out))}</td></tr>"
+    rows = [
+        {
+            "name": step.name,
+            "points": step.points,
+            "residual_mm": f"{step.residual_mm:.3f}",
+            "residual_px": ", ".join(f"{name} {value:.2f}" for name, value in step.residual_px.items()),
+            "errors": _errors(step.covariance),
+            "left_out": "; ".join(step.left_out),
+        }
         for step in record.steps
-    )
-    pictures = "".join(f'<p><img src="{escape(name)}" alt="{escape(name)}"></p>' for name in record.pictures)
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Registration</title>'
-        "<style>body{font-family:sans-serif;margin:2em}td,th{padding:.2em .8em;text-align:left}img{max-width:100%}</style>"
-        f"<h1>Registration</h1><p>Teeth {', '.join(map(str, record.teeth))}. {escape(record.repairs)}</p>"
-        f"<p>Median distance of the teeth's outlines from those in the photographs: {record.misfit_mm:.3f} mm.</p>"
-        "<table><tr><th>step</th><th>points</th><th>residual, mm</th><th>residual, px</th><th>standard errors</th>"
-        f"<th>left out</th></tr>{rows}</table>"
-        "<p>Outlines: orange after landmarks, green after outlines. Rings: clicks; dots: where the scan has them.</p>"
-        f"{pictures}</html>\n"
+    ]
+    template = page_template(Path(__file__).parent / "registration.html.j2")
+    return template.render(
+        teeth=", ".join(map(str, record.teeth)),
+        repairs=record.repairs,
+        misfit_mm=f"{record.misfit_mm:.3f}",
+        rows=rows,
+        pictures=record.pictures,
     )
 
 

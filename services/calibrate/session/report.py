@@ -18,6 +18,7 @@ from services.calibrate.session.drawings import (
     uncertainty_drawing,
 )
 from services.calibrate.session.run import Session
+from services.core.page import page_template
 from services.core.store import write_atomic
 
 REPORT = "report.html"
@@ -25,16 +26,14 @@ REPORT = "report.html"
 
 def write_report(session: Session, out: Path) -> None:
     """Write ``report.html`` into a folder."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((Path(__file__).parent / "report.html.j2").read_text(encoding="utf-8"))
+    template = page_template(Path(__file__).parent / "report.html.j2")
     judgement = session.judgement
     broken = len(judgement.broken)
     page = template.render(
         made=session.record.made,
         days=f"{session.record.valid_days:g}",
         verdict="All limits are kept." if not broken else f"{broken} of {len(judgement.limits)} limits are not kept.",
+        is_broken=broken > 0,
         advice=judgement.advice,
         suspicions=judgement.suspicions,
         limits=judgement.limits,

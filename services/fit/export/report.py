@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.page import page_template
 from services.core.results import Correlation, Estimate, Figure, FitReport, ToothReport
 from services.core.store import write_atomic
 from services.core.verdict import mean_figure, percent, verdict_of
@@ -30,9 +31,6 @@ from services.fit.export.pictures import (
     tone_map,
     white_level,
 )
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 PART_LABELS = {
     "enamel": "Enamel",
@@ -130,17 +128,6 @@ def write_report(
         provenance=_provenance(boundary, context),
     )
     write_atomic(path, page.encode())
-
-
-def page_template(path: Path) -> Template:
-    """A report's page with the style that all of them share."""
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
-    environment.globals["style"] = Markup(style)  # noqa: S704 - our own file
-    return environment.from_string(path.read_text(encoding="utf-8"))
 
 
 def _error_rows(errors: dict[str, float], ses: dict[str, float]) -> dict[str, Any] | None:

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.page import page_template
 from services.core.results import Estimate, Figure, Verdict
 from services.core.store import write_atomic
 from services.core.verdict import percent
 from services.fit.export.pictures import DIVERGING, data_uri, enlarge, signed_map, tone_map, white_level
-from services.fit.export.report import cell, gradient, page_template
+from services.fit.export.report import cell, gradient
 from services.fit.slab.results.chart import phase_chart
 from services.fit.slab.results.kept import Images
 from services.fit.slab.results.result import Quantity, SlabFit, SlabReport
