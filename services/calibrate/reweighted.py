@@ -16,7 +16,7 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 """As a share of each unknown's own curvature."""
 DAMPING_STEP = 10.0
 SMALL_DECREASE = 1e-9
-"""Of the cost, relative: a step that gains less moves every unknown by less than 5·10⁻⁵ of its ±."""
+"""Of the cost, relative: of R residuals of one σ a step that gains less moves no unknown by more than √(10⁻⁹ R) of its ±, 0.003 of 9,000."""
 
 
 def solve_reweighted(

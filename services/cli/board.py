@@ -1,4 +1,4 @@
-"""``dentine board``: boards and charts to print, as PDF to scale."""
+"""``dentine board``: boards to print, as PDF to scale."""
 
 from __future__ import annotations
 

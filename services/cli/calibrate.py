@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def calibrate_command(
     raw: Annotated[Path, typer.Argument(metavar="RAW", help="Folder with raw.toml and its frames.")],
     out: Annotated[Path, typer.Option(help="Folder of calibration.json, residuals.json and report.html.")],
-    valid_days: Annotated[float, typer.Option(min=1, help="After how many days the calibration is old.")] = 30.0,
+    valid_days: Annotated[float, typer.Option(min=1, help="For how many days the record says that it holds.")] = 30.0,
     against: Annotated[
         Path | None, typer.Option(help="An earlier calibration.json of this rig: tell what changed.")
     ] = None,

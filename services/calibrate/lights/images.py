@@ -51,7 +51,7 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
     height, width = grey.shape
     shrink = max(width / SEARCH_WIDTH, 1.0)
     small = cv2.resize(grey, (round(width / shrink), round(height / shrink)), interpolation=cv2.INTER_AREA)
-    # The bright end is cut at the median's tenfold, as highlights outshine every outline.
+    # The bright end is cut at four times the 60th percentile, as highlights outshine every outline.
     top = 4 * float(np.percentile(small, 60)) + 1e-12
     eight = np.clip(small / top * 255, 0, 255).astype(np.uint8)
     expected = float(eye.lens.values[0]) * radius_mm / distance_mm / shrink
@@ -75,7 +75,7 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
 def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
     """The centre (2,) in pixels of the brightest highlight within a sphere's outline, or None.
 
-    It is the mean place of the light above half of the peak, in the patch that holds the peak.
+    It is the mean place of the patch that is brighter than half of the peak and holds it, weighted by the light above a quarter.
     """
     import cv2
 

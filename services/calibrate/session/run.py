@@ -46,7 +46,7 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     Args:
         root: folder with ``raw.toml``.
         tell: is told each step as it begins.
-        valid_days: after how many days the calibration warns that it is old.
+        valid_days: for how many days the record says that it holds.
 
     Raises:
         CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
