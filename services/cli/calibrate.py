@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from services.calibrate.session.run import Session
+    from services.core.calibration.record import Calibration
 
 
 def calibrate_command(
@@ -23,24 +24,25 @@ def calibrate_command(
     """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status 9."""
     from services.calibrate.session.report import write_report
     from services.calibrate.session.run import calibrate, write_session
+    from services.core.calibration.record import Calibration
+    from services.core.store import read_record
 
+    earlier = None if against is None else read_record(against, Calibration)
     session = calibrate(raw, print, valid_days)
     write_session(session, out)
     write_report(session, out)
     _tell(session)
-    if against is not None:
-        _tell_drift(session, against)
+    if earlier is not None:
+        _tell_drift(session, earlier, against)
     print(f"calibration: {out / 'calibration.json'}, report: {out / 'report.html'}")
     if session.judgement.broken and not accept:
         raise typer.Exit(9)
 
 
-def _tell_drift(session: Session, against: Path) -> None:
+def _tell_drift(session: Session, earlier: Calibration, against: Path | None) -> None:
     from services.calibrate.session.drift import changes
-    from services.core.calibration.record import Calibration
-    from services.core.store import read_record
 
-    found = changes(read_record(against, Calibration), session.record)
+    found = changes(earlier, session.record)
     clear = [one for one in found if one.is_clear]
     print(f"against {against}: {len(clear)} of {len(found)} quantities changed beyond their errors")
     for one in clear:

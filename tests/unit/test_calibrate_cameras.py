@@ -213,6 +213,11 @@ def test_a_board_of_markers_that_opencv_lacks_is_refused() -> None:
         corners_on_board(charuco((5, 7), "DICT_9X9_1"))
 
 
+def test_a_board_of_more_markers_than_its_dictionary_has_is_refused() -> None:
+    with pytest.raises(CaptureInputError, match="shows 72 markers and dictionary DICT_4X4_50 has 50"):
+        corners_on_board(charuco((12, 12), "DICT_4X4_50"))
+
+
 def test_a_camera_that_shares_no_board_is_named() -> None:
     random = np.random.default_rng(7)
     rig = true_rig(random, n_places=6)

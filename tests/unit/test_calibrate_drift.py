@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from services.calibrate.cameras.rotations import rotation_matrix
 from services.calibrate.session.drift import changes
 from services.core.calibration.record import Calibration
+from services.core.errors import CaptureInputError
 
 LIGHTS = 1000 * np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0.5, 0.5, 0.7]])
 POSITION_SE_MM, GAIN_SE, FOCAL_SE = 1.5, 0.003, 2e-4
@@ -56,3 +57,9 @@ def test_what_changed_is_named_first() -> None:
 def test_without_errors_nothing_is_compared() -> None:
     silent = drawn(1).model_copy(update={"uncertainty": None})
     assert changes(silent, drawn(2)) == []
+
+
+def test_calibrations_of_other_channels_are_not_compared() -> None:
+    other = drawn(2).model_copy(update={"channels": ("green",)})
+    with pytest.raises(CaptureInputError, match="has channels green and this one grey"):
+        changes(other, drawn(1))

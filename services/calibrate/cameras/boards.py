@@ -44,7 +44,7 @@ def opencv_board(board: Board) -> Any:
     Of an ArUco board ``square_mm`` is the distance from one marker's edge to the next one's.
 
     Raises:
-        CaptureInputError: unknown dictionary.
+        CaptureInputError: unknown dictionary, or one with fewer markers than the board shows.
     """
     import cv2
 
@@ -55,6 +55,13 @@ def opencv_board(board: Board) -> Any:
             f"Board {board.name} names dictionary {board.dictionary}, which OpenCV lacks; it has {known}."
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
+    places = board.squares[0] * board.squares[1]
+    markers, known_markers = places if board.type == "aruco" else places // 2, len(dictionary.bytesList)
+    if markers > known_markers:
+        raise CaptureInputError(
+            f"Board {board.name} shows {markers} markers and dictionary {board.dictionary} has {known_markers}; "
+            "name a larger dictionary or fewer squares."
+        )
     if board.type == "aruco":
         return cv2.aruco.GridBoard(board.squares, board.marker_mm, board.square_mm - board.marker_mm, dictionary)
     made = cv2.aruco.CharucoBoard(board.squares, board.square_mm, board.marker_mm, dictionary)

@@ -38,13 +38,18 @@ def calibrate_colours(photos: Photos) -> ColourStep | None:
     """Each camera's way from channels to XYZ; None without charts or without three channels.
 
     Raises:
-        CaptureInputError: a chart that is not found, too bright, or without a reference.
+        CaptureInputError: a chart that is not found, too bright, or without a reference; frames of several charts.
     """
     frames = [frame for frame in photos.folder.frame if frame.kind == "chart"]
     if not frames or len(photos.folder.channels) != 3:
         return None
     charts = {chart.name: chart for chart in photos.folder.chart}
     fits, rgb = {}, {}
+    if other := next((frame for frame in frames if frame.chart != frames[0].chart), None):
+        raise CaptureInputError(
+            f"Frame {other.file} shows chart {other.chart} and frame {frames[0].file} chart {frames[0].chart}; "
+            "keep the frames of one chart in a session."
+        )
     xyz = read_reference(photos.root / charts[str(frames[0].chart)].reference, str(frames[0].chart))
     for camera in dict.fromkeys(frame.camera for frame in frames):
         mine = [frame for frame in frames if frame.camera == camera]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.calibration.record import Calibration
+from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 CLEAR_SIGMAS = 4.0
@@ -40,7 +41,16 @@ class Change:
 
 
 def changes(old: Calibration, new: Calibration) -> list[Change]:
-    """Changes of what both calibrations have with a ±, the clearest first."""
+    """Changes of what both calibrations have with a ±, the clearest first.
+
+    Raises:
+        CaptureInputError: they are of different channels.
+    """
+    if old.channels != new.channels:
+        raise CaptureInputError(
+            f"The earlier calibration has channels {', '.join(old.channels)} and this one {', '.join(new.channels)}; "
+            "compare calibrations of the same channels."
+        )
     found = [*_lenses(old, new), *_lights(old, new)]
     return sorted(found, key=lambda one: -abs(one.change) / one.se)
 

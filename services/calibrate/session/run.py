@@ -71,6 +71,9 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     tell("colours: charts")
     colours = calibrate_colours(photos)
     used = [root / DESCRIPTION, *(root / frame.file for frame in folder.frame if _is_used(frame.kind))]
+    used += [
+        root / chart.reference for chart in folder.chart if any(frame.chart == chart.name for frame in folder.frame)
+    ]
     inputs = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in used}
     made = datetime.now(UTC).isoformat(timespec="seconds")
     record = record_of(folder, photos.black, falls, cameras, lights, intensity, colours, made, valid_days, inputs)
