@@ -103,16 +103,31 @@ def test_every_name_that_is_imported_is_there() -> None:
 
 
 def names_bound_in(tree: ast.Module) -> set[str]:
-    """What a module defines, assigns or imports at any depth; a module with ``__getattr__`` may offer what its ``__all__`` lists."""
+    """What a module itself defines, assigns or imports; one with ``__getattr__`` may offer what its ``__all__`` lists besides."""
     bound: set[str] = set()
-    for node in ast.walk(tree):
+    nodes = list[ast.AST](tree.body)
+    while nodes:
+        node = nodes.pop()
         match node:
-            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-                bound.add(node.name)
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                bound.add(name)
+                # What is bound inside is not the module's.
+                continue
             case ast.Name(id=name, ctx=ast.Store()):
                 bound.add(name)
             case ast.Import() | ast.ImportFrom():
                 bound |= {alias.asname or alias.name for alias in node.names}
-            case ast.Constant(value=str(text)):
-                bound.add(text)
+        nodes += ast.iter_child_nodes(node)
+    if "__getattr__" in bound:
+        lists = (
+            one.value for one in tree.body if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]) == "__all__"
+        )
+        bound |= {name for listed in lists for name in ast.literal_eval(listed)}
     return bound
+
+
+def test_a_name_that_is_only_written_or_bound_inside_is_not_there() -> None:
+    """Nor does a list of names help a module that cannot make them."""
+    written = "if True:\n    there = 1\ndef made() -> None:\n    inside = 2\n'lost'\n__all__ = ['listed']\n"
+    assert names_bound_in(ast.parse(written)) == {"there", "made", "__all__"}
+    assert names_bound_in(ast.parse(written + "def __getattr__(name): ...\n")) >= {"listed"}

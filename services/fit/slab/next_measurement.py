@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabCamera, SlabFolder, SlabImage
 from services.fit.slab.bound import curvature_of
-from services.fit.slab.diagnosis import THICKEST, THINNEST
+from services.fit.slab.diagnosis import THINNEST
 from services.fit.slab.images import Measurements
 from services.fit.slab.model.dictionary import KNOTS, Material
 from services.fit.slab.model.forward import Blocks
 from services.fit.slab.model.rig import rig_of
-from services.fit.slab.solve.prior import precision
+from services.fit.slab.solve.prior import THICK, precision
 from services.fit.slab.solve.seen import seen_of
 from services.fit.slab.solve.uncertainty import phase_chain, slopes
 
@@ -105,10 +105,13 @@ def _percent(share: float) -> str:
 
 
 def candidates(folder: SlabFolder, wavelength_nm: float, material: Material) -> Iterator[Candidate]:
-    """Dilutions and cells within the range that images tell of, and a camera beside a beam where none is."""
+    """Dilutions and cells within the range in which a fit comes near its bound, and a camera beside a beam where none is.
+
+    Beyond ``THICK`` fits stay ten times above the bound, so that what it promises there would not come true.
+    """
     thickness, width_mm = material.extinction_per_mm * folder.cell.width_mm, folder.cell.width_mm
     for factor in FACTORS:
-        if THINNEST <= factor * thickness <= THICKEST:
+        if THINNEST <= factor * thickness <= THICK:
             how = f"dilute it {1 / factor:g}-fold" if factor < 1 else f"concentrate it {factor:g}-fold"
             yield Candidate(f"{how} and measure again beside these images", folder, factor)
             cell = folder.cell.model_copy(update={"width_mm": factor * width_mm})
