@@ -72,7 +72,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
     with monkeypatch.context() as patch:
         patch.setattr(workshop, "write_atomic", counted(workshop.write_atomic, after=False))
         patch.setattr(workshop, "write_array", counted(workshop.write_array, after=True))
-        patch.setattr(blocks, "_array", counted(blocks._array, after=False))
+        patch.setattr(workshop.Workshop, "array", counted(workshop.Workshop.array, after=False))
         patch.setattr(blocks, "write_picture", counted(blocks.write_picture, after=True))
         patch.setattr(StageWriter, "publish", counted(StageWriter.publish, after=False))
         yield

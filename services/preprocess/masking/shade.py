@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
@@ -124,7 +123,7 @@ def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: 
     bits = _read(workshop, view, "valid", light)
     bits = bits & ~np.uint16(MaskBit.SHADOW) | np.where(confidence >= SHADOWED, MaskBit.SHADOW, 0).astype(np.uint16)
     for name, values in (("valid", bits), ("shadow", np.rint(100 * confidence).astype(np.uint8))):
-        _array(workshop, name)[camera, light, view.window.rows, view.window.columns] = values
+        workshop.array(name)[camera, light, view.window.rows, view.window.columns] = values
     quality = done.quality
     picture = workshop.folder / "quality" / f"{quality.camera}_{quality.light}.png"
     write_picture(picture, _read(workshop, view, "radiance", light), bits)
@@ -150,8 +149,4 @@ def _finer(confidence: Image, step: int, covered: NDArray[np.bool_]) -> Image:
 
 
 def _read(workshop: Workshop, view: View, name: str, light: int) -> NDArray[Any]:
-    return np.asarray(_array(workshop, name)[view.number, light, view.window.rows, view.window.columns])
-
-
-def _array(workshop: Workshop, name: str) -> zarr.Array[Any]:
-    return zarr.open_array(workshop.folder / "prepared.zarr" / name, mode="r+")
+    return np.asarray(workshop.array(name)[view.number, light, view.window.rows, view.window.columns])

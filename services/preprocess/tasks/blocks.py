@@ -12,10 +12,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import zarr
 
 from services.core.records import JobSpec, MaskBit
 from services.core.stage import LocalContext
@@ -109,16 +108,12 @@ def images_of(block: Block, workshop: Workshop) -> Iterator[ImageDone]:
         yield done
 
 
-def _array(workshop: Workshop, name: str) -> zarr.Array[Any]:
-    return zarr.open_array(workshop.folder / "prepared.zarr" / name, mode="r+")
-
-
 def _look(workshop: Workshop, source: Source, subject: Subject, camera: int) -> None:
     """Find a camera's window and footprint; what has no image is said to be unlit."""
     whole = source.description.cameras[camera]
     view = subject.view_of(camera, whole)
     require_seen(view.footprint, len(subject.teeth), whole)
-    surface, valid = (_array(workshop, name) for name in ("surface", "valid"))
+    surface, valid = (workshop.array(name) for name in ("surface", "valid"))
     labels = np.full(surface.shape[1:], NOTHING, dtype=np.int16)
     labels[view.window.rows, view.window.columns] = view.footprint.mesh
     surface[camera] = labels
@@ -163,14 +158,14 @@ class Desk:
         """Write an image's arrays and its mask (H, W)."""
         place, window = (self.view.number, light), self.view.window
         for name, values in (("radiance", image.radiance), ("variance", image.variance)):
-            _array(self.workshop, name)[*place, window.rows, window.columns] = values
-        valid = _array(self.workshop, "valid")
+            self.workshop.array(name)[*place, window.rows, window.columns] = values
+        valid = self.workshop.array("valid")
         whole = np.full(valid.shape[2:], MaskBit.OUTSIDE, dtype=np.uint16)
         whole[window.rows, window.columns] = bits
         valid[place] = whole
         if image.displacement is None:
             return
-        motion = _array(self.workshop, "motion")
+        motion = self.workshop.array("motion")
         step = stored_step((valid.shape[2], valid.shape[3]))
         top, left = -(-window.top // step), -(-window.left // step)
         rows, columns = image.displacement.shape[:2]

@@ -17,9 +17,10 @@ import hashlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import zarr
 
 from services.core.geometry import Camera, Record
 from services.core.store import StageWriter, write_atomic, write_record
@@ -90,6 +91,10 @@ class Workshop:
     def end(self) -> None:
         """Remove what is not published."""
         shutil.rmtree(self.work, ignore_errors=True)
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """An array of the store being written."""
+        return zarr.open_array(self.folder / "prepared.zarr" / name, mode="r+")
 
     def scratch(self, camera: int) -> Path:
         """Folder of what a camera's blocks share."""
