@@ -85,6 +85,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             context.raise_if_cancelled()
         if spec.shadows:
             unshaded = [k for k, own in enumerate(lights) if not all(workshop.is_shaded(k, j) for j in own)]
+            progress.shade(len(unshaded))
             for _ in workers.run([Block(spec, workshop, "shade", k) for k in unshaded]):
                 context.raise_if_cancelled()
 

@@ -48,6 +48,10 @@ class Progress:
             )
             self._tell("log", f"Camera {quality.camera}, light {quality.light} has no valid pixel left ({reasons}).")
 
+    def shade(self, cameras: int) -> None:
+        """Shadows are to be looked for in the images of so many cameras."""
+        self._tell("log", f"Shadows are looked for in the images of {cameras} cameras.")
+
     def finish(self) -> None:
         """All is published."""
         message = f"{self._images} images are prepared."
