@@ -138,11 +138,12 @@ def shadow_confidence(
         response = np.where(tells, radiance / expected, np.nan)
     bright = expected >= rule.telling * np.where(tells, expected, 0).max(axis=0)
     brightness = _upper(np.where(bright, response, np.nan), rule.bright_quantile)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    # A value without any certainty has an infinite error, and its probability is one half
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         ratio = response / brightness
         error = np.sqrt(variance) / (expected * brightness)
-    ratio, error = np.where(tells, ratio, np.nan), np.where(tells, error, np.nan)
-    total = np.sqrt(rule.model_error**2 + error**2)
+        ratio, error = np.where(tells, ratio, np.nan), np.where(tells, error, np.nan)
+        total = np.sqrt(rule.model_error**2 + error**2)
     certain = ratio < rule.certain
     likely = ratio < rule.possible
     touched = np.stack([_touching(seeds, grown) for seeds, grown in zip(certain, likely, strict=True)])
