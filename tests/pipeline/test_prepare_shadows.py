@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 import zarr
 from numpy.typing import NDArray
 
@@ -14,6 +16,8 @@ from services.core.records import MaskBit
 from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.projection import project
 from services.preprocess.quality import QualityReport
+from services.preprocess.tasks.blocks import Block
+from services.preprocess.tasks.workshop import Workshop
 from tests.support.folder_captures import prepare
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 
@@ -66,6 +70,33 @@ def test_shadows_are_flagged_where_a_job_asks(tmp_path: Path) -> None:
     report = QualityReport.model_validate_json((tmp_path / "asked" / "prepared" / "quality.json").read_text())
     shares = {image.light: image.masked.get("shadow", 0.0) for image in report.images}
     assert max(shares, key=lambda light: shares[light]) == f"l{SHADED}"
+
+
+def test_shading_that_was_cut_off_is_done_again_on_another_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Dask runs a block again whose worker died after it had written an image's flags and before their record."""
+    (tmp_path / "capture").mkdir()
+    write_capture(tmp_path / "capture", lights=8)
+    kept = Block.__call__
+
+    def twice(block: Block) -> None:
+        if block.step == "shade":
+            with monkeypatch.context() as patch:
+                patch.setattr(Workshop, "files_of", Mock(side_effect=KeyboardInterrupt))
+                with pytest.raises(KeyboardInterrupt):
+                    kept(block)
+            assert [k for k in range(8) if block.workshop.image(0, k) is None]
+        kept(block)
+
+    monkeypatch.setattr(Block, "__call__", twice)
+    prepare(tmp_path / "capture", tmp_path / "cut_off", shadows=True)
+    monkeypatch.undo()
+    prepare(tmp_path / "capture", tmp_path / "whole", shadows=True)
+    assert shadows(tmp_path / "whole").any()
+    for path in (tmp_path / "whole" / "prepared").rglob("*"):
+        if path.is_file() and path.name != "manifest.json":
+            assert (tmp_path / "cut_off" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
 
 
 def test_few_lights_tell_of_no_shadow(tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ PIXEL_MM = 0.25
 MIN_LIGHTS = 6
 """With fewer lights most of a pixel's images may lie in shadow, and nothing says how bright it would be."""
 SHADOWED = 0.5
-"""A pixel is left out from this confidence on: it is then more likely shadowed than not."""
-NO_VALUE = np.uint16(MaskBit.HIGHLIGHT | MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.MOTION)
+"""A pixel is left out above this confidence: it is then more likely shadowed than not."""
+NO_VALUE = np.uint16(MaskBit.HIGHLIGHT | MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.MOTION | MaskBit.UNLIT)
 """Pixels whose brightness is not the tooth's."""
 
 
@@ -118,17 +118,19 @@ def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Im
 
 def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: int, confidence: Image) -> None:
     """Write one image's flags, confidence and picture, and say that it is done."""
-    done = workshop.image(camera, light)
+    # Where a worker died between the flags and the record, the files no longer have the record's sizes; all but flags is as it was
+    done = workshop.record(camera, light)
     assert done is not None, "images are stored before shadows are looked for"
     bits = _read(workshop, view, "valid", light)
-    bits = bits & ~np.uint16(MaskBit.SHADOW) | np.where(confidence >= SHADOWED, MaskBit.SHADOW, 0).astype(np.uint16)
+    bits = bits & ~np.uint16(MaskBit.SHADOW) | np.where(confidence > SHADOWED, MaskBit.SHADOW, 0).astype(np.uint16)
     for name, values in (("valid", bits), ("shadow", np.rint(100 * confidence).astype(np.uint8))):
         workshop.array(name)[camera, light, view.window.rows, view.window.columns] = values
     quality = done.quality
     picture = workshop.folder / "quality" / f"{quality.camera}_{quality.light}.png"
     write_picture(picture, _read(workshop, view, "radiance", light), bits)
+    covered, error_px = view.footprint.covered, quality.motion_error_px
     changed = {
-        "quality": assess(quality.camera, quality.light, bits, view.footprint.covered, quality.motion_px),
+        "quality": assess(quality.camera, quality.light, bits, covered, quality.motion_px, error_px),
         "tooth_pixels": tuple(subject.pixels_of_teeth(view.footprint, bits).tolist()),
         "files": workshop.files_of(camera, light, picture),
         "shaded": True,

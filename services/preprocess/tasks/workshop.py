@@ -133,7 +133,7 @@ class Workshop:
 
     def image(self, camera: int, light: int) -> ImageDone | None:
         """What was made of an image; None where it is not stored whole."""
-        done = _read(self.scratch(camera) / f"image-{light}.json", ImageDone)
+        done = self.record(camera, light)
         if done is None:
             return None
         sizes = {name: one.bytes for name, one in done.files.items()}
@@ -142,6 +142,10 @@ class Workshop:
             for name, size in sizes.items()
         )
         return done if is_whole else None
+
+    def record(self, camera: int, light: int) -> ImageDone | None:
+        """What was last said of an image, whether or not its files are still those."""
+        return _read(self.scratch(camera) / f"image-{light}.json", ImageDone)
 
     def is_shaded(self, camera: int, light: int) -> bool:
         """Whether an image is stored and shadows were looked for in it."""
