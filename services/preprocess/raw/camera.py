@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.errors import CaptureInputError
+from services.core.geometry import Record
 from services.core.raw.frames import read_counts
 from services.core.raw.mosaic import sites
 from services.core.raw.records import DARK, RawFolder, RawFrame
+from services.core.store import write_atomic
 from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
@@ -25,12 +27,25 @@ from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
 
+MEASURES = "measures.json"
+"""In the scratch folder of a camera."""
 FRAMES_MEASURED = 8
 """Black frames, and pairs of lit ones, that are looked at: more tell little more."""
 BRIGHT_BLACK = 0.25
 """Of full scale: a frame with a higher median is no black one."""
 PIXELS_MEASURED = 1_000_000
 """Of a frame, for its noise: they tell a variance to 0.14 %."""
+
+
+class Measures(Record):
+    """What the frames of a camera told, so that no other block of the same preparation has to measure it again."""
+
+    read_counts: float
+    counts_per_electron: float
+    relative: float
+    curve: tuple[float, float]
+    vignetting: tuple[float, float, float]
+    notes: tuple[str, ...]
 
 
 class CameraFrames:
@@ -42,13 +57,19 @@ class CameraFrames:
     """
 
     def __init__(
-        self, root: Path, folder: RawFolder, camera: CalibratedCamera, assumed_noise: tuple[float, float]
+        self,
+        root: Path,
+        folder: RawFolder,
+        camera: CalibratedCamera,
+        assumed_noise: tuple[float, float],
+        scratch: Path | None = None,
     ) -> None:
         """Measure what the frames tell.
 
         Args:
             camera: as calibrated.
             assumed_noise: fraction of the value, and of full scale, where neither frames nor calibration tell the noise.
+            scratch: folder in which what was measured is kept and looked for; None to measure it anew.
 
         Raises:
             CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the frame.
@@ -61,12 +82,39 @@ class CameraFrames:
         self._full = np.float32(np.inf if self.raw.full_counts is None else self.raw.full_counts)
         self._black_frames = folder.frames_of(camera.name, "black")
         self.linearity = Linearity(np.empty(0), (0.0, 0.0), float(self._full))
+        kept = None if scratch is None else scratch / MEASURES
+        if kept is not None and kept.is_file():
+            self._take(Measures.model_validate_json(kept.read_bytes()))
+        else:
+            self._measure(assumed_noise)
+            if kept is not None:
+                write_atomic(kept, self._measures().model_dump_json().encode())
+        self._ambient = self._measured_ambient()
+
+    def _measure(self, assumed_noise: tuple[float, float]) -> None:
         if not self._black_frames:
             self._require_black_of_calibration()
         self.noise = self._measured_noise(*assumed_noise)
         self.linearity = self._measured_linearity()
         self.lens = self._measured_lens()
-        self._ambient = self._measured_ambient()
+
+    def _measures(self) -> Measures:
+        noise = self.noise
+        return Measures(
+            read_counts=noise.read_counts,
+            counts_per_electron=noise.counts_per_electron,
+            relative=noise.relative,
+            curve=self.linearity.curve,
+            vignetting=self.lens.vignetting,
+            notes=tuple(self.notes),
+        )
+
+    def _take(self, told: Measures) -> None:
+        self.noise = NoiseModel(told.read_counts, told.counts_per_electron, told.relative)
+        # How far single blocks are off is told by the notes, and asked for nowhere else.
+        self.linearity = Linearity(np.empty(0), told.curve, float(self._full))
+        self.lens = Lens(self.calibrated, told.vignetting)
+        self.notes += told.notes
 
     def exposure(self, frame: RawFrame, region: Window | None = None) -> Exposure:
         """Counts of a frame above black, linear, without the room's own light; (H, W) of a mosaic, else (H, W, C).

@@ -86,7 +86,7 @@ class RawSource:
     def _raw_view(self, view: View) -> RawView:
         name = view.whole.name
         if name not in self._measured:
-            self._measured[name] = CameraFrames(self.root, self._folder, self._cameras[name], self._noise)
+            self._measured[name] = CameraFrames(self.root, self._folder, self._cameras[name], self._noise, view.scratch)
             self.notes += tuple(self._measured[name].notes)
         motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name))
         return RawView(self.root, self._measured[name], view, motion, self.description.channels)

@@ -6,7 +6,7 @@
       .prepared.<attempt>/      the store being written
       .prepared.work/
         plan.json               digest of all that the store depends on
-        <camera>/               footprint and black image as .npy, view.json, motion-<frame>.json, image-<light>.json
+        <camera>/               footprint and black image as .npy, view.json, measures.json, motion-<frame>.json, image-<light>.json
 
 A record is written last, once what it speaks of is on the disk, so a kill at any moment costs what was being made and nothing else.
 """
