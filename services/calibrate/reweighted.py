@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e8
 """As a share of each unknown's own curvature."""
 DAMPING_STEP = 10.0
 SMALL_DECREASE = 1e-9
@@ -45,12 +45,12 @@ def solve_reweighted(
         scaled = normal * np.outer(scale, scale)
         before, gained = _cost(off, huber), 0.0
         # More damping until a step gains; with the most none does, and the unknowns are as good as rounding lets them be.
-        while damping <= MOST_DAMPING:
+        while damping <= MAX_DAMPING:
             step = -scale * np.linalg.solve(scaled + damping * np.eye(len(values)), scale * side)
             tried = residuals(values + step)
             gained = before - _cost(tried, huber)
             if gained >= 0:
-                values, off, damping = values + step, tried, max(damping / DAMPING_STEP, LEAST_DAMPING)
+                values, off, damping = values + step, tried, max(damping / DAMPING_STEP, MIN_DAMPING)
                 break
             damping *= DAMPING_STEP
         if gained <= SMALL_DECREASE * before:

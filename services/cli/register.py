@@ -27,12 +27,12 @@ def register(
     ] = None,
 ) -> None:
     """Find where the teeth of a scan stand in the rig."""
-    from services.calibrate.registration.register import MOST_MISFIT_MM, PAGE, register_folder
+    from services.calibrate.registration.register import MAX_MISFIT_MM, PAGE, register_folder
     from services.core.files.folders import require_folder
 
     if out is not None:
         require_folder(out, "--out")
-    record = register_folder(raw, calibration, out, MOST_MISFIT_MM if max_misfit_mm is None else max_misfit_mm)
+    record = register_folder(raw, calibration, out, MAX_MISFIT_MM if max_misfit_mm is None else max_misfit_mm)
     for step in record.steps:
         print(f"{step.name}: {step.points} points, {step.residual_mm:.3f} mm in the median")
         for text in step.left_out:

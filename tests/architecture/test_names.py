@@ -131,3 +131,14 @@ def test_a_name_that_is_only_written_or_bound_inside_is_not_there() -> None:
     written = "if True:\n    there = 1\ndef made() -> None:\n    inside = 2\n'lost'\n__all__ = ['listed']\n"
     assert names_bound_in(ast.parse(written)) == {"there", "made", "__all__"}
     assert names_bound_in(ast.parse(written + "def __getattr__(name): ...\n")) >= {"listed"}
+
+
+def test_bounds_are_called_maximum_and_minimum() -> None:
+    """One pair of words for the bounds of the whole house, that of textbooks."""
+    others = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sources("services", "tests", "dentine")
+        for name in names_bound_in(ast.parse(path.read_text()))
+        if re.fullmatch(r"(MOST|LEAST)(_[A-Z0-9_]+)?", name)
+    }
+    assert others == set()

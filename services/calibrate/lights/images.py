@@ -28,7 +28,7 @@ MIN_EDGES = RAYS // 3
 INSIDE = 0.97
 """Part of the radius within which highlights are searched: nearer to the outline they are lines."""
 HALF = 0.5
-LEAST_CONTRAST = 8.0
+MIN_CONTRAST = 8.0
 """Of a highlight's peak over the sphere, in units of the sphere's own scatter."""
 
 
@@ -92,7 +92,7 @@ def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
     level = float(np.median(part[inside]))
     scatter = 1.4826 * float(np.median(np.abs(part[inside] - level)))
     peak = float(smooth[row, column]) - level
-    if peak <= LEAST_CONTRAST * max(scatter, 1e-12):
+    if peak <= MIN_CONTRAST * max(scatter, 1e-12):
         return None
     bright = (inside & (smooth - level > HALF * peak)).astype(np.uint8)
     _, labels = cv2.connectedComponents(bright)

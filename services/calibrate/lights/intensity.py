@@ -19,9 +19,9 @@ from services.calibrate.lights.mirror import Eye
 from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
-LEAST_COSINE_OF_LIGHT = 0.35
+MIN_COSINE_OF_LIGHT = 0.35
 """Beyond 70° light grazes: cos changes by a tenth within 2°, and no paint is Lambertian there."""
-LEAST_COSINE_OF_VIEW = 0.5
+MIN_COSINE_OF_VIEW = 0.5
 """Of the angle to the camera: towards the outline pixels mix with the background."""
 MIN_PIXELS = 50
 MIN_PLACES_FOR_A_LOBE = 3
@@ -93,7 +93,7 @@ def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> 
     distance = np.linalg.norm(to_light, axis=1)
     cosine = (normals * to_light).sum(axis=1) / distance
     view = -(normals * rays).sum(axis=1)
-    usable = (inside > 0) & (cosine > LEAST_COSINE_OF_LIGHT) & (view > LEAST_COSINE_OF_VIEW)
+    usable = (inside > 0) & (cosine > MIN_COSINE_OF_LIGHT) & (view > MIN_COSINE_OF_VIEW)
     return np.asarray(cosine / (np.pi * distance**2)), np.asarray(usable)
 
 

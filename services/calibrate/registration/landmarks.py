@@ -23,9 +23,9 @@ FAR = 4.0
 """Standard errors from which on a click counts as wrong: one in 3,000 good ones in two dimensions."""
 DRAWS = 60
 """Triples: with a third of the clicks wrong, 60 hold a right one but for 1 in 10^9."""
-LEAST = 4
+MIN_CLICKS = 4
 """Clicks that are needed: three leave up to four poses, and no way to see a wrong one."""
-LEAST_POINTS = 3
+MIN_POINTS = 3
 """Landmarks in several cameras from which a start follows: three points fix a rigid pose."""
 PARALLEL = 1e4
 """Condition of the normal equations of lines of sight above which they are too parallel to meet anywhere."""
@@ -33,7 +33,8 @@ FLAT = 1e-3
 """Spread of points across their line, relative to that along it and squared, below which the turn about it is open."""
 TRIED = 12
 """Starts that are refined over all cameras."""
-MOST_WRONG = 1 / 3
+MAX_WRONG_SHARE = 1 / 3
+"""Of the clicks; with more of them wrong, another pose may have as many that agree."""
 ROUNDS = 30
 CONVERGED = 1e-9
 
@@ -80,9 +81,9 @@ def fit_landmarks(
         CaptureInputError: too few clicks for any pose.
     """
     most = max((sum(one.camera == name for one in clicks) for name in cameras), default=0)
-    if most < LEAST:
+    if most < MIN_CLICKS:
         raise CaptureInputError(
-            f"No camera sees {LEAST} landmarks of the scan (the most are {most}); add [[landmark]] entries to raw.toml, "
+            f"No camera sees {MIN_CLICKS} landmarks of the scan (the most are {most}); add [[landmark]] entries to raw.toml, "
             "spread over the arch."
         )
     starts = list(_starts(cameras, clicks))
@@ -105,11 +106,11 @@ def fit_landmarks(
         if (good == kept).all():
             break
         kept = good
-        if np.count_nonzero(kept) < LEAST:
+        if np.count_nonzero(kept) < MIN_CLICKS:
             break
     error = _errors(cameras, clicks, pose, click_mm)
     wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
-    is_believed = len(wrong) <= MOST_WRONG * len(clicks) and np.count_nonzero(kept) >= LEAST
+    is_believed = len(wrong) <= MAX_WRONG_SHARE * len(clicks) and np.count_nonzero(kept) >= MIN_CLICKS
     told = tuple(f"{one.name} in camera {one.camera}, {_offset_px(cameras, one, pose):.0f} px off" for one in wrong)
     residual_px = {
         name: float(
@@ -158,11 +159,11 @@ def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tup
 
 def _starts_from_points(scan_mm: Floats, rig_mm: Floats) -> Iterator[RigidPose]:
     # The rotation and move between points (Kabsch 1976), from all of them and from drawn triples.
-    if len(scan_mm) < LEAST_POINTS:
+    if len(scan_mm) < MIN_POINTS:
         return
     rng = np.random.default_rng(0)
-    draws = [rng.choice(len(scan_mm), LEAST_POINTS, replace=False) for _ in range(DRAWS)]
-    for chosen in [np.arange(len(scan_mm)), *(draws if len(scan_mm) > LEAST_POINTS else [])]:
+    draws = [rng.choice(len(scan_mm), MIN_POINTS, replace=False) for _ in range(DRAWS)]
+    for chosen in [np.arange(len(scan_mm)), *(draws if len(scan_mm) > MIN_POINTS else [])]:
         one, two = scan_mm[chosen], rig_mm[chosen]
         left, size, right = np.linalg.svd((two - two.mean(axis=0)).T @ (one - one.mean(axis=0)))
         if size[1] > FLAT * size[0]:
@@ -177,10 +178,10 @@ def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[
     rng = np.random.default_rng(0)
     for name, camera in cameras.items():
         own = [one for one in clicks if one.camera == name]
-        if len(own) < LEAST:
+        if len(own) < MIN_CLICKS:
             continue
         points, pixels = np.array([one.point_mm for one in own]), np.array([one.pixel for one in own])
-        draws = [rng.choice(len(own), LEAST, replace=False) for _ in range(DRAWS)] if len(own) > LEAST else []
+        draws = [rng.choice(len(own), MIN_CLICKS, replace=False) for _ in range(DRAWS)] if len(own) > MIN_CLICKS else []
         world_from_camera = np.linalg.inv(np.asarray(camera.camera_from_world))
         for chosen in [np.arange(len(own)), *draws]:
             try:

@@ -27,13 +27,13 @@ CLEAR = 0.25
 """Share of the strong edges' strength (their 90th percentile) that an edge needs to be taken for one."""
 TUKEY = 4.685
 """Standard errors beyond which a point counts nothing (Tukey's biweight at 95 % efficiency)."""
-LEAST_SPREAD_PX = 0.15
+MIN_SPREAD_PX = 0.15
 OTHER_TOOTH = 0.5
 """Likeness to tooth beyond an outline from which on another tooth is taken to be there."""
 BETWEEN_WEIGHT = 0.25
 """Of a border between teeth: its dark line lies beside either tooth's edge by a width that nobody knows."""
 ROUNDS = 12
-LEAST_FOUND = 0.3
+MIN_FOUND = 0.3
 """Share of the outlines' points that must find an edge; lips and retractor hide some."""
 SECTORS = 6
 """Parts of a tooth's outline whose errors are taken to be of one piece, for the covariance."""
@@ -208,7 +208,7 @@ def _equations(camera: Camera, found: Found, centre_mm: Floats) -> tuple[Floats,
     across = np.einsum("nk,nkj->nj", contour.outward, pixel_derivatives(camera, contour.points_mm, centre_mm))
     residual = np.where(found.is_found, found.offset_px, 0.0)
     seen = np.abs(residual[found.is_found])
-    spread = max(1.4826 * float(np.median(seen)) if len(seen) else LEAST_SPREAD_PX, LEAST_SPREAD_PX)
+    spread = max(1.4826 * float(np.median(seen)) if len(seen) else MIN_SPREAD_PX, MIN_SPREAD_PX)
     far = np.clip(np.abs(residual) / (TUKEY * spread), 0, 1)
     weight = found.is_found * (1 - far**2) ** 2 * np.where(contour.between, BETWEEN_WEIGHT, 1.0) / spread**2
     return across, residual, weight, spread
@@ -236,7 +236,7 @@ def _sandwich(
 
 def _require_edges(found: Sequence[Found]) -> None:
     total, seen = sum(len(one.is_found) for one in found), sum(int(one.is_found.sum()) for one in found)
-    if total == 0 or seen < LEAST_FOUND * total:
+    if total == 0 or seen < MIN_FOUND * total:
         share = 0.0 if total == 0 else seen / total
         raise CaptureInputError(
             f"Only {share:.0%} of the teeth's outlines are seen as edges in the photographs; see in the overlay pictures whether "

@@ -27,7 +27,7 @@ CUT_PX = 700
 """Width of the part around the teeth in which outlines are looked for: 0.1 mm a pixel, and edges are found to a fraction of it."""
 MARGIN_MM = 4.0
 """Around the teeth in that part."""
-MOST_LIGHTS = 12
+MAX_LIGHTS = 12
 """Frames of single lights that are averaged where no frame has all of them on."""
 
 
@@ -132,7 +132,7 @@ def _lens(camera: CalibratedCamera) -> Lens:
 
 
 def _some(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
-    count = min(len(frames), MOST_LIGHTS)
+    count = min(len(frames), MAX_LIGHTS)
     return [frames[k * len(frames) // count] for k in range(count)]
 
 

@@ -31,7 +31,7 @@ FARTHEST_LANDMARK_MM = 2.0
 """Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre apart."""
 REACH_MM = 1.5
 """How far outlines are looked for at first: clicks leave a pose open by less."""
-MOST_MISFIT_MM = 0.10
+MAX_MISFIT_MM = 0.10
 """Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.06 mm in a
 calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
 
@@ -56,7 +56,7 @@ def register_folder(
     root: Path,
     calibration_file: Path | None = None,
     out: Path | None = None,
-    max_misfit_mm: float = MOST_MISFIT_MM,
+    max_misfit_mm: float = MAX_MISFIT_MM,
 ) -> Registration:
     """Register the scan of a raw folder and write teeth, gums, record, pictures and page.
 
@@ -147,11 +147,11 @@ def _require_agreement(contradiction: str | None) -> None:
         raise CaptureInputError(contradiction)
 
 
-def _require_small(misfit_mm: float, most_mm: float) -> None:
-    if misfit_mm > most_mm:
+def _require_small(misfit_mm: float, max_mm: float) -> None:
+    if misfit_mm > max_mm:
         raise CaptureInputError(
             f"The scan's teeth lie {misfit_mm:.2f} mm from the photographs' outlines in the median, more than "
-            f"{most_mm:g} mm; see whether the scan is of this person and as the teeth are now, and whether the "
+            f"{max_mm:g} mm; see whether the scan is of this person and as the teeth are now, and whether the "
             "calibration is this rig's."
         )
 

@@ -11,7 +11,7 @@ from services.core.errors import CaptureInputError
 Floats = NDArray[np.float64]
 CELLS = 48
 """Means of so many cells across an image: noise is averaged, and the fall of light is smooth."""
-LEAST_LIGHT = 0.05
+MIN_LIGHT = 0.05
 """Of the middle's light, below which an image's corner is no photograph of an even source through this lens."""
 
 
@@ -54,7 +54,7 @@ def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, flo
         products.append(answer[1:] / answer[0])
     a, b, c = (float(one) for one in np.mean(products, axis=0))
     edge = np.linspace(0, max(float(q.max()) for q, _ in rows), 50)
-    if (1 + edge * (a + edge * (b + edge * c))).min() < LEAST_LIGHT:
+    if (1 + edge * (a + edge * (b + edge * c))).min() < MIN_LIGHT:
         raise CaptureInputError(
             f"Camera {camera}'s flat frames fall to nothing at the image's edge; photograph an even source that fills the view."
         )

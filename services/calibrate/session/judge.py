@@ -19,7 +19,7 @@ from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
 GRID = (8, 6)
-MOST_EDGE_SHIFT_PX = 1.0
+MAX_EDGE_SHIFT_PX = 1.0
 """Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
 FEW_PLACES = 8
 
@@ -129,7 +129,7 @@ def _suspicions(folder: RawFolder, cameras: CamerasStep, lights: LightsStep | No
         return
     fit, names = lights.fit, [light.name for light in folder.light]
     for number, shift in enumerate(fit.edge_shifts_px):
-        if abs(shift) > MOST_EDGE_SHIFT_PX:
+        if abs(shift) > MAX_EDGE_SHIFT_PX:
             yield (
                 f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
                 "measure the sphere's radius_mm and the board's square_mm again."

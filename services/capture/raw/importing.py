@@ -26,7 +26,7 @@ LOOKED_AT = 8
 """Frames of a camera that are read to tell its bits."""
 MIN_TRACKING = 4
 """A smooth motion is followed from four frames on."""
-MOST_NAMED = 5
+MAX_NAMED = 5
 Entry = dict[str, Any]
 _THINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -186,7 +186,7 @@ def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
         if len(folder.frames_of(name, "tracking")) < MIN_TRACKING:
             yield f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed less well."
         if lacking := sorted(str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}):
-            shown = ", ".join(lacking[:MOST_NAMED]) + (" and more" if len(lacking) > MOST_NAMED else "")
+            shown = ", ".join(lacking[:MAX_NAMED]) + (" and more" if len(lacking) > MAX_NAMED else "")
             yield f"Camera {name} has no frame of light {shown}, which another camera has."
     if not lit:
         yield "No frame shows teeth under a light (kind light)."

@@ -21,7 +21,7 @@ SOURCES = {
     "unfinished": "unfinished",
 }
 """Sources of a ± as the report heads them."""
-LEAST_SHARE = 0.005
+MIN_SHARE = 0.005
 """Smaller shares of a squared ± are not shown."""
 
 
@@ -37,7 +37,7 @@ def source_tables(
     tables = []
     for channel, table in report.parameters.items():
         shown = {name: one for name, one in table.items() if leading(name) and one.se and one.se_parts}
-        present = [name for name in SOURCES if any(_share(one, name) >= LEAST_SHARE for one in shown.values())]
+        present = [name for name in SOURCES if any(_share(one, name) >= MIN_SHARE for one in shown.values())]
         rows = [(label(name), [_percent(_share(one, source)) for source in present]) for name, one in shown.items()]
         if rows:
             tables.append({"channel": channel, "labels": [SOURCES[name] for name in present], "rows": rows})
@@ -70,4 +70,4 @@ def _share(estimate: Estimate, source: str) -> float:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= LEAST_SHARE else ""
+    return f"{100 * share:.0f} %" if share >= MIN_SHARE else ""

@@ -19,7 +19,7 @@ from services.fit.slab.model.forward import Block, Blocks, BlockSums
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.kept import fingerprint, keep, read_kept
 
-MOST_TRAVELLING_BYTES = 32 * 2**20
+MAX_TRAVELLING_BYTES = 32 * 2**20
 """Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones stay where they are."""
 
 
@@ -101,7 +101,7 @@ def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
 def _may_travel(folder: SlabFolder) -> bool:
     """Whether a block's sums are small enough to leave their worker."""
     values = len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (KNOTS + 2)
-    return 8 * values <= MOST_TRAVELLING_BYTES
+    return 8 * values <= MAX_TRAVELLING_BYTES
 
 
 def _raise_if_cancelled(flag: Path) -> None:
