@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.raw.merge import Exposure, merge
+from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance
 from services.preprocess.raw.lens import Lens, Sampler, fitted_vignetting
-from services.preprocess.raw.merge import Exposure, merge
-from services.preprocess.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
 from services.preprocess.raw.response import Series, measure_linearity
 from services.preprocess.window import Window
 from tests.support.raw_sensor import Sensor, taken_through

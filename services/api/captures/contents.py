@@ -114,10 +114,9 @@ def _slab_fault(name: str, folder: SlabFolder, limits: UploadLimits, names: froz
     if folder.pixels.columns * folder.pixels.rows * _SLAB_PIXEL_BYTES > limits.largest_image_bytes:
         size = f"{folder.pixels.columns} x {folder.pixels.rows}"
         return f"{name} has images of {size} pixels, more than {limits.largest_image_bytes} bytes; bin them."
-    for image in folder.images:
-        for file in (image.file, image.variance_file):
-            if file is not None and str(PurePosixPath(file)) not in names:
-                return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
+    for file in folder.files():
+        if str(PurePosixPath(file)) not in names:
+            return f"{name} names image file {file}, which is not among the files; add it or remove its entry."
     return None
 
 

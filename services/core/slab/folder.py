@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Name, Record
+from services.core.slab.exposures import SlabExposure, exposures_fault
 from services.core.store import read_record
 
 Positive = Annotated[float, Field(gt=0)]
@@ -48,7 +49,11 @@ class Beam(Record):
     profile: Literal["gaussian", "disc"]
     sigma_mm: Positive | None = None
     radius_mm: Positive | None = None
-    power: Positive = Field(default=1.0, description="before any Fresnel loss; images are given per unit of it")
+    power: Positive = Field(
+        default=1.0,
+        description="before any Fresnel loss; images are given per unit of it, exposures are divided by it, so there it is what the camera "
+        "would count of the whole beam: counts per s at gain 1, mm2 and sr",
+    )
 
     @model_validator(mode="after")
     def _size_of_its_profile(self) -> Beam:
@@ -127,7 +132,8 @@ class SlabFolder(Record):
     pixels: PixelGrid
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
     cameras: Annotated[tuple[SlabCamera, ...], Field(min_length=1)]
-    images: Annotated[tuple[SlabImage, ...], Field(min_length=1)]
+    images: tuple[SlabImage, ...] = ()
+    exposures: tuple[SlabExposure, ...] = Field(default=(), description="counts in place of images")
     through_beam: tuple[ThroughBeam, ...] = ()
 
     @model_validator(mode="after")
@@ -137,8 +143,12 @@ class SlabFolder(Record):
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
         self._require_index()
+        if bool(self.images) == bool(self.exposures):
+            raise ValueError("a slab folder lists either images or exposures; give one of both")
+        if fault := exposures_fault(self.exposures, self.wavelengths_nm):
+            raise ValueError(fault)
         seen: set[tuple[str, str, float]] = set()
-        for image in self.images:
+        for image in self._entries():
             self._require_known(image)
             key = image.camera, image.light, self.wavelength_of(image)
             if key in seen:
@@ -180,6 +190,30 @@ class SlabFolder(Record):
                 f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or correct it"
             )
 
+    def _entries(self) -> tuple[SlabImage, ...]:
+        """The images, or one for all exposures of a camera under a light, whose file is the first of theirs."""
+        first: dict[tuple[Name, Name | None, float | None], SlabImage] = {}
+        for one in self.exposures:
+            if one.light is not None:
+                entry = SlabImage(camera=one.camera, light=one.light, wavelength_nm=one.wavelength_nm, file=one.file)
+                first.setdefault((one.camera, one.light, one.wavelength_nm), entry)
+        return self.images or tuple(first.values())
+
+    def images_at(self, wavelength_nm: float) -> tuple[SlabImage, ...]:
+        """The images of one wavelength in the folder's order; of exposures one for each camera under each light."""
+        return tuple(image for image in self._entries() if self.wavelength_of(image) == wavelength_nm)
+
+    def exposures_at(self, wavelength_nm: float) -> tuple[SlabExposure, ...]:
+        """The exposures of one wavelength, and the black ones that hold for all."""
+        return tuple(one for one in self.exposures if one.holds_at(wavelength_nm, self.wavelengths_nm))
+
+    def files(self, wavelength_nm: float | None = None) -> tuple[str, ...]:
+        """Every file that is named, of one wavelength or of all."""
+        chosen = self.wavelengths_nm if wavelength_nm is None else (wavelength_nm,)
+        images = [image for image in self.images if self.wavelength_of(image) in chosen]
+        named = [file for image in images for file in (image.file, image.variance_file) if file is not None]
+        return (*named, *dict.fromkeys(one.file for nm in chosen for one in self.exposures_at(nm)))
+
     def wavelength_of(self, image: SlabImage) -> float:
         """The image's wavelength, nm."""
         return self.wavelengths_nm[0] if image.wavelength_nm is None else image.wavelength_nm
@@ -193,14 +227,9 @@ def read_folder(root: Path) -> SlabFolder:
     """
     origin = root / "slab.json"
     folder = read_record(origin, SlabFolder)
-    for image in folder.images:
-        for file in (image.file, image.variance_file):
-            if file is None:
-                continue
-            if not (root / file).resolve().is_relative_to(root.resolve()):
-                raise CaptureInputError(f"Image file {file} lies outside the slab folder {root}; put it inside.")
-            if not (root / file).is_file():
-                raise CaptureInputError(
-                    f"Image file {root / file} (camera {image.camera}, light {image.light}) does not exist; put it there or remove its entry."
-                )
+    for file in folder.files():
+        if not (root / file).resolve().is_relative_to(root.resolve()):
+            raise CaptureInputError(f"Image file {file} lies outside the slab folder {root}; put it inside.")
+        if not (root / file).is_file():
+            raise CaptureInputError(f"Image file {root / file} does not exist; put it there or remove its entry.")
     return folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder, SlabImage
 from services.fit.slab.diagnosis import grid_faults, image_faults
+from services.fit.slab.exposures import merged_images
 from services.fit.slab.model.rig import Grid, grid_of
 
 Array = NDArray[np.float64]
@@ -43,15 +45,14 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         CaptureInputError: a file cannot be read, has another shape, or is not finite.
     """
     grid = grid_of(folder.pixels)
-    entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
+    entries = folder.images_at(wavelength_nm)
     if not entries:
         raise CaptureInputError(
             f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength."
         )
-    values, variances, faults = [], [], list(grid_faults(folder.pixels))
-    for entry in entries:
-        image = _read(root, folder, entry, entry.file)
-        variance = shot_noise(image) if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
+    values, variances, faults, assumed = [], [], list(grid_faults(folder.pixels)), False
+    for entry, image, own in _linear(root, folder, wavelength_nm):
+        variance, assumed = (shot_noise(image), True) if own is None else (own, assumed)
         usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
         if not usable.any():
             raise CaptureInputError(
@@ -66,8 +67,22 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
     return Measurements(
         np.stack(values), np.stack(variances), held_out, tuple(f"{entry.camera} under {entry.light}" for entry in entries),
-        any(entry.variance_file is None for entry in entries), tuple(faults),
+        assumed, tuple(faults),
     )  # fmt: skip
+
+
+def _linear(root: Path, folder: SlabFolder, wavelength_nm: float) -> Iterator[tuple[SlabImage, Array, Array | None]]:
+    """Each image with its variance, None where that has to be assumed; exposures are merged."""
+    entries = folder.images_at(wavelength_nm)
+    if folder.exposures:
+        merged = merged_images(root, folder, wavelength_nm)
+        for entry in entries:
+            key = entry.camera, entry.light
+            yield entry, merged.values[key], None if merged.variances is None else merged.variances[key]
+        return
+    for entry in entries:
+        variance = None if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
+        yield entry, _read(root, folder, entry, entry.file), variance
 
 
 def shot_noise(image: Array, share: float = DEFAULT_NOISE) -> Array:

@@ -140,7 +140,7 @@ def errors_of(material: Material, covariance: Array) -> dict[str, float]:
 
 def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None:
     """All images of one more camera beside the through-beam of the first light; None where one looks there already."""
-    entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
+    entries = folder.images_at(wavelength_nm)
     lights = {light.name: light for light in folder.lights}
     cameras = {camera.name: camera for camera in folder.cameras}
     for image in entries:
@@ -158,7 +158,7 @@ def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None
         )
         for one in dict.fromkeys(image.light for image in entries)
     )
-    other = folder.model_copy(update={"cameras": (*folder.cameras, more), "images": images})
+    other = folder.model_copy(update={"cameras": (*folder.cameras, more), "images": images, "exposures": ()})
     words = f"add a camera at the {side} at {angle_deg:g} degrees, {BESIDE_DEG:g} degrees beside the beam of light {first.name}"
     return Candidate(words, other)
 

@@ -14,14 +14,14 @@ from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 from services.core.raw.frames import read_counts
+from services.core.raw.merge import Exposure, merge
 from services.core.raw.mosaic import sites
+from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
 from services.core.raw.records import DARK, RawFolder, RawFrame
 from services.core.store import write_atomic
 from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
-from services.preprocess.raw.merge import Exposure, merge
-from services.preprocess.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
 from services.preprocess.window import Window
 

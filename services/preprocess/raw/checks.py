@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
+from services.core.raw.merge import Exposure
 from services.core.raw.records import RawFolder, RawFrame
 from services.preprocess.colours import FrameColour
-from services.preprocess.raw.merge import Exposure
 
 Image = NDArray[np.float32]
 

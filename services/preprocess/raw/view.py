@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.raw.merge import Exposure, merge
 from services.core.raw.records import RawFrame
 from services.core.records import MaskBit
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance, spoiled
 from services.preprocess.raw.lens import Sampler
-from services.preprocess.raw.merge import Exposure, merge
 from services.preprocess.rig import STILL_PX, UNCERTAIN_PX
 from services.preprocess.source import Image, LightImage, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion

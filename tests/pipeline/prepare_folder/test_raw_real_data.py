@@ -15,9 +15,9 @@ import tifffile
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.raw.folder import read_raw_folder
+from services.core.raw.merge import merge
 from services.core.raw.mosaic import sites
 from services.preprocess.raw.camera import CameraFrames
-from services.preprocess.raw.merge import merge
 from tests.support.raw_folders import write_toml
 from tests.support.shared_data import shared_path
 

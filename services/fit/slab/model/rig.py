@@ -92,7 +92,7 @@ def rig_of(folder: SlabFolder, wavelength_nm: float, index: float | None = None)
     interface = interface_of(folder.cell, index)
     grid = grid_of(folder.pixels)
     cameras = {camera.name: camera for camera in folder.cameras}
-    entries = [image for image in folder.images if folder.wavelength_of(image) == wavelength_nm]
+    entries = folder.images_at(wavelength_nm)
     views = []
     for light in folder.lights:
         seen = [(number, cameras[image.camera]) for number, image in enumerate(entries) if image.light == light.name]

@@ -50,14 +50,17 @@ def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     # Options at these defaults are left out, so that what earlier versions kept is taken.
     later = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
     told = options.model_dump_json(exclude=later)
-    for part in (numerics_name(), folder.model_dump_json(), told, f"{wavelength_nm:g}"):
+    # So are exposures where there are none.
+    described = folder.model_dump_json(exclude=None if folder.exposures else {"exposures"})
+    for part in (numerics_name(), described, told, f"{wavelength_nm:g}"):
         digest.update(part.encode() + b"\n")
     if options.dictionary == "table":
         digest.update(hashlib.sha256(table_file(root).read_bytes()).digest())
-    for image in folder.images:
-        if folder.wavelength_of(image) == wavelength_nm:
-            for file in (image.file, image.variance_file):
-                digest.update(b"none" if file is None else hashlib.sha256((root / file).read_bytes()).digest())
+    for image in folder.images_at(wavelength_nm) if folder.images else ():
+        for file in (image.file, image.variance_file):
+            digest.update(b"none" if file is None else hashlib.sha256((root / file).read_bytes()).digest())
+    for exposure in folder.exposures_at(wavelength_nm):
+        digest.update(hashlib.sha256((root / exposure.file).read_bytes()).digest())
     return digest.hexdigest()
 
 

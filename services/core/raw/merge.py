@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.preprocess.raw.noise import NoiseModel
+from services.core.raw.noise import NoiseModel
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]

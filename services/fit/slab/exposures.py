@@ -1,0 +1,157 @@
+"""Exposures of one wavelength to linear images with their variances, merged as those of all raw cameras are.
+
+A camera's noise is measured from its own frames: read noise from black frames of one exposure, counts per electron from pairs of
+frames of one light. Light and camera stand still, so two different exposures are a pair as well as two alike are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError
+from services.core.raw.frames import read_counts
+from services.core.raw.merge import Exposure, merge
+from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
+from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
+from services.core.slab.exposures import SlabExposure
+from services.core.slab.folder import SlabFolder, SlabImage
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.float32]
+
+ASSUMED = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
+"""By which exposures are weighed where no frames tell the noise; variances are then assumed as for images that come without."""
+ABOVE_BLACK = 5.0
+"""Standard errors of its mean by which a frame must be brighter than black, or it was taken with the beam off."""
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Images by camera and light (rows, columns), per unit of the beam's power; NaN where every exposure is full."""
+
+    values: dict[tuple[str, str], Array]
+    variances: dict[tuple[str, str], Array] | None
+    """None where the frames do not tell the noise."""
+
+
+def merged_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Merged:
+    """Merge all exposures of one wavelength.
+
+    Raises:
+        CaptureInputError: a frame cannot be read, does not fit what is said of it, or holds no light; names it.
+    """
+    frames = folder.exposures_at(wavelength_nm)
+    values: dict[tuple[str, str], Array] = {}
+    variances: dict[tuple[str, str], Array] = {}
+    is_known = True
+    for camera in dict.fromkeys(one.camera for one in frames):
+        stack = _Stack(root, folder, tuple(one for one in frames if one.camera == camera))
+        noise = stack.noise()
+        is_known &= noise is not None
+        for image in folder.images_at(wavelength_nm):
+            if image.camera == camera:
+                rate, variance, lost = merge(stack.exposures_of(image, noise or ASSUMED), noise or ASSUMED)
+                key = camera, image.light
+                values[key] = np.where(lost, np.nan, rate.astype(np.float64)) / folder.beam.power
+                variances[key] = np.where(lost, np.nan, variance.astype(np.float64)) / folder.beam.power**2
+    return Merged(values, variances if is_known else None)
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """All frames of one camera at one wavelength."""
+
+    root: Path
+    folder: SlabFolder
+    frames: tuple[SlabExposure, ...]
+
+    def counts(self, frame: SlabExposure) -> Counts:
+        """Counts of a frame (rows, columns)."""
+        pixels = self.folder.pixels
+        camera = RawCamera(
+            name=frame.camera,
+            size=(pixels.columns, pixels.rows),
+            bits=frame.bits,
+            saturation_counts=frame.saturation_counts,
+            channels=("light",),
+        )
+        lights = () if frame.light is None else (RawLight(name=frame.light),)
+        raw = RawFrame(
+            camera=frame.camera, file=frame.file, kind=frame.kind, light=frame.light, exposure_s=frame.exposure_s,
+            gain=frame.gain,
+        )  # fmt: skip
+        described = RawFolder(units="mm", camera=(camera,), light=lights, frame=(raw,))
+        return read_counts(self.root, described, raw)[..., 0].astype(np.float32)
+
+    def black(self, frame: SlabExposure) -> tuple[Counts, int]:
+        """Mean of the black frames nearest in gain, then in exposure, and their number."""
+        black = [one for one in self.frames if one.kind == "black"]
+        nearest = min(black, key=lambda one: (abs(np.log(one.gain / frame.gain)), _times_apart(one, frame)))
+        own = [one for one in black if (one.gain, one.exposure_s) == (nearest.gain, nearest.exposure_s)]
+        return np.mean([self.counts(one) for one in own], axis=0, dtype=np.float32), len(own)
+
+    def exposure(self, frame: SlabExposure, noise: NoiseModel) -> Exposure:
+        """A frame's counts above black."""
+        counts, (black, averaged) = self.counts(frame), self.black(frame)
+        full = frame.saturation_counts if frame.bits is None else frame.saturation_counts or 2**frame.bits - 1
+        assert full is not None
+        of_black = float(noise.variance(np.zeros((), np.float32), frame.gain)) / averaged
+        return Exposure(
+            counts - black, of_black, np.float32(full) - counts, frame.exposure_s * frame.gain, frame.gain
+        )  # fmt: skip
+
+    def exposures_of(self, image: SlabImage, noise: NoiseModel) -> list[Exposure]:
+        """All of a light, each brighter than black."""
+        found = []
+        for frame in (one for one in self.frames if one.light == image.light):
+            exposure = self.exposure(frame, noise)
+            spread = float(np.std(exposure.signal)) / np.sqrt(exposure.signal.size)
+            if float(np.mean(exposure.signal)) <= ABOVE_BLACK * spread:
+                raise CaptureInputError(
+                    f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than the camera's black "
+                    "frames; expose it for longer, or leave it out."
+                )
+            found.append(exposure)
+        return found
+
+    def noise(self) -> NoiseModel | None:
+        """Of the camera, from its frames; None where they do not tell."""
+        read = self._read_counts()
+        measured = shot_noise(self._pairs(), read)
+        return None if measured is None else NoiseModel(measured[1], measured[0])
+
+    def _read_counts(self) -> float | None:
+        black = sorted((one for one in self.frames if one.kind == "black"), key=_setting)
+        squares, weights = [], []
+        for (_, gain), own in groupby(black, key=_setting):
+            counts = [self.counts(one) for one in own]
+            if (read := read_noise(counts, gain)) is not None:
+                squares.append(read**2)
+                weights.append(len(counts) - 1)
+        return float(np.sqrt(np.average(squares, weights=weights))) if squares else None
+
+    def _pairs(self) -> Iterator[LitPair]:
+        lit = sorted((one for one in self.frames if one.light is not None), key=lambda one: (one.light or "", one.gain))
+        for _, own in groupby(lit, key=lambda one: (one.light, one.gain)):
+            for first, second in pairwise(sorted(own, key=_setting)):
+                a, b = (self._above_black(one) for one in (first, second))
+                yield LitPair(a, b, first.gain)
+
+    def _above_black(self, frame: SlabExposure) -> Counts:
+        """NaN where full."""
+        exposure = self.exposure(frame, NoiseModel(0.0, 0.0))
+        return np.where(exposure.headroom > 0, exposure.signal, np.float32(np.nan)).astype(np.float32)
+
+
+def _setting(frame: SlabExposure) -> tuple[float, float]:
+    return frame.exposure_s, frame.gain
+
+
+def _times_apart(first: SlabExposure, second: SlabExposure) -> float:
+    return float(abs(np.log(first.exposure_s / second.exposure_s)))

@@ -1,0 +1,159 @@
+"""Stacks of exposures in a slab's folder, by a camera whose numbers are known: what is read of them, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.api.captures.contents import content_fault
+from services.core.errors import CaptureInputError
+from services.core.settings import UploadLimits
+from services.core.slab.folder import read_folder
+from services.fit.slab.images import read_images
+from services.fit.slab.model.rig import rig_of
+from services.fit.slab.options import SlabOptions
+from services.fit.slab.results.kept import fingerprint
+from tests.support.raw_sensor import Sensor
+from tests.support.small_slab import WAVELENGTH_NM, description
+
+EDGE = 48
+POWER = 250.0
+"""What the camera would count of the whole beam: exposures are divided by it."""
+TIMES_S = (0.05, 0.4, 3.2)
+SENSOR = Sensor()
+"""12 bits; full at 4095 counts, with 64 of black."""
+EXPOSURE = {"exposure_s": 1.0, "bits": 12}
+
+
+def radiance() -> np.ndarray:
+    """From 2 to 20,000 counts per s above black, so that the longest exposure is full near the middle and the shortest dark beside it."""
+    x, y = np.meshgrid(*2 * [np.linspace(-4, 4, EDGE)])
+    return np.asarray(2 + 20_000 * np.exp(-2 * np.hypot(x, y)))
+
+
+def write_stack(root: Path, *, blacks: int = 4, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
+    """A folder of two cameras and two lights in three exposures, and black frames."""
+    told, rng, noise = description(), np.random.default_rng(3), radiance()[..., None]
+    told["pixels"] |= {"columns": EDGE, "rows": EDGE}
+    told["beam"]["power"] = POWER
+    told["exposures"] = []
+    for image in told.pop("images"):
+        for number, time_s in enumerate(TIMES_S):
+            file = image["file"].replace(".npy", f"_{number}.npy")
+            np.save(root / file, SENSOR.counts(noise, time_s, rng)[..., 0])
+            told["exposures"].append(image | EXPOSURE | {"file": file, "exposure_s": time_s})
+    for camera in ("f0", "b0"):
+        for number in range(blacks):
+            file = f"{camera}_black_{number}.npy"
+            np.save(root / file, SENSOR.counts(0 * noise, 1.0, rng)[..., 0])
+            told["exposures"].append(EXPOSURE | {"camera": camera, "kind": "black", "file": file})
+    change(told)
+    (root / "slab.json").write_text(json.dumps(told))
+    return root
+
+
+def test_exposures_become_one_image_with_the_noise_that_it_has(tmp_path: Path) -> None:
+    root = write_stack(tmp_path)
+    measured = read_images(root, read_folder(root), WAVELENGTH_NM)
+    assert not measured.assumed_noise
+    assert measured.names == ("f0 under l0", "b0 under l0", "f0 under l1", "b0 under l1")
+    true = radiance()[EDGE // 2 :].ravel() / POWER  # symmetric in y, as the fold expects
+    z = (measured.values - true) / np.sqrt(measured.variances)
+    # 4,608 values: the rms of as many normal ones is 1 within 0.011, and the measured noise model is known to 2 %.
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=0.05)
+    assert abs(z.mean()) < 5 / np.sqrt(z.size)
+    # The brightest pixels are seen by the shortest exposure alone, the dark ones by the longest better than by it: 64 times the light.
+    dark = true * POWER < 5
+    alone = np.sqrt((2.0**2 + 0.5 * true * POWER * TIMES_S[0]) / 2) / TIMES_S[0] / POWER
+    assert (np.sqrt(measured.variances[0])[dark] < 0.05 * alone[dark]).all()
+    assert np.isfinite(measured.variances).all()
+
+
+def test_pixels_that_are_full_in_all_exposures_count_for_nothing(tmp_path: Path) -> None:
+    root = write_stack(tmp_path, change=lambda d: [one.update(saturation_counts=300) for one in d["exposures"]])
+    measured = read_images(root, read_folder(root), WAVELENGTH_NM)
+    lost = np.isinf(measured.variances[0])
+    bright = radiance()[EDGE // 2 :].ravel() * TIMES_S[0] > 300 - SENSOR.black
+    # Noise decides of pixels within a few of its standard deviations.
+    assert abs(int(lost.sum()) - int(bright.sum())) <= 4
+    assert lost.any()
+    assert np.isfinite(measured.values).all()
+
+
+def test_without_noise_that_frames_tell_it_is_assumed(tmp_path: Path) -> None:
+    def first_alone(told: dict[str, Any]) -> None:
+        told["exposures"] = [one for one in told["exposures"] if "_0.npy" in one["file"]]
+
+    root = write_stack(tmp_path, change=first_alone)
+    assert read_images(root, read_folder(root), WAVELENGTH_NM).assumed_noise
+
+
+def test_a_result_is_of_all_frames_it_was_made_from(tmp_path: Path) -> None:
+    root = write_stack(tmp_path)
+    before = fingerprint(root, WAVELENGTH_NM, SlabOptions())
+    frame = np.load(root / "b0_black_3.npy")
+    frame[0, 0] += 1
+    np.save(root / "b0_black_3.npy", frame)
+    assert fingerprint(root, WAVELENGTH_NM, SlabOptions()) != before
+
+
+def test_an_upload_needs_every_frame(tmp_path: Path) -> None:
+    path = write_stack(tmp_path) / "slab.json"
+    files = frozenset(one.name for one in tmp_path.glob("*.npy"))
+    assert content_fault(path, "slab.json", UploadLimits(), files) is None
+    told = content_fault(path, "slab.json", UploadLimits(), files - {"f0_black_0.npy"})
+    assert told is not None
+    assert "f0_black_0.npy" in told
+
+
+def test_black_frames_of_another_wavelength_do_not_count(tmp_path: Path) -> None:
+    def of_two(told: dict[str, Any]) -> None:
+        told["wavelengths_nm"] = [532.0, 633.0]
+        for one in told["exposures"]:
+            one["wavelength_nm"] = 532.0
+        told["exposures"].append(told["exposures"][0] | {"file": "red.npy", "wavelength_nm": 633.0})
+
+    root = write_stack(tmp_path, change=of_two)
+    with pytest.raises(CaptureInputError, match="no black exposure, so the zero of red"):
+        read_folder(root)
+
+
+def blacks(told: dict[str, Any]) -> list[dict[str, Any]]:
+    return [one for one in told["exposures"] if one.get("kind") == "black"]
+
+
+BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "images too": (lambda d: d.update(description()), "either images or exposures"),
+    "no black": (lambda d: [d["exposures"].remove(one) for one in blacks(d)], "camera f0 has no black exposure"),
+    "lit black": (lambda d: blacks(d)[0].update(light="l0"), "has no light on"),
+    "light not named": (lambda d: d["exposures"][0].pop("light"), "must name its light"),
+    "not said when full": (lambda d: d["exposures"][0].pop("bits"), "give bits or saturation_counts"),
+    "fuller than full": (lambda d: d["exposures"][0].update(saturation_counts=5000), "more than 12 bits hold"),
+    "the same file twice": (lambda d: d["exposures"].append(d["exposures"][0]), "is listed in two exposures"),
+    "no time": (lambda d: d["exposures"][0].update(exposure_s=0), "exposure_s"),
+    "unknown light": (lambda d: d["exposures"][0].update(light="x"), "names light x"),
+    "unknown wavelength": (lambda d: d["exposures"][0].update(wavelength_nm=700), "wavelength_nm 700"),
+    "a missing frame": (lambda d: d["exposures"][-1].update(file="gone.npy"), "gone.npy does not exist"),
+    "fewer bits": (lambda d: d["exposures"][2].update(bits=8), "more than the 8 bits"),
+    "black as a light": (lambda d: d["exposures"][2].update(file="f0_black_1.npy") or d["exposures"].remove(blacks(d)[1]), "no brighter than"),
+    "another size": (lambda d: d["pixels"].update(columns=EDGE // 2), "export it at the camera's size"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_exposures_are_refused_by_a_sentence(tmp_path: Path, name: str) -> None:
+    change, told = BAD[name]
+    root = write_stack(tmp_path, change=change)
+    with pytest.raises(CaptureInputError) as refused:
+        read_images(root, read_folder(root), WAVELENGTH_NM)
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_rig_has_one_image_for_each_camera_under_each_light(tmp_path: Path) -> None:
+    assert rig_of(read_folder(write_stack(tmp_path)), WAVELENGTH_NM).images == 4
