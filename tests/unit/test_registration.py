@@ -7,9 +7,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from services.calibrate.registration.appearance import learn_appearance
 from services.calibrate.registration.contours import tooth_contours
 from services.calibrate.registration.landmarks import CLICK_MM, Click, pose_from_landmarks
-from services.calibrate.registration.outlines import pose_from_outlines
+from services.calibrate.registration.outlines import View, pose_from_outlines
 from services.calibrate.registration.pose import RigidPose, pixel_derivatives
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Mesh
@@ -135,7 +136,11 @@ def test_a_spheres_outline_is_where_geometry_has_it() -> None:
 def test_outlines_bring_a_phantom_within_the_target() -> None:
     mouth = photographed_mouth(None, 1)
     start = pose_from_landmarks(mouth.cameras, clicks_on(mouth, np.random.default_rng(1)), mouth.centre_mm)
-    found = pose_from_outlines(mouth.views, mouth.teeth, [mouth.gums], start, mouth.centre_mm)
+    # A camera that sees no tooth at all changes nothing and is told.
+    views = (*mouth.views, turned_away(mouth.views[0]))
+    found = pose_from_outlines(views, mouth.teeth, [mouth.gums], start, mouth.centre_mm)
+    assert found.left_out[-1] == "camera away, which sees no tooth at this pose"
+    assert set(found.residual_px) == set(mouth.cameras)
     centre = mouth.rig_from_scan.apply(mouth.centre_mm[None])[0]
     twist = found.pose.twist_to(mouth.rig_from_scan, centre)
     # The target of the design: 0.2 mm alone cost 3 to 5 % of an image.
@@ -144,6 +149,24 @@ def test_outlines_bring_a_phantom_within_the_target() -> None:
     assert (np.sqrt(np.diag(found.covariance))[3:] < 0.05).all()
     # From clicks alone it is not reached.
     assert np.linalg.norm(start.pose.twist_to(mouth.rig_from_scan, centre)[3:]) > 0.05
+
+
+def turned_away(view: View) -> View:
+    pose = np.diag([-1.0, 1, -1, 1]) @ np.asarray(view.camera.camera_from_world)
+    fields = view.camera.model_dump() | {"name": "away", "camera_from_world": tuple(map(tuple, pose.tolist()))}
+    return View(Camera.model_validate(fields), view.image)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 8])
+def test_a_tooth_is_told_from_gums_by_any_number_of_channels(channels: int) -> None:
+    rng, tooth = np.random.default_rng(5), np.zeros((80, 90), dtype=bool)
+    tooth[20:60, 25:65] = True
+    colour = np.where(tooth[..., None], np.linspace(0.8, 0.6, channels), np.linspace(0.5, 0.2, channels))
+    image = (colour * (1 + rng.normal(0, 0.02, colour.shape))).astype(np.float32)
+    likeness = learn_appearance(image, tooth).likeness
+    # Colours 15 standard deviations of the noise apart; pixels beside the outline are smoothed over it.
+    assert likeness[25:55, 30:60].min() > 0.9
+    assert likeness[:15].max() < 0.1
 
 
 @pytest.mark.parametrize(("view", "limit_px"), [("frontal", 4.0), ("upper", 3.0)])

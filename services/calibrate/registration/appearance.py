@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ SMOOTH_BINS = 1.0
 INSIDE_PX, BAND_PX = 3, 25
 """Pixels this far inside an outline teach what tooth is; those from as far outside to this far, what it is not."""
 SMOOTH_PX = 1.0
+MAX_CHANNELS = 3
+"""Of a camera with more, neighbouring ones are averaged: the features' joint histogram grows as the power of their number."""
 FLOOR = 1e-3
 """Of the brightest pixels, added before the logarithm: darker ones are noise."""
 
@@ -44,6 +47,9 @@ def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_
     distance_in = cv2.distanceTransform(tooth.astype(np.uint8), cv2.DIST_L2, 5)
     distance_out = cv2.distanceTransform((~tooth).astype(np.uint8), cv2.DIST_L2, 5)
     inside, outside = distance_in > inner, (distance_out > inner) & (distance_out < outer)
+    if not inside.any() or not outside.any():
+        # No tooth is seen, or nothing else: every pixel is as likely, and no outline is found here.
+        return Appearance(np.full(tooth.shape, 0.5, dtype=np.float32), np.zeros(tooth.shape, dtype=np.float32))
     low, high = np.percentile(features[inside | outside], [1, 99], axis=0)
     index = np.clip((features - low) / np.maximum(high - low, 1e-6) * BINS, 0, BINS - 1).astype(np.int64)
     flat = np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), (BINS,) * features.shape[-1])
@@ -58,8 +64,9 @@ def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_
 def _features(image: NDArray[np.float32]) -> Floats:
     # Logarithms: brightness, and the ratios of neighbouring channels, which shading does not change.
     bright = np.percentile(image, 99)
-    logs = np.log(np.maximum(image, 0) + FLOOR * bright)
-    ratios = [logs[..., k] - logs[..., k + 1] for k in range(image.shape[-1] - 1)]
+    groups = np.array_split(np.maximum(image, 0), min(image.shape[-1], MAX_CHANNELS), axis=-1)
+    logs = [np.log(group.mean(axis=-1) + FLOOR * bright) for group in groups]
+    ratios = [one - two for one, two in itertools.pairwise(logs)]
     return np.stack([np.log(np.maximum(image, 0).mean(axis=-1) + FLOOR * bright), *ratios], axis=-1).astype(np.float64)
 
 

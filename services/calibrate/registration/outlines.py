@@ -120,6 +120,8 @@ def pose_from_outlines(
     residual_mm = float(np.mean([px * size for px, size in zip(apart.values(), sizes, strict=True)]))
     missing = [
         f"{1 - one.is_found.mean():.0%} of the outlines in camera {view.camera.name}"
+        if len(one.is_found)
+        else f"camera {view.camera.name}, which sees no tooth at this pose"
         for view, one in zip(views, found, strict=True)
     ]
     return PoseStep(
@@ -164,6 +166,8 @@ def _thinned(contour: Contour) -> Contour:
 def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Found:
     import cv2
 
+    if len(contour.pixels) == 0:
+        return Found(contour, np.zeros(0), np.zeros(0, dtype=bool))
     # Samples along each point's line, some more at both ends for the differences.
     steps = np.arange(-np.ceil(reach_px / STEP_PX), np.ceil(reach_px / STEP_PX) + 1) * STEP_PX
     padded = np.concatenate([steps[0] - STEP_PX * np.arange(4, 0, -1), steps, steps[-1] + STEP_PX * np.arange(1, 5)])
