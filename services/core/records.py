@@ -168,7 +168,10 @@ class JobSpec(Record):
     rig: RigSpec | None = Field(default=None, description="rig to capture with; give this or capture")
     calibration: Path | None = Field(
         default=None,
-        description="file with cameras and lights that stand in for the capture's own, or calibrations/<id>",
+        description="file with cameras and lights that stand in for the capture's own, or calibrations/<name>",
+    )
+    accept_calibration: bool = Field(
+        default=False, description="use a calibration also where it is beyond the limits that it was held to"
     )
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
-from services.core.calibration.record import published_capture, recalibrated
+import numpy as np
+
+from services.core.calibration.record import Calibration, lit_at, published_capture, recalibrated
+from services.core.calibration.state import broken_limits, require_within_limits, warning_of_age
+from services.core.files.meshes import read_teeth
 from services.core.raw.folder import is_raw_folder
 from services.core.records import CaptureManifest, JobSpec
-from services.core.store import open_stage
+from services.core.store import open_stage, read_record
 from services.preprocess.folder import FolderSource
 from services.preprocess.raw.source import RawSource
 from services.preprocess.rig import RigSource
@@ -21,19 +26,37 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
         verify: compare a published capture's files with their checksums first.
 
     Raises:
-        CaptureInputError: it cannot be read, or contradicts itself. StoreError: a published capture is damaged.
+        CaptureInputError: it cannot be read, contradicts itself, or its calibration is beyond its limits. StoreError: a published capture is damaged.
     """
     if spec.capture is not None and is_raw_folder(spec.capture):
-        return RawSource(spec.capture, spec.calibration, spec.sensor_noise_relative, spec.sensor_noise_floor)
+        raw = RawSource(spec.capture, spec.calibration, spec.sensor_noise_relative, spec.sensor_noise_floor)
+        return _calibrated(raw, raw.calibration, "of the raw folder" if spec.calibration is None else "", spec)
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
     if published is not None:
         source: FolderSource | RigSource = RigSource(*open_stage(*published, CaptureManifest, verify=verify))
     else:
         assert spec.capture is not None
         source = FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)
-    if spec.calibration is not None:
-        source.description = recalibrated(source.description, spec.calibration)
-        source.notes += (
-            f"Cameras and lights are those of calibration {spec.calibration.stem}, not the capture's own.",
-        )
+    if spec.calibration is None:
+        return source
+    calibration = read_record(spec.calibration, Calibration)
+    source.description = recalibrated(source.description, calibration, spec.calibration)
+    source.notes += (f"Cameras and lights are those of calibration {spec.calibration.stem}, not the capture's own.",)
+    return _calibrated(source, calibration, "", spec)
+
+
+def _calibrated(
+    source: FolderSource | RigSource | RawSource, calibration: Calibration, name: str, spec: JobSpec
+) -> Source:
+    """The source with what its calibration says of itself, and of its lights at the teeth."""
+    name = name or (spec.calibration.stem if spec.calibration is not None else "")
+    require_within_limits(calibration, name, accepted=spec.accept_calibration)
+    if (old := warning_of_age(calibration, name, time.time())) is not None:
+        source.notes += (old,)
+    if broken := broken_limits(calibration):
+        source.notes += (f"Calibration {name} was accepted beyond its limits: {broken[0]}.",)
+    if any(light.lobe is not None for light in calibration.lights):
+        vertices = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(source.root)])
+        x, y, z = (float(one) for one in vertices.mean(axis=0))
+        source.description = lit_at(source.description, (x, y, z))
     return source

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from services.api.app import create_app
 from services.client.client import Client
 from services.client.errors import UnknownCalibrationError
 from services.core.errors import CaptureInputError
+from services.core.files.meshes import read_teeth
 from services.core.records import JobSpec, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
@@ -151,6 +153,62 @@ def test_a_calibration_of_another_rig_is_refused(
     (tmp_path / "other.json").write_text(json.dumps(calibration))
     with pytest.raises(CaptureInputError, match=named):
         stage.run(JobSpec(capture=mouth, calibration=tmp_path / "other.json"), LocalContext(tmp_path / "job"))
+
+
+OLD = {"made": "2020-01-01T00:00:00+00:00", "valid_days": 30}
+BEYOND = {"limits": [{"what": "scatter of corners, camera c0", "value": 1.5, "limit": 1.0, "unit": "px"}]}
+
+
+def test_a_job_names_a_calibration_by_name_and_keeps_its_content(
+    client: httpx.Client, mouth: Path, calibration: dict[str, Any]
+) -> None:
+    option = client.put("/v1/calibrations/by-name", json=calibration).json()["option"]
+    job = client.post("/v1/jobs", json={"capture": str(mouth), "calibration": "calibrations/by-name"}).json()
+    assert job["spec"]["calibration"] == option
+
+
+def test_a_calibration_beyond_its_limits_is_refused_unless_told_otherwise(
+    client: httpx.Client, mouth: Path, calibration: dict[str, Any]
+) -> None:
+    listed = client.put("/v1/calibrations/beyond", json=calibration | BEYOND).json()
+    assert listed["state"] == "beyond its limits"
+    job = {"capture": str(mouth), "calibration": "calibrations/beyond"}
+    answer = client.post("/v1/jobs", json=job)
+    assert (answer.status_code, answer.json()["code"]) == (422, "bad-settings")
+    told = "Calibration beyond is beyond its limits: scatter of corners, camera c0 is 1.5 px, and 1 px is the limit"
+    assert told in answer.json()["detail"]
+    accepted = client.post("/v1/jobs", json=job | {"accept_calibration": True})
+    assert accepted.status_code == 201
+
+
+def test_an_old_calibration_is_shown_as_old_and_told_by_the_preparation(
+    client: httpx.Client, tmp_path: Path, mouth: Path, calibration: dict[str, Any]
+) -> None:
+    assert client.put("/v1/calibrations/old", json=calibration | OLD).json()["state"] == "old"
+    listed = {entry["name"]: entry["state"] for entry in client.get("/v1/calibrations").json()}
+    assert listed["old"] == "old"
+    (tmp_path / "rig.json").write_text(json.dumps(calibration | OLD | BEYOND))
+    spec = JobSpec(capture=mouth, calibration=tmp_path / "rig.json", accept_calibration=True)
+    stage.run(spec, LocalContext(tmp_path / "job"))
+    notes = open_stage(tmp_path / "job", "prepared", PreparedManifest)[1].notes
+    assert any("days old and was made to hold for 30" in note for note in notes)
+    assert any("was accepted beyond its limits: scatter of corners" in note for note in notes)
+    with pytest.raises(CaptureInputError, match="Calibration rig is beyond its limits"):
+        stage.run(spec.model_copy(update={"accept_calibration": False}), LocalContext(tmp_path / "other"))
+
+
+def test_a_lobe_is_evaluated_at_the_teeth(tmp_path: Path, mouth: Path, calibration: dict[str, Any]) -> None:
+    light = calibration["lights"][1]
+    off = np.array([0.6, 0.0, 0.8])
+    calibration["lights"][1] = light | {"lobe": {"axis": off.tolist(), "exponent": 2.0}}
+    (tmp_path / "rig.json").write_text(json.dumps(calibration))
+    spec = JobSpec(capture=mouth, calibration=tmp_path / "rig.json")
+    stage.run(spec, LocalContext(tmp_path / "job"))
+    prepared = open_stage(tmp_path / "job", "prepared", PreparedManifest)[1].lights[1]
+    teeth = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(mouth)]).mean(axis=0)
+    towards = teeth - np.array(light["position_mm"])
+    cosine = towards @ off / np.linalg.norm(towards)
+    assert prepared.intensity == pytest.approx([cosine**2 * one for one in light["intensity"]])
 
 
 def test_the_command_line_names_a_stored_calibration(

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from services.calibrate.cameras.printing import board_pdf, board_rectangles
 from services.calibrate.session.flats import fall_of_light, relative_square
 from services.calibrate.session.judge import judge
-from services.calibrate.session.photos import Channels, Photos
+from services.calibrate.session.photos import Channels, Photos, black_of
 from services.calibrate.session.record import uncertainty_of
 from services.calibrate.session.report import write_report
 from services.calibrate.session.run import Session, calibrate, write_session
@@ -239,3 +239,15 @@ def test_the_fall_of_light_is_that_of_the_lens() -> None:
 def test_a_bad_flat_field_is_named(fall: tuple[float, float, float], saturated: bool, named: str) -> None:
     with pytest.raises(CaptureInputError, match=named):
         fall_of_light(cast("Photos", EvenPhotos(fall, saturated)), "c0", np.array([205.0, 148.0]))
+
+
+def test_black_frames_tell_their_noise_without_the_sensors_pattern() -> None:
+    random = np.random.default_rng(2)
+    pattern = random.normal(0, 10, (60, 80, 1))
+    frames = [np.round(64 + pattern + random.normal(0, 2, (60, 80, 3))).astype(np.uint16) for _ in range(5)]
+    black = black_of(iter(frames))
+    # 14,400 values, four degrees of freedom each: the standard error of the noise is 2 / √(2 · 57,600) = 0.006.
+    assert black.noise == pytest.approx(2, abs=0.03)
+    assert black.counts == pytest.approx(np.mean(frames), abs=1e-3)
+    # One frame cannot tell pattern from noise, so both are told.
+    assert black_of(iter(frames[:1])).noise == pytest.approx(104**0.5, rel=0.03)

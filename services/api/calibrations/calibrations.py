@@ -22,6 +22,7 @@ from pydantic import Field
 
 from services.client.errors import CalibrationTakenError, UnknownCalibrationError
 from services.core.calibration.record import Calibration, require_consistent
+from services.core.calibration.state import CalibrationState, broken_limits, refusal, state_of
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP, LOCAL_VIEWER, Viewer
@@ -34,13 +35,26 @@ NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}"
 _ID = re.compile(r"[0-9a-f]{64}")
 
 
-class NamedCalibration(Record):
-    """A calibration as it is listed."""
+class StoredName(Record):
+    """What a name means, as it is stored."""
 
     name: str
     id: str = Field(description="SHA-256 of its content: the same for the same cameras, lights and channels")
     created_s: float = Field(description="Unix time")
     owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
+    made: str | None = Field(default=None, description="when it was calibrated, ISO 8601; null where it does not say")
+    valid_days: float | None = Field(default=None, description="for how long it holds from then")
+    broken: tuple[str, ...] | None = Field(
+        default=None, description="limits that it does not keep, in words; null where it was held to none"
+    )
+
+
+class NamedCalibration(StoredName):
+    """A calibration as it is listed."""
+
+    state: CalibrationState = Field(
+        description="good, old (beyond its valid_days), beyond its limits (jobs refuse it unless they accept_calibration), or not known"
+    )
 
 
 class CalibrationDetail(NamedCalibration):
@@ -72,25 +86,30 @@ class Calibrations:
         """
         require_consistent(calibration, f"Calibration {name}")
         content = (calibration.model_dump_json(indent=1) + "\n").encode()
-        entry = NamedCalibration(
-            name=name, id=hashlib.sha256(content).hexdigest(), created_s=self._now_s(), owner=viewer.owner
+        entry = StoredName(
+            name=name,
+            id=hashlib.sha256(content).hexdigest(),
+            created_s=self._now_s(),
+            owner=viewer.owner,
+            made=calibration.made,
+            valid_days=calibration.valid_days,
+            broken=broken_limits(calibration),
         )
         names = self._names(viewer.owner)
         names.mkdir(parents=True, exist_ok=True)
         if not self._content(entry.id).exists():
             write_atomic(self._content(entry.id), content)
         is_new = self._take_name(entry)
-        known = entry if is_new else read_record(names / f"{name}.json", NamedCalibration)
+        known = entry if is_new else read_record(names / f"{name}.json", StoredName)
         if known.id != entry.id:
             raise CalibrationTakenError(
                 f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date."
             )
-        return CalibrationCreation(_detail(known, calibration), is_new)
+        return CalibrationCreation(self._detail(known, calibration), is_new)
 
     def list(self, viewer: Viewer = LOCAL_VIEWER) -> list[NamedCalibration]:
         """Those that somebody may see, newest first."""
-        entries = [read_record(path, NamedCalibration) for names in self._seen(viewer) for path in names.glob("*.json")]
-        return sorted(entries, key=lambda entry: (-entry.created_s, entry.name, entry.owner))
+        return [self._judged(entry) for entry in self._entries(viewer)]
 
     def get(self, name: str, viewer: Viewer = LOCAL_VIEWER) -> CalibrationDetail:
         """One calibration, by its name: one's own first, for those who see all.
@@ -98,29 +117,62 @@ class Calibrations:
         Raises:
             UnknownCalibrationError: there is none of this name that he may see.
         """
-        paths = [names / f"{name}.json" for names in self._seen(viewer)] if re.fullmatch(NAME, name) else []
-        if (path := next((path for path in paths if path.is_file()), None)) is None:
-            raise UnknownCalibrationError(f"There is no calibration {name}; list the calibrations to see their names.")
-        entry = read_record(path, NamedCalibration)
-        return _detail(entry, read_record(self._content(entry.id), Calibration))
+        entry = self._named(name, viewer)
+        return self._detail(entry, read_record(self._content(entry.id), Calibration))
 
-    def require(self, path: Path, viewer: Viewer = LOCAL_VIEWER) -> None:
-        """Refuse the option of a job that names a calibration that is not here, or is somebody else's.
+    def by_content(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> JobSpec:
+        """The job with the id of what it calls ``calibrations/<name>``, so that it means the same for ever; others as they are."""
+        path = spec.calibration
+        if path is None or not is_stored(path) or _ID.fullmatch(path.name):
+            return spec
+        try:
+            return spec.model_copy(update={"calibration": Path(FOLDER, self._named(path.name, viewer).id)})
+        except UnknownCalibrationError as problem:
+            raise SettingsError(f"Option 'calibration': {problem.message}") from problem
+
+    def require(self, path: Path, viewer: Viewer = LOCAL_VIEWER, *, accepted: bool = True) -> None:
+        """Refuse the option of a job that names a calibration that is not here, is somebody else's, or is beyond its limits.
+
+        Args:
+            path: ``calibrations/<id>``.
+            viewer: who asks.
+            accepted: also take one that is beyond its limits.
 
         Raises:
-            SettingsError: there is none of this id that he may see.
+            SettingsError: there is none of this id that he may see, or it is not to be used.
         """
+        entries = [entry for entry in self._entries(viewer) if entry.id == path.name]
         is_id = _ID.fullmatch(path.name) is not None and self._content(path.name).is_file()
-        if not is_id or not (viewer.sees_all or any(entry.id == path.name for entry in self.list(viewer))):
+        if not is_id or not (viewer.sees_all or entries):
             raise SettingsError(
-                f"Option 'calibration': there is no {path}; give the 'option' of GET /v1/calibrations/NAME."
+                f"Option 'calibration': there is no {path}; name one of GET /v1/calibrations as calibrations/NAME."
             )
+        if not accepted and (bad := next((entry for entry in entries if entry.broken), None)):
+            raise SettingsError(f"Option 'calibration': {refusal(bad.name, bad.broken or ())}")
 
     def locate(self, spec: JobSpec) -> JobSpec:
         """The job with a stored calibration's file instead of its id."""
         if spec.calibration is None or not is_stored(spec.calibration):
             return spec
         return spec.model_copy(update={"calibration": self._content(spec.calibration.name)})
+
+    def _entries(self, viewer: Viewer) -> tuple[StoredName, ...]:
+        entries = [read_record(path, StoredName) for names in self._seen(viewer) for path in names.glob("*.json")]
+        return tuple(sorted(entries, key=lambda entry: (-entry.created_s, entry.name, entry.owner)))
+
+    def _named(self, name: str, viewer: Viewer) -> StoredName:
+        paths = [names / f"{name}.json" for names in self._seen(viewer)] if re.fullmatch(NAME, name) else []
+        if (path := next((path for path in paths if path.is_file()), None)) is None:
+            raise UnknownCalibrationError(f"There is no calibration {name}; list the calibrations to see their names.")
+        return read_record(path, StoredName)
+
+    def _judged(self, entry: StoredName) -> NamedCalibration:
+        state = state_of(entry.made, entry.valid_days, entry.broken, self._now_s())
+        return NamedCalibration(**entry.model_dump(), state=state)
+
+    def _detail(self, entry: StoredName, calibration: Calibration) -> CalibrationDetail:
+        listed = self._judged(entry).model_dump()
+        return CalibrationDetail(**listed, option=f"{FOLDER}/{entry.id}", calibration=calibration)
 
     def _names(self, owner: str) -> Path:
         return self._folder / "names" if owner == DEFAULT_GROUP else self._folder / "owners" / owner
@@ -136,7 +188,7 @@ class Calibrations:
     def _content(self, calibration_id: str) -> Path:
         return self._folder / f"{calibration_id}.json"
 
-    def _take_name(self, entry: NamedCalibration) -> bool:
+    def _take_name(self, entry: StoredName) -> bool:
         # A hard link is made once, whichever request is first.
         written = self._folder / f".{secrets.token_hex(8)}"
         write_record(written, entry)
@@ -152,7 +204,3 @@ class Calibrations:
 def is_stored(path: Path) -> bool:
     """Whether a job names a calibration as a stored one, ``calibrations/<id>``."""
     return len(path.parts) == 2 and path.parts[0] == FOLDER
-
-
-def _detail(entry: NamedCalibration, calibration: Calibration) -> CalibrationDetail:
-    return CalibrationDetail(**entry.model_dump(), option=f"{FOLDER}/{entry.id}", calibration=calibration)

@@ -142,6 +142,7 @@ class Jobs:
             JobTooLargeError: the machine could never run it.
             ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another job.
         """
+        spec = self.calibrations.by_content(spec, viewer)
         if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
             return Creation(earlier, is_new=False)
         if spec.channels == ():
@@ -154,7 +155,7 @@ class Jobs:
             remedy = "upload it with dentine submit --upload, or try the demonstration with dentine demo"
             self.server_paths.require("rig.mouth", spec.rig.mouth, remedy)
         if spec.calibration is not None and is_stored(spec.calibration):
-            self.calibrations.require(spec.calibration, viewer)
+            self.calibrations.require(spec.calibration, viewer, accepted=spec.accept_calibration)
         elif spec.calibration is not None:
             self.server_paths.require("calibration", spec.calibration)
         self._admission.refuse_too_large(

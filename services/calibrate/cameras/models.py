@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.calibrate.cameras.bundle import BundleFit, fit_bundle, pose_apply
 from services.calibrate.cameras.lens import MODELS, Lens
 from services.calibrate.cameras.sightings import View
-from services.calibrate.cameras.start import board_pose, first_lens, first_rig, usable
+from services.calibrate.cameras.start import board_pose, first_lens, first_rig, lens_and_scatter, usable
 
 Floats = NDArray[np.float64]
 FOLDS = 5
@@ -28,13 +28,13 @@ class ModelChoice:
 
     Attributes:
         lens: of the chosen model, from all boards.
+        sigma_px: scatter of one coordinate of its corners about a fit of this camera alone.
         held_out_px: rms distance of the corners of boards that were left out, by model; empty where there were too few boards.
-        bad_corners: names of the photographs with corners that fit nowhere, and how many.
     """
 
     lens: Lens
+    sigma_px: float
     held_out_px: dict[str, float]
-    bad_corners: dict[str, int]
 
 
 def fit_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> BundleFit:
@@ -56,24 +56,18 @@ def choose_lens(
         CaptureInputError: the camera shows fewer than three boards.
     """
     if len(usable(views)) < MIN_BOARDS:
-        return ModelChoice(first_lens(usable(views), size, MODEL_OF_FEW, name), {}, {})
-    fit = fit_lens(views, size, MODEL_FOR_OUTLIERS, name)
-    good, bad = without_outliers(of_one_camera(usable(views)), fit)
+        held = fit_lens(views, size, MODEL_OF_FEW, name)
+        return ModelChoice(held.rig.lenses[0], float(held.sigma_px[0]), {})
+    good = without_outliers(of_one_camera(usable(views)), fit_lens(views, size, MODEL_FOR_OUTLIERS, name))
     errors = {model: _cross_validated(good, size, model, name, min(folds, len(good) // 2)) for model in models}
     chosen = next(model for model in errors if not any(_beats(other, errors[model]) for other in errors.values()))
     told = {model: float(np.sqrt(np.mean(squares))) for model, squares in errors.items()}
-    return ModelChoice(first_lens(good, size, chosen, name), told, bad)
+    return ModelChoice(*lens_and_scatter(good, size, chosen, name), held_out_px=told)
 
 
-def without_outliers(views: Sequence[View], fit: BundleFit) -> tuple[list[View], dict[str, int]]:
-    """The views without the corners that a fit left out, and how many those were by photograph."""
-    kept, bad = [], {}
-    for number, view in enumerate(views):
-        good = fit.inliers[fit.corners.view == number]
-        kept.append(view.kept(good))
-        if not good.all():
-            bad[view.name] = int(np.count_nonzero(~good))
-    return usable(kept), bad
+def without_outliers(views: Sequence[View], fit: BundleFit) -> list[View]:
+    """The views without the corners that a fit left out."""
+    return usable([view.kept(fit.inliers[fit.corners.view == number]) for number, view in enumerate(views)])
 
 
 def held_out_squares(views: Sequence[View], lens: Lens) -> Floats:

@@ -26,7 +26,12 @@ def usable(views: Sequence[View]) -> list[View]:
 
 
 def first_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> Lens:
-    """A camera's intrinsics by OpenCV from its own views (Zhang 2000).
+    """A camera's intrinsics by OpenCV from its own views (Zhang 2000); raises what ``lens_and_scatter`` does."""
+    return lens_and_scatter(views, size, model, name)[0]
+
+
+def lens_and_scatter(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> tuple[Lens, float]:
+    """A camera's intrinsics by OpenCV, and the scatter in px of one coordinate of its corners, by degrees of freedom.
 
     Raises:
         CaptureInputError: it has too few views.
@@ -42,10 +47,14 @@ def first_lens(views: Sequence[View], size: tuple[int, int], model: str, name: s
     flags = _flags(model)
     points = [np.ascontiguousarray(view.corners_mm, dtype=np.float32) for view in good]
     pixels = [np.ascontiguousarray(view.pixels - HALF_PIXEL, dtype=np.float32) for view in good]
-    _, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
+    rms, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
     count = MODELS[model]
     focal = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
-    return Lens(size, np.concatenate([focal, np.ravel(distortion)[:count]]))
+    # OpenCV's rms is that of distances of corners; each has two coordinates, and each view's pose costs six of them.
+    corners = sum(len(view.pixels) for view in good)
+    freedom = max(2 * corners - len(focal) - count - 6 * len(good), 1)
+    lens = Lens(size, np.concatenate([focal, np.ravel(distortion)[:count]]))
+    return lens, float(rms * np.sqrt(corners / freedom))
 
 
 def board_pose(view: View, lens: Lens) -> Floats:

@@ -27,14 +27,12 @@ class AlignedList:
     """A list in the world's frame.
 
     Attributes:
-        world_from_list: the rigid motion (4, 4).
         positions_mm: of all listed lights (L, 3).
         sigma_mm: scatter of one coordinate of the list about the lights that were found.
         off_mm: distance of listed and found, NaN where no highlight was found (L,).
         outliers: numbers of the lights that lie elsewhere than listed.
     """
 
-    world_from_list: Floats
     positions_mm: Floats
     sigma_mm: float
     off_mm: Floats
@@ -64,7 +62,7 @@ def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
     distances = np.full(len(listed_mm), np.nan)
     distances[known] = off
     bad = np.flatnonzero(np.nan_to_num(distances) > OUTLIER_SIGMAS * sigma)
-    return AlignedList(motion, _moved(motion, listed_mm), sigma, distances, tuple(int(n) for n in bad))
+    return AlignedList(_moved(motion, listed_mm), sigma, distances, tuple(int(n) for n in bad))
 
 
 def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.calibrate.cameras.boards import detect
 from services.calibrate.cameras.bundle import BundleFit, fit_bundle
-from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, choose_lens, fit_lens
+from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, choose_lens
 from services.calibrate.cameras.sightings import View
 from services.calibrate.cameras.start import first_rig, usable
 from services.calibrate.lights.mirror import Eye
@@ -74,20 +74,36 @@ def calibrate_cameras(photos: Photos) -> CamerasStep:
     if not frames:
         raise CaptureInputError("raw.toml lists no frame of kind board; photograph a board in at least ten places.")
     views, missed = _find(photos, frames, names)
-    first = _place(frames[0])
-    if not any(view.place == 0 for view in usable(views)):
+    return adjust_cameras(views, {camera.name: camera.size for camera in folder.camera}, _place(frames[0]), missed)
+
+
+def adjust_cameras(
+    views: Sequence[View], sizes: Mapping[str, tuple[int, int]], first: str, missed: tuple[str, ...] = ()
+) -> CamerasStep:
+    """Choose each camera's distortion model, and adjust the rig to the boards that were found.
+
+    Args:
+        views: boards in photographs; place 0 is to be the world's frame.
+        sizes: of the images by the cameras' names, in the order of their numbers.
+        first: what place 0 is called, for messages.
+        missed: files in which no board was found.
+
+    Raises:
+        CaptureInputError: too few boards, or cameras that share none.
+    """
+    names, good = tuple(sizes), usable(views)
+    if not any(view.place == 0 for view in good):
         raise CaptureInputError(
             f"No camera shows the board at {first}, the first of raw.toml, which is to be the world's frame; photograph it again, "
             "or list another place first."
         )
-    choices, sigmas = {}, []
-    for camera, name in enumerate(names):
-        mine = [view for view in views if view.camera == camera]
-        choices[name] = choose_lens(mine, folder.camera[camera].size, name)
-        sigmas.append(fit_lens(mine, folder.camera[camera].size, choices[name].lens.model, name).sigma_px[0])
-    good = _renumbered(usable(views))
+    choices = {
+        name: choose_lens([view for view in views if view.camera == camera], sizes[name], name)
+        for camera, name in enumerate(names)
+    }
+    good = _renumbered(good)
     start = first_rig(good, [choices[name].lens for name in names], names)
-    fit = fit_bundle(good, start, sigma_px=np.array(sigmas))
+    fit = fit_bundle(good, start, sigma_px=np.array([choices[name].sigma_px for name in names]))
     return CamerasStep(names, fit, choices, tuple(good), missed)
 
 

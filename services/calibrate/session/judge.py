@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from services.calibrate.lights.listed import swapped_names
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
 from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.calibration.record import CalibrationLimit
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.raw.records import RawFolder
 
@@ -22,16 +25,24 @@ GRID = (8, 6)
 MAX_EDGE_SHIFT_PX = 1.0
 """Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
 FEW_PLACES = 8
+MAX_EMPTY = 0.3
+"""Share of an image's cells without a corner: a board in nine places leaves the corners alone empty."""
+CHANNELS_OF_COLOUR = 3
+"""XYZ is fitted to three channels alone; a chart tells nothing of other numbers of them."""
+AGAIN = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
+MAX_TIMES = 10
+"""Nobody takes ten times as many photographs, and errors that large are none of chance."""
 
 
 @dataclass(frozen=True)
 class Limit:
-    """One figure that a calibration must keep: what it is, its value, the limit and the unit."""
+    """One figure that a calibration must keep: what it is, its value, the limit, the unit, and what photographs would mend it."""
 
     what: str
     value: float
     limit: float
     unit: str
+    mended_by: Literal["boards", "spheres", "chart"]
 
     @property
     def is_kept(self) -> bool:
@@ -52,6 +63,16 @@ class Judgement:
         """Limits that are not kept."""
         return tuple(one for one in self.limits if not one.is_kept)
 
+    @property
+    def recorded(self) -> tuple[CalibrationLimit, ...]:
+        """The limits as the calibration's record keeps them, for whoever uses it."""
+        return tuple(
+            CalibrationLimit(
+                what=one.what, value=one.value if math.isfinite(one.value) else None, limit=one.limit, unit=one.unit
+            )
+            for one in self.limits
+        )
+
 
 def judge(
     folder: RawFolder,
@@ -64,7 +85,7 @@ def judge(
     """Hold a calibration to its limits. They are those that keep a tooth's absorption within a few per cent."""
     limits = list(_limits(cameras, lights, uncertainty, colours))
     suspicions = tuple(_suspicions(folder, cameras, lights))
-    return Judgement(tuple(limits), suspicions, _advice(limits, cameras, lights, intensity, colours))
+    return Judgement(tuple(limits), suspicions, _advice(folder, limits, cameras, lights, intensity, colours))
 
 
 def _limits(
@@ -74,23 +95,23 @@ def _limits(
     colours: ColourStep | None,
 ) -> Iterator[Limit]:
     for number, name in enumerate(cameras.names):
-        yield Limit(f"scatter of corners, camera {name}", cameras.fit.rms_px(number), 1.0, "px")
+        yield Limit(f"scatter of corners, camera {name}", cameras.fit.rms_px(number), 1.0, "px", "boards")
         worst = float(np.max(uncertainty_at_the_boards(cameras.fit, number, cameras.distance_mm)))
-        yield Limit(f"uncertainty of projection at the boards, camera {name}", worst, 0.05, "mm")
+        yield Limit(f"uncertainty of projection at the boards, camera {name}", worst, 0.05, "mm", "boards")
     if lights is not None:
         count = 3 * len(lights.fit.lights)
         errors = np.sqrt(np.diag(lights.fit.covariance)[:count].reshape(-1, 3).sum(axis=1))
-        yield Limit("position of the lights, rms ±", float(np.sqrt(np.mean(errors**2))), 2.0, "mm")
+        yield Limit("position of the lights, rms ±", float(np.sqrt(np.mean(errors**2))), 2.0, "mm", "spheres")
     if uncertainty is not None:
         gains = [n for n, name in enumerate(uncertainty.names) if name.startswith("light_gain.")]
         if gains:
             variances = np.diag(uncertainty.matrix)[gains]
-            yield Limit("intensity of the lights, rms ±", 100 * float(np.sqrt(np.mean(variances))), 0.5, "%")
+            rms = 100 * float(np.sqrt(np.mean(variances)))
+            yield Limit("intensity of the lights, rms ±", rms, 0.5, "%", "spheres")
     if colours is not None:
         for name, fit in colours.fits.items():
-            yield Limit(
-                f"patches that were left out, median ΔE2000, camera {name}", float(np.median(fit.held_out)), 1.0, ""
-            )
+            median = float(np.median(fit.held_out))
+            yield Limit(f"patches that were left out, median ΔE2000, camera {name}", median, 1.0, "", "chart")
 
 
 def uncertainty_at_the_boards(fit: BundleFit, camera: int, distance_mm: float) -> Floats:
@@ -119,6 +140,11 @@ def _suspicions(folder: RawFolder, cameras: CamerasStep, lights: LightsStep | No
         yield (
             f"{len(cameras.missed)} frames show no board, among them {cameras.missed[0]}: check that the board of raw.toml is the one "
             "that was photographed, not mirrored and in focus."
+        )
+    if not cameras.fit.converged:
+        yield (
+            "The adjustment of cameras and boards stopped before it settled, so its errors cannot be trusted: look for boards that moved "
+            "while the cameras took them, and photograph more places and tilts."
         )
     bad = ~cameras.fit.inliers
     for number, view in enumerate(cameras.views):
@@ -171,6 +197,7 @@ def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
 
 
 def _advice(
+    folder: RawFolder,
     limits: list[Limit],
     cameras: CamerasStep,
     lights: LightsStep | None,
@@ -178,30 +205,35 @@ def _advice(
     colours: ColourStep | None,
 ) -> str:
     """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of photographs."""
+    worst = max(limits, key=lambda one: one.value / one.limit)
+    if not worst.is_kept:
+        return _again(worst)
     if lights is None:
         return "Photograph a mirror sphere light by light in three or more places: without it the lights are where the list says."
     if intensity is None:
         return "Photograph a white sphere light by light: without it all lights count as equally bright."
-    if colours is None:
+    if colours is None and len(folder.channels) == CHANNELS_OF_COLOUR:
         return "Photograph a colour chart under all lights: without it the asset has no colours."
-    worst = max(limits, key=lambda one: one.value / one.limit)
-    if not worst.is_kept:
-        times = int(np.ceil((worst.value / worst.limit) ** 2))
-        thing = (
-            "spheres, larger or further apart,"
-            if "light" in worst.what
-            else "the chart"
-            if "patches" in worst.what
-            else "boards"
-        )
-        return (
-            f"Photograph {thing} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}; "
-            f"{times} times as many photographs would meet it, if chance alone is the cause."
-        )
     empty = {name: 1 - float(covered_cells(cameras.fit, number).mean()) for number, name in enumerate(cameras.names)}
     name, share = max(empty.items(), key=lambda pair: pair[1])
-    if share > 0.3:
+    if share > MAX_EMPTY:
         return f"All limits are kept; boards nearer to the edges of camera {name} would cover the {share:.0%} of its image that none touches."
     if len(cameras.fit.rig.places) < FEW_PLACES:
         return f"All limits are kept by {len(cameras.fit.rig.places)} places of the board; twice as many would make lenses 1.4 times surer."
     return "All limits are kept; nothing needs to be photographed again."
+
+
+def _again(worst: Limit) -> str:
+    """What would mend the limit that is kept least."""
+    thing = AGAIN[worst.mended_by]
+    if not math.isfinite(worst.value):
+        return (
+            f"Photograph {thing} again: {worst.what} is not known at all, and {worst.limit:g} {worst.unit} are asked."
+        )
+    times = math.ceil((worst.value / worst.limit) ** 2)
+    told = (
+        f"Photograph {thing} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}"
+    )
+    if times > MAX_TIMES:
+        return f"{told}; that is no chance, so look at what looks wrong in the report first."
+    return f"{told}; {times} times as many photographs would meet it, if chance alone is the cause."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +14,15 @@ from services.core.raw.mosaic import binned
 from services.core.raw.records import RawFolder, RawFrame
 
 Image = NDArray[np.float32]
+ROUNDING = 1 / 12
+"""Variance of rounding to whole counts."""
 LOW_PERCENTILE, HIGH_PERCENTILE = 1.0, 99.5
 """Of a photograph's grey values: what is drawn black and white for the finders of boards, so that a few glints do not darken it."""
 
 
 @dataclass(frozen=True)
 class Black:
-    """A camera without light: mean counts over the image, and the scatter of a pixel from one frame to the next."""
+    """A camera without light: mean counts over the image, and the scatter of a pixel from one frame to the next, before rounding."""
 
     counts: float
     noise: float
@@ -85,9 +88,24 @@ class Photos:
         frames = self.folder.frames_of(camera, "black")
         if not frames:
             return Black(0.0, 0.0)
-        stack = [read_counts(self.root, self.folder, frame).astype(np.float32) for frame in frames[:8]]
-        noise = float(np.std(stack[0] - stack[1])) / 2**0.5 if len(stack) > 1 else float(np.std(stack[0]))
-        return Black(float(np.mean([one.mean() for one in stack])), noise)
+        return black_of(read_counts(self.root, self.folder, frame) for frame in frames)
+
+
+def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
+    """Black level and noise of all frames without light, one in memory at a time.
+
+    Of two or more frames the noise is each pixel's own scatter (Welford 1962), so that a sensor's fixed pattern is no noise; of one
+    it is the scatter over the image. Rounding to whole counts adds a variance of 1/12, which is taken off.
+    """
+    mean = squares = np.zeros(())
+    count = 0
+    for frame in frames:
+        counts, count = frame.astype(np.float32), count + 1
+        off = counts - mean
+        mean = mean + off / count
+        squares = squares + off * (counts - mean)
+    variance = float(np.var(mean)) if count == 1 else float(np.mean(squares)) / (count - 1)
+    return Black(float(np.mean(mean)), max(variance - ROUNDING, 0.0) ** 0.5)
 
 
 def for_finders(grey: Image) -> NDArray[np.uint8]:

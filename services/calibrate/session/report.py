@@ -42,6 +42,7 @@ def write_report(session: Session, out: Path) -> None:
         cameras=[_camera(session, number) for number in range(len(session.cameras.names))],
         lights=_lights(session),
         colours=_colours(session),
+        between=None if session.colours is None else session.colours.between_cameras,
         assumed=list(_assumed(session)),
     )
     write_atomic(out / REPORT, page.encode())

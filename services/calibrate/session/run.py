@@ -78,6 +78,7 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     made = datetime.now(UTC).isoformat(timespec="seconds")
     record = record_of(folder, photos.black, falls, cameras, lights, intensity, colours, made, valid_days, inputs)
     judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty)
+    record = record.model_copy(update={"limits": judgement.recorded})
     return Session(record, cameras, lights, intensity, colours, judgement)
 
 

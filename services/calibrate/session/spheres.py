@@ -76,14 +76,40 @@ def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distanc
         pixels = np.array([found[number] for number in numbers]).reshape(-1, 2)
         views.append(SphereView(cameras.index(camera), places.index(place), radius, outline.points_px, numbers, pixels))
         names.append(f"camera {camera}, {place}")
-    fit = fit_lights(views, eyes, lights, covariance)
     listed = np.array([light.position_mm or (np.nan,) * 3 for light in folder.light], dtype=np.float64)
+    return place_lights(views, names, eyes, lights, covariance, listed, tuple(missed))
+
+
+def place_lights(
+    views: Sequence[SphereView],
+    view_names: Sequence[str],
+    eyes: Sequence[Eye],
+    lights: Sequence[str],
+    covariance: Floats,
+    listed_mm: Floats,
+    missed: tuple[str, ...] = (),
+) -> LightsStep:
+    """Positions of the lights from spheres that were found, and the list laid over them where it is whole.
+
+    Args:
+        views: mirror spheres in photographs.
+        view_names: of the same, for people.
+        eyes: the calibrated cameras.
+        lights: their names.
+        covariance: of lens values and pose of each camera in turn.
+        listed_mm: positions that raw.toml lists (L, 3), NaN where it lists none.
+        missed: files in which no highlight was found.
+
+    Raises:
+        CaptureInputError: a light that shows only once.
+    """
+    fit = fit_lights(views, eyes, lights, covariance)
     aligned = None
-    if np.isfinite(listed).all():
-        all_found = np.full((len(lights), 3), np.nan)
-        all_found[fit.lights] = fit.positions_mm
-        aligned = align_list(listed, all_found)
-    return LightsStep(fit, tuple(views), tuple(names), aligned, tuple(missed))
+    if np.isfinite(listed_mm).all():
+        found = np.full((len(lights), 3), np.nan)
+        found[fit.lights] = fit.positions_mm
+        aligned = align_list(listed_mm, found)
+    return LightsStep(fit, tuple(views), tuple(view_names), aligned, missed)
 
 
 def measure_intensity(

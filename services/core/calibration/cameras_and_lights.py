@@ -10,6 +10,7 @@ Only the product of intensity and radiance can be measured, so the lights' inten
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -74,9 +75,22 @@ class Lobe(Record):
 
 
 class CalibratedLight(Light):
-    """A light with its lobe. Its intensity is that towards the teeth, with the lobe evaluated there."""
+    """A light with its lobe. Its intensity is that along the lobe's axis, which a calibration lays through the white spheres' middle."""
 
     lobe: Lobe | None = Field(default=None, exclude_if=is_absent, description="null for a light that is even")
+
+    def towards(self, point_mm: Vector3) -> Light:
+        """The light with the intensity that it has towards a point, and without a lobe; dark where the point lies behind it."""
+        if self.lobe is None:
+            return self
+        off = [there - here for there, here in zip(point_mm, self.position_mm, strict=True)]
+        cosine = sum(a * b for a, b in zip(off, self.lobe.axis, strict=True)) / (
+            math.hypot(*off) * math.hypot(*self.lobe.axis)
+        )
+        share = max(cosine, 0.0) ** self.lobe.exponent
+        return Light(
+            name=self.name, position_mm=self.position_mm, intensity=tuple(share * one for one in self.intensity)
+        )
 
 
 class CameraColour(Record):

@@ -11,7 +11,7 @@ from pydantic import Field
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight, CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty, require_known_names
 from services.core.errors import CaptureInputError
-from services.core.geometry import Camera, Record
+from services.core.geometry import Camera, Record, Vector3
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
 
@@ -27,6 +27,20 @@ MAX_DISTANCE_MM = 1e6
 """A kilometre; a unit other than millimetres does not come out much nearer."""
 MIN_INTENSITY, MAX_INTENSITY = 1e-12, 1e24
 """Of a light: between them products with distances and albedos stay within single precision."""
+
+
+class CalibrationLimit(Record):
+    """One figure that a calibration was held to when it was made."""
+
+    what: str
+    value: float | None = Field(description="null where it could not be told at all")
+    limit: float
+    unit: str
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the value is known and within the limit."""
+        return self.value is not None and self.value <= self.limit
 
 
 class Calibration(Record):
@@ -48,6 +62,9 @@ class Calibration(Record):
     )
     colour: dict[str, CameraColour] | None = Field(
         default=None, exclude_if=is_absent, description="colours of each camera by its name; they apply to the asset"
+    )
+    limits: tuple[CalibrationLimit, ...] | None = Field(
+        default=None, exclude_if=is_absent, description="what it was held to; null where it was held to nothing"
     )
 
     @classmethod
@@ -164,13 +181,17 @@ def _require_possible(camera: Camera, origin: str) -> None:
         )
 
 
-def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:
-    """The same capture with cameras and lights, by name, of a calibration's file; it may have more of them than the capture.
+def recalibrated(description: FolderCapture, calibration: Calibration, path: Path) -> FolderCapture:
+    """The same capture with cameras and lights, by name, of a calibration; it may have more of them than the capture.
+
+    Args:
+        description: of the capture.
+        calibration: read from a file.
+        path: that file, for messages.
 
     Raises:
         CaptureInputError: it lacks a camera or light, or is of another image size or other channels.
     """
-    calibration = read_record(path, Calibration)
     require_consistent(calibration, f"Calibration {path}")
     if calibration.channels != description.channels:
         theirs, ours = ", ".join(calibration.channels), ", ".join(description.channels)
@@ -192,9 +213,23 @@ def recalibrated(description: FolderCapture, path: Path) -> FolderCapture:
             raise CaptureInputError(
                 f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but the capture's are {ours}; calibrate anew."
             )
-    changed = {
+    changed: dict[str, object] = {
         "cameras": tuple(cameras[one.name] for one in description.cameras),
         "lights": tuple(lights[one.name] for one in description.lights),
         "uncertainty": calibration.uncertainty,
     }
     return description.model_copy(update=changed)
+
+
+def lit_at(description: FolderCapture, point_mm: Vector3) -> FolderCapture:
+    """The same capture with the intensities that its lights have towards a point, as their lobes say.
+
+    Raises:
+        CaptureInputError: a light shines away from the point.
+    """
+    lights = [light.towards(point_mm) if isinstance(light, CalibratedLight) else light for light in description.lights]
+    if dark := next((light.name for light in lights if not max(light.intensity) > 0), None):
+        raise CaptureInputError(
+            f"Light {dark} shines away from the teeth, as the lobe of its calibration says; choose the calibration of this rig."
+        )
+    return description.model_copy(update={"lights": tuple(lights)})

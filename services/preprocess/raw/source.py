@@ -41,9 +41,9 @@ class RawSource:
         self.root, self._noise = root, (noise_relative, noise_floor)
         self._measured: dict[str, CameraFrames] = {}
         self._folder = read_raw_folder(root)
-        self._calibration = read_calibration(root, self._folder, calibration)
-        self._cameras = {camera.name: camera for camera in self._calibration.cameras}
-        self.description = described(root, self._folder, self._calibration)
+        self.calibration = read_calibration(root, self._folder, calibration)
+        self._cameras = {camera.name: camera for camera in self.calibration.cameras}
+        self.description = described(root, self._folder, self.calibration)
         self._frames = _in_time(frame for frame in self._folder.frame if frame.kind in {"light", "tracking"})
         self.notes: tuple[str, ...] = tuple(missing_exposures(self._folder))
         fewest = min(sum(frame.kind == "tracking" for frame in self._of(camera.name)) for camera in self._folder.camera)
@@ -59,7 +59,7 @@ class RawSource:
     def identity(self) -> str:
         """See ``Source``: every frame's size and time of change, so that one that was exported again counts."""
         lines = [self.description.model_dump_json(), self._folder.model_dump_json(), repr(self._noise)]
-        lines.append(self._calibration.model_dump_json())
+        lines.append(self.calibration.model_dump_json())
         paths = [path for frame in self._folder.frame if (path := self.root / frame.file).is_file()]
         lines += [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
         return "\n".join(lines)

@@ -1,0 +1,89 @@
+"""Whether a calibration may still be used: its age, and the limits that it was held to when it was made."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import Literal
+
+from services.core.calibration.record import Calibration, CalibrationLimit
+from services.core.errors import CaptureInputError
+
+CalibrationState = Literal["good", "old", "beyond its limits", "not known"]
+SECONDS_A_DAY = 86_400.0
+
+
+def age_days(made: str | None, now_s: float) -> float | None:
+    """Days since a calibration was made; None where it does not say when.
+
+    Args:
+        made: date and time, ISO 8601; without a zone it is taken for UTC.
+        now_s: Unix time.
+    """
+    if made is None:
+        return None
+    try:
+        then = datetime.fromisoformat(made)
+    except ValueError:
+        return None
+    return (now_s - (then if then.tzinfo else then.replace(tzinfo=UTC)).timestamp()) / SECONDS_A_DAY
+
+
+def state_of(
+    made: str | None, valid_days: float | None, broken: tuple[str, ...] | None, now_s: float
+) -> CalibrationState:
+    """One word on a calibration: beyond its limits counts before old; not known where it states neither limits nor a life.
+
+    Args:
+        made, valid_days: of the record.
+        broken: limits that it does not keep, in words; None where it states none.
+        now_s: Unix time.
+    """
+    age = age_days(made, now_s)
+    if broken:
+        return "beyond its limits"
+    if age is not None and valid_days is not None:
+        return "old" if age > valid_days else "good"
+    return "good" if broken is not None else "not known"
+
+
+def broken_limits(calibration: Calibration) -> tuple[str, ...] | None:
+    """The limits that a calibration does not keep, in words; None where it states none."""
+    if calibration.limits is None:
+        return None
+    return tuple(_in_words(one) for one in calibration.limits if not one.is_kept)
+
+
+def warning_of_age(calibration: Calibration, name: str, now_s: float) -> str | None:
+    """A sentence on a calibration that is older than it holds, or None."""
+    age = age_days(calibration.made, now_s)
+    if age is None or calibration.valid_days is None or age <= calibration.valid_days:
+        return None
+    return (
+        f"Calibration {name} is {age:.0f} days old and was made to hold for {calibration.valid_days:g}: the rig may have moved since; "
+        "calibrate again, and compare the two with dentine calibrate --against."
+    )
+
+
+def require_within_limits(calibration: Calibration, name: str, *, accepted: bool) -> None:
+    """Refuse a calibration that does not keep its own limits, unless it is accepted all the same.
+
+    Raises:
+        CaptureInputError: names the first limit that is not kept.
+    """
+    if (broken := broken_limits(calibration)) and not accepted:
+        raise CaptureInputError(refusal(name, broken))
+
+
+def refusal(name: str, broken: tuple[str, ...]) -> str:
+    """The sentence that refuses a calibration beyond its limits."""
+    more = f" (and {len(broken) - 1} more)" if broken[1:] else ""
+    return (
+        f"Calibration {name} is beyond its limits: {broken[0]}{more}; "
+        "calibrate again as its report advises, or accept it with accept_calibration = true."
+    )
+
+
+def _in_words(limit: CalibrationLimit) -> str:
+    value = "not known" if limit.value is None or not math.isfinite(limit.value) else f"{limit.value:.3g} {limit.unit}"
+    return f"{limit.what} is {value.rstrip()}, and {f'{limit.limit:g} {limit.unit}'.rstrip()} is the limit"
