@@ -93,6 +93,22 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     read_mesh(out / "gums.ply").require_solid("gums.ply", (2.0, 200.0))
 
 
+def test_a_scan_without_labels_is_parted_by_its_landmarks(tmp_path: Path) -> None:
+    bare = write_raw_mouth(tmp_path, is_labelled=False)
+    record = register_folder(tmp_path)
+    assert record.teeth == (11, 12, 13, 21, 22, 23)
+    assert record.repairs.startswith("Teeth parted along creases about landmarks of 6 teeth.")
+    # As with labels: the parts differ at necks and contacts alone.
+    turn_deg, move_mm = errors(record, bare)
+    assert move_mm < 0.2
+    assert turn_deg < 0.2
+
+    write_toml(tmp_path, bare.tree | {"landmark": [one for one in bare.tree["landmark"] if one["tooth"] == 11]})
+    shutil.rmtree(tmp_path / "teeth")
+    with pytest.raises(CaptureInputError, match=r"has no labels, and landmarks name 1 of its teeth; click one point"):
+        register_folder(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from services.anatomy.templates.jaw import build_jaw
 from services.calibrate.registration.pose import RigidPose
@@ -32,14 +33,22 @@ class RawMouth:
     centre_mm: np.ndarray
 
 
-def write_raw_mouth(root: Path, subject: int | None = None, seed: int = 1, places: int = 3) -> RawMouth:
-    """Three cameras; the scan is of the teeth up to a place from the midline."""
+def write_raw_mouth(
+    root: Path, subject: int | None = None, seed: int = 1, places: int = 3, *, is_labelled: bool = True
+) -> RawMouth:
+    """Three cameras; the scan is of the teeth up to a place from the midline.
+
+    Without labels it is an STL file, and each tooth that is not clicked in photographs has a landmark in the scan alone.
+    """
     jaw = build_jaw(subject)
     mouth = photographed_mouth(subject, seed, 0.2, jaw)
     inverse = mouth.rig_from_scan.rotation.T
     scan = scan_of(jaw, seed=seed, places=places)
     vertices = (scan.mesh.vertices_mm - mouth.rig_from_scan.translation_mm) @ inverse.T
-    write_labelled_ply(root / "scan.ply", Mesh(vertices, scan.mesh.faces), scan.fdi)
+    if is_labelled:
+        write_labelled_ply(root / "scan.ply", Mesh(vertices, scan.mesh.faces), scan.fdi)
+    else:
+        trimesh.Trimesh(vertices, scan.mesh.faces, process=False).export(root / "scan.stl")
 
     cameras, frames = [], []
     for view in mouth.views:
@@ -67,6 +76,14 @@ def write_raw_mouth(root: Path, subject: int | None = None, seed: int = 1, place
         pixels.append({"camera": one.camera, "xy_px": one.pixel.tolist()})
     tree: Tree = {"units": "mm", "calibration": {"file": "calibration.json"}, "camera": cameras, "frame": frames}
     tree["scan"] = {"file": "scan.ply", "units": "mm", "labels": "label", "jaw": "upper"}
+    if not is_labelled:
+        tree["scan"] = {"file": "scan.stl", "units": "mm", "jaw": "upper"}
+        clicked = {one["tooth"] for one in landmarks.values()}
+        for fdi, mesh in zip(mouth.fdi, mouth.teeth, strict=True):
+            if fdi % 10 <= places and fdi not in clicked:
+                height = mouth.rig_from_scan.apply(mesh.vertices_mm)[:, 2]
+                tip = mesh.vertices_mm[int(height.argmax())].tolist()
+                landmarks[f"{fdi} edge"] = {"tooth": fdi, "point": "edge", "xyz_mm": tip}
     tree["landmark"] = list(landmarks.values())
     write_toml(root, tree)
     return RawMouth(root, tree, mouth.rig_from_scan, mouth.centre_mm)

@@ -90,15 +90,21 @@ class CrownMatch:
         self._mesh, self._average = _sampled(outer, MESH_POINTS), self._crown_points(CROWN_POINTS)
         self._mesh_tree, self._average_tree = cKDTree(self._mesh.features), cKDTree(self._average.features)
 
-    def settled(self, axes: Array, points: int, rounds: int) -> Placements:
+    @property
+    def half_size_mm(self) -> Array:
+        """Half of the average crown's extent (3,) along its own axes."""
+        return np.asarray(np.ptp(self._crown_points(CROWN_POINTS).points_mm, axis=0) / 2)
+
+    def settled(self, axes: Array, points: int, rounds: int, top_mm: Array | None = None) -> Placements:
         """Turned, moved and scaled onto the mesh from canonical axes (G, 3, 3), the crown's top at the mesh's.
 
         Args:
             points: of the crown, that are compared.
             rounds: of closest points.
+            top_mm: where the crown's top is to begin (3,), in place of the mesh's.
         """
         crown = self._crown_points(points)
-        placed = self._begun(axes, crown.points_mm)
+        placed = self._begun(axes, crown.points_mm) if top_mm is None else self._hung(axes, crown.points_mm, top_mm)
         for _ in range(rounds):
             placed = self._step(placed, crown)
         _, distance = self._closest(placed, crown)
@@ -119,6 +125,10 @@ class CrownMatch:
     def _crown_points(self, count: int) -> SurfacePoints:
         found = _sampled(self._crown, count)
         return SurfacePoints((found.points_mm - self._middle) * self._mirror, found.normals * self._mirror)
+
+    def _hung(self, axes: Array, crown_mm: Array, top_mm: Array) -> Placements:
+        ones = np.ones(len(axes))
+        return Placements(axes, top_mm - np.ptp(crown_mm[:, 2]) / 2 * axes[:, 2], ones, ones)
 
     def _begun(self, axes: Array, crown_mm: Array) -> Placements:
         along = np.einsum("gkj,nj->gkn", axes, self._mesh.points_mm)

@@ -1,14 +1,16 @@
-"""A labelled intra-oral scan: one open surface of one jaw, whose every triangle is of a tooth or of the gingiva."""
+"""An intra-oral scan: one open surface of one jaw, whose every triangle is of a tooth or of the gingiva by labels or landmarks."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.parting import part_by_landmarks
 from services.anatomy.scans.patches import middle_mm
 from services.anatomy.scans.units import MM_PER_UNIT, Unit, require_anatomical_scale
 from services.anatomy.templates.average_arch import is_upper
@@ -21,6 +23,8 @@ Numbering = Literal["universal", "fdi", "either"]
 Jaw = Literal["upper", "lower"]
 
 GINGIVA = 0
+LABEL = "Label"
+"""Name of the array that is looked for where none is named."""
 HIGHEST_UNIVERSAL = 32
 EXTENT_MM = (8.0, 200.0)
 """Of a scan with two teeth at least."""
@@ -34,6 +38,8 @@ class LabelledScan:
     fdi: NDArray[np.int64]
     doubled_vertices: int = 0
     """How many vertices of the file were copies of others and were joined with them."""
+    is_labelled: bool = True
+    """Whether the file says what each triangle is; otherwise that follows from points on the teeth."""
 
     @property
     def teeth(self) -> tuple[int, ...]:
@@ -56,30 +62,38 @@ def fdi_from_universal(number: int) -> int:
 def read_scan(
     path: Path,
     numbering: Numbering = "universal",
-    labels: str = "Label",
+    labels: str | None = LABEL,
     *,
     units: Unit = "mm",
     jaw: Jaw | None = None,
+    points_mm: Mapping[int, NDArray[np.float64]] | None = None,
 ) -> LabelledScan:
-    """Read a scan (.vtp, .ply, .stl or .obj) with a label for each triangle or each vertex.
+    """Read a scan (.vtp, .ply, .stl or .obj) with a label for each triangle or each vertex, or with points on its teeth.
 
     Args:
         path: of the scan.
         numbering: how labels name teeth; 0 is gingiva in either.
         labels: name of the file's array or property; or of a file beside the scan (.json, .npy, .txt, .csv), which a
-            format without properties needs.
+            format without properties needs. None: the array named Label where the file has one, else none.
         units: of the file's coordinates.
         jaw: which jaw the scan is said to be of; None where nothing is said.
+        points_mm: by FDI number, points (N, 3) on the tooth, by which a scan without labels is parted; in mm.
 
     Raises:
         CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one jaw.
         MeshError: of a size that no jaw has in this unit.
     """
     file = read_scan_file(path)
-    values = _triangle_labels(file, path, labels)
+    is_labelled = labels is not None or _array(file, LABEL) is not None
+    values = _triangle_labels(file, path, labels or LABEL) if is_labelled else None
     mesh, doubled = _welded(file.mesh)
     mesh = Mesh(MM_PER_UNIT[units] * mesh.vertices_mm, mesh.faces)
-    scan = LabelledScan(mesh, _fdi_numbers(values, numbering, path), doubled)
+    if values is None:
+        mesh.require_surface(f"of scan {path}", EXTENT_MM)
+        fdi = part_by_landmarks(mesh, points_mm or {}, f"scan {path}")
+    else:
+        fdi = _fdi_numbers(values, numbering, path)
+    scan = LabelledScan(mesh, fdi, doubled, is_labelled)
     _require_one_jaw(scan, path, jaw)
     if np.isfinite(mesh.vertices_mm).all():
         middles = [middle_mm(Mesh(mesh.vertices_mm, mesh.faces[scan.fdi == number])) for number in scan.teeth]
@@ -114,15 +128,23 @@ def _triangle_labels(file: ScanFile, path: Path, labels: str) -> NDArray[np.floa
     if Path(labels).suffix.lower() in SIDECARS:
         beside = path.parent / labels
         return _per_triangle(read_sidecar(beside), file, f"Label file {beside}")
-    for arrays in (file.triangle_arrays, file.vertex_arrays):
-        found = next((values for name, values in arrays.items() if name.lower() == labels.lower()), None)
-        if found is not None:
-            return _per_triangle(np.asarray(found, dtype=np.float64), file, f"Scan {path}, array {labels},")
+    found = _array(file, labels)
+    if found is not None:
+        return _per_triangle(np.asarray(found, dtype=np.float64), file, f"Scan {path}, array {labels},")
     held = ", ".join(sorted(file.triangle_arrays | file.vertex_arrays)) or "none"
     raise CaptureInputError(
         f"Scan {path} has no label per triangle named {labels} (it has: {held}); export it with its segmentation, "
         "or name a file of labels beside it (.json, .npy, .txt, .csv)."
     )
+
+
+def _array(file: ScanFile, name: str) -> NDArray[Any] | None:
+    # That of triangles counts over that of vertices; capitals do not.
+    for arrays in (file.triangle_arrays, file.vertex_arrays):
+        for own, values in arrays.items():
+            if own.lower() == name.lower():
+                return values
+    return None
 
 
 def _per_triangle(values: NDArray[np.float64], file: ScanFile, what: str) -> NDArray[np.float64]:

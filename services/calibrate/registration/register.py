@@ -110,13 +110,18 @@ def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
         raise CaptureInputError(f"{root / DESCRIPTION} names no scan; add [scan] with its file, units and jaw.")
     if scan.jaw == "both":
         raise CaptureInputError(f"Scan {scan.file} is of both jaws; export the jaw that is photographed alone.")
-    read = read_scan(root / scan.file, "either", scan.labels or "Label", units=scan.units, jaw=scan.jaw)
+    points_mm = {
+        fdi: np.array([one.xyz_mm for one in folder.landmark if one.tooth == fdi], dtype=np.float64)
+        for fdi in sorted({one.tooth for one in folder.landmark})
+    }
+    read = read_scan(root / scan.file, "either", scan.labels, units=scan.units, jaw=scan.jaw, points_mm=points_mm)
     jaw: ScannedJaw = jaw_from_scan(read, "whole")
+    parted = "" if read.is_labelled else f"Teeth parted along creases about landmarks of {len(points_mm)} teeth. "
     scan_from_arch = np.asarray(np.linalg.inv(jaw.arch_from_scan), dtype=np.float64)
     back = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
     teeth = tuple(_placed(tooth.outer, back) for tooth in jaw.teeth)
     fdi = tuple(tooth.fdi for tooth in jaw.teeth)
-    return ScannedTeeth(fdi, teeth, _placed(jaw.gums, back), jaw.arch_from_scan, jaw.repairs.sentence())
+    return ScannedTeeth(fdi, teeth, _placed(jaw.gums, back), jaw.arch_from_scan, parted + jaw.repairs.sentence())
 
 
 def _registered(

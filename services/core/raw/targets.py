@@ -86,12 +86,14 @@ class CalibrationFile(Record):
 
 
 class ScanFile(Record):
-    """A labelled intra-oral scan to take the teeth from."""
+    """An intra-oral scan to take the teeth from; without labels, landmarks say where each tooth is."""
 
     file: FileName
     units: Literal["mm", "cm", "m", "um", "inch"]
     labels: str | None = Field(
-        default=None, description="property of the scan's faces or vertices that holds the labels, or a file beside it"
+        default=None,
+        description="property of the scan's faces or vertices that holds the labels, or a file beside it; default: Label "
+        "where the scan has it, else landmarks part the teeth, one at least on each",
     )
     jaw: Literal["upper", "lower", "both"]
 
@@ -104,9 +106,12 @@ class SeenPoint(Record):
 
 
 class Landmark(Record):
-    """A point of a tooth that was clicked, in the scan and in photographs."""
+    """A point of a tooth that was clicked, in the scan and in photographs.
+
+    One that no photograph shows serves a scan without labels.
+    """
 
     tooth: Fdi
     point: Label = Field(description="what it is, such as 'mesial edge'")
     xyz_mm: Vector3 = Field(description="in the scan")
-    pixels: Annotated[tuple[SeenPoint, ...], Field(min_length=1)]
+    pixels: tuple[SeenPoint, ...] = ()
