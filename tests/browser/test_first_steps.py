@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +92,32 @@ def test_a_rig_is_explained_and_its_dome_is_looked_at(
         looked_at(page, f"rig-{scheme}-{width}")
         page.get_by_role("link", name="Submit a job with a rig").click()
         expect(page.get_by_label("What is fitted from")).to_have_value("rig")
+
+
+def test_calibrations_are_shown_with_their_state_and_offered_to_jobs(
+    chromium: Browser, server: httpx.Client, tmp_path: Path
+) -> None:
+    tree = json.loads((write_capture(tmp_path / "mine") / "capture.json").read_text())
+    del tree["images"]
+    limit = {"what": "scatter of corners, camera c0", "value": 1.5, "limit": 1.0, "unit": "px"}
+    made = {"made": datetime.now(UTC).isoformat(), "valid_days": 30.0}
+    server.put("/v1/calibrations/new-rig", json=tree | made | {"limits": []}).raise_for_status()
+    server.put("/v1/calibrations/shaken-rig", json=tree | made | {"limits": [limit]}).raise_for_status()
+    server.put("/v1/calibrations/old-rig", json=tree | made | {"made": "2020-01-01T00:00:00"}).raise_for_status()
+    with watched_page(chromium, address_of(server), expected=("404",)) as page:
+        page.goto("/#/rig")
+        rows = page.get_by_role("region", name="Calibrations").locator("tbody tr")
+        expect(rows.filter(has_text="new-rig")).to_contain_text("good")
+        expect(rows.filter(has_text="shaken-rig")).to_contain_text("beyond its limits")
+        expect(rows.filter(has_text="shaken-rig")).to_contain_text("camera c0 is 1.5 px, and 1 px is the limit")
+        expect(rows.filter(has_text="old-rig")).to_contain_text("It was made to hold for 30 days")
+        looked_at(page, "calibrations")
+        page.goto("/#/submit")
+        offered = page.locator("#known-option-calibration option")
+        expect(offered).to_have_count(3)
+        expect(page.locator("#known-option-calibration option[value='calibrations/new-rig']")).to_have_text(
+            "new-rig: good"
+        )
 
 
 def test_a_server_without_a_dome_says_so(chromium: Browser, server: httpx.Client) -> None:

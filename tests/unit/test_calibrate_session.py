@@ -83,6 +83,12 @@ def test_the_record_is_one_that_jobs_read(made: tuple[Path, Truth], session: Ses
     # Gains and positions err together: a light that is believed nearer comes out dimmer.
     gains, places = names.index("light_gain.L0.red"), names.index("light.L0.x")
     assert np.abs(record.uncertainty.matrix[gains, places : places + 3]).max() > 0
+    # The white standard's 1 % is the same in all channels, and the gain of the photographs is known no better.
+    red, blue = names.index("gain.red"), names.index("gain.blue")
+    assert 1e-4 < record.uncertainty.matrix[red, red] < 1.2e-4
+    assert record.uncertainty.matrix[red, blue] == pytest.approx(1e-4)
+    assert record.limits is not None
+    assert {one.unit for one in record.limits} == {"px", "mm", "%", ""}
     assert np.mean([light.intensity for light in record.lights], axis=0) == pytest.approx(1)
     assert record.inputs is not None
     assert "raw.toml" in record.inputs

@@ -19,6 +19,8 @@ from services.core.calibration.uncertainty import LENS, TWIST, CalibrationUncert
 from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
+REFLECTANCE_SE = 0.01
+"""Relative, of a white sphere's reflectance where raw.toml does not say it: a white standard is certified to about 1 %."""
 LIGHT_DRIFT = 1e-4
 """Relative: a lamp's brightness changes by so much while it warms, whatever the fit says."""
 
@@ -130,7 +132,23 @@ def uncertainty_of(
         noise = np.zeros((len(rows), len(rows)))
         noise[-len(moved) :, -len(moved) :] = fit.covariance + LIGHT_DRIFT**2 * np.eye(len(moved))
     total = rows @ covariance @ rows.T + noise
+    if intensity is not None:
+        names += [f"gain.{channel}" for channel in folder.channels]
+        both = np.zeros((len(names), len(names)))
+        both[: len(total), : len(total)], both[len(total) :, len(total) :] = total, gain_covariance(intensity)
+        total = both
     return CalibrationUncertainty.model_validate({"names": names, "covariance": ((total + total.T) / 2).tolist()})
+
+
+def gain_covariance(intensity: IntensityStep) -> Floats:
+    """Of the brightness of all photographs together by channel, relative (C, C).
+
+    The white sphere's reflectance is wrong alike in all channels; the photographs' scatter is each channel's own. What the lights'
+    places add is hundredths of a per cent, so it is left out.
+    """
+    shared = REFLECTANCE_SE if intensity.reflectance_se is None else intensity.reflectance_se
+    scatter = intensity.fit.sigma / len(intensity.photos) ** 0.5
+    return np.asarray(shared**2 * np.ones((len(scatter),) * 2) + np.diag(scatter**2 + LIGHT_DRIFT**2))
 
 
 def _camera_rows(names: Sequence[str], eyes: Sequence[Eye]) -> tuple[list[str], Floats]:

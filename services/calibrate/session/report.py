@@ -17,6 +17,7 @@ from services.calibrate.session.drawings import (
     srgb,
     uncertainty_drawing,
 )
+from services.calibrate.session.record import REFLECTANCE_SE
 from services.calibrate.session.run import Session
 from services.core.page import page_template
 from services.core.store import write_atomic
@@ -135,5 +136,10 @@ def _assumed(session: Session) -> Iterator[str]:
         yield "No white sphere was photographed: all lights count as equally bright."
     elif session.intensity.fit.exponent == 0:
         yield "Lights shine alike in all directions: the white spheres' places tell of no lobe."
+    if session.intensity is not None and session.intensity.reflectance_se is None:
+        yield (
+            f"The white sphere's reflectance is right to {100 * REFLECTANCE_SE:g} %, as raw.toml gives no reflectance_se: "
+            "so well is the gain of all photographs known."
+        )
     if session.colours is not None:
         yield "Light on the chart is even, also in the image; its white is that of its grey patches."

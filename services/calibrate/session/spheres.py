@@ -41,11 +41,19 @@ class LightsStep:
 
 @dataclass(frozen=True)
 class IntensityStep:
-    """How bright lights are, and the mean place of the white spheres (3,), towards which intensities are told."""
+    """How bright lights are.
+
+    Attributes:
+        fit: intensities and cameras.
+        photos: of white spheres.
+        middle_mm: mean place of the white spheres (3,), towards which intensities are told.
+        reflectance_se: relative, of the white spheres' reflectance; None where raw.toml does not say it.
+    """
 
     fit: IntensityFit
     photos: tuple[WhitePhoto, ...]
     middle_mm: Floats
+    reflectance_se: float | None = None
 
 
 def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distance_mm: float) -> LightsStep | None:
@@ -155,7 +163,10 @@ def measure_intensity(
         for centre, place in zip(centres, places, strict=True)
     ]
     middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
-    return IntensityStep(fit_intensity(found, eyes, spheres, lights_mm, lights), tuple(found), middle)
+    told = [thing.reflectance_se for thing in thing_of.values()]
+    # Of several spheres the least certain counts, and one of which nothing is said leaves all unsaid.
+    se = None if None in told else max(one for one in told if one is not None)
+    return IntensityStep(fit_intensity(found, eyes, spheres, lights_mm, lights), tuple(found), middle, se)
 
 
 def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFrame]]:

@@ -57,6 +57,10 @@ class Sphere(Record):
     reflectance: tuple[Unit, ...] | None = Field(
         default=None, description="of a white sphere: diffuse reflectance, one number a channel"
     )
+    reflectance_se: Positive | None = Field(
+        default=None,
+        description="relative standard error of that, the same in all channels; 0.01 where it is not given",
+    )
 
     @model_validator(mode="after")
     def _reflectance_of_white(self) -> Sphere:

@@ -91,6 +91,18 @@ export interface Capture {
   bytes: number;
 }
 
+/** A calibration by name, as it is listed. */
+export interface NamedCalibration {
+  name: string;
+  state: "good" | "old" | "beyond its limits" | "not known";
+  created_s: number;
+  /** When it was made, ISO 8601. */
+  made: string | null;
+  valid_days: number | null;
+  /** Limits that it does not keep, in words. */
+  broken: string[] | null;
+}
+
 /** The receipt of a deleted job. */
 export interface Deletion {
   job: string;
@@ -250,6 +262,7 @@ export const getOptions = (): Promise<OptionsSchema> => ask("/options");
 export const listPresets = (): Promise<Preset[]> => ask("/presets");
 export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name}`);
 export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
+export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibrations");
 export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
 export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");

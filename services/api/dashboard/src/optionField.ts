@@ -46,6 +46,13 @@ export class OptionField {
     this.reset();
   }
 
+  /** Offer values, each with a few words on it; others may be typed all the same. */
+  suggest(values: [string, string][]): void {
+    const list = element("datalist", { id: `known-${this.input.id}` }, ...values.map(([value, text]) => element("option", { value }, text)));
+    this.input.setAttribute("list", list.id);
+    this.root.append(list);
+  }
+
   reset(): void {
     this.set(this.schema.default);
   }

@@ -1,13 +1,15 @@
 /** How a rig is connected: what to set and where, and whether the server's dome answers. */
 
-import { getDome, sentenceOf, Unauthenticated } from "./api";
+import { getDome, listCalibrations, type NamedCalibration, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
+import { when } from "./format";
 import { SUBMIT } from "./newJobView";
 
 export class RigView {
   readonly root = element("article", { class: "rig" });
   private readonly check = element("button", { type: "button" }, "Check the dome");
   private readonly found = element("p", { role: "status" });
+  private readonly calibrations = element("div", { class: "scroll", role: "region", "aria-label": "Calibrations", tabindex: "0" });
 
   constructor() {
     this.check.addEventListener("click", () => void this.look());
@@ -24,6 +26,8 @@ export class RigView {
         "2. The calibration",
         element("p", {}, "A folder with ", code("capture.json"), " (cameras, lights and channels, lengths in mm) and the scan's meshes as ", code("teeth/<FDI>/outer.ply"), ". Upload it like a capture, or put it where server and workers see it and give its path."),
         element("p", {}, element("a", { href: "#/new" }, "Upload the folder")),
+        element("p", {}, "A calibration of ", code("dentine calibrate"), " is put under a name of its own by ", code("PUT /v1/calibrations/NAME"), "; jobs name it as ", code("calibrations/NAME"), "."),
+        this.calibrations,
       ),
       section(
         "3. The limits of light",
@@ -38,7 +42,8 @@ export class RigView {
   }
 
   async start(): Promise<void> {
-    await this.look();
+    const [, listed] = await Promise.all([this.look(), listCalibrations()]);
+    this.calibrations.replaceChildren(...(listed.length ? [tableOf(listed)] : [element("p", { class: "soft" }, "There is none yet.")]));
   }
 
   stop(): void {}
@@ -64,4 +69,20 @@ export class RigView {
 
 function section(title: string, ...content: HTMLElement[]): HTMLElement {
   return element("section", {}, element("h3", {}, title), ...content);
+}
+
+/** What is known of each calibration, and what may be done with it. */
+function tableOf(listed: NamedCalibration[]): HTMLElement {
+  const head = ["Name", "State", "Made", ""].map((text) => element("th", { scope: "col" }, text));
+  const rows = listed.map((one) => {
+    const bad = one.state === "beyond its limits" || one.state === "old";
+    return element("tr", {}, element("td", {}, one.name), element("td", { class: bad ? "bad" : one.state === "good" ? "done" : "soft" }, one.state), element("td", {}, when(one.made ? Date.parse(one.made) / 1000 : one.created_s)), element("td", {}, toldOf(one)));
+  });
+  return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
+}
+
+function toldOf(one: NamedCalibration): string {
+  if (one.broken?.length) return `${one.broken.join("; ")}. Jobs refuse it unless they accept_calibration.`;
+  if (one.state === "old") return `It was made to hold for ${one.valid_days} days; calibrate again.`;
+  return one.state === "good" ? "" : "It states neither limits nor how long it holds.";
 }

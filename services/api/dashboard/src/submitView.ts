@@ -1,6 +1,6 @@
 /** The form for a job, built from the server's own schema of options: source, preset, name, then groups of options. */
 
-import { type Capture, getOptions, listCaptures, listPresets, type OptionsSchema, type Preset, sentenceOf, submitJob, Unauthenticated } from "./api";
+import { type Capture, getOptions, listCalibrations, listCaptures, listPresets, type NamedCalibration, type OptionsSchema, type Preset, sentenceOf, submitJob, Unauthenticated } from "./api";
 import { element } from "./element";
 import { bytes, when } from "./format";
 import { OptionField } from "./optionField";
@@ -9,7 +9,7 @@ const SOURCES = new Set(["capture", "rig"]);
 /** Groups by the options that they hold; what the schema has besides comes last, so that no option is missing. */
 const GROUPS: [string, string[]][] = [
   ["What is fitted", ["kind", "boundary", "ior", "dentin", "stains", "lobes"]],
-  ["Images", ["channels", "held_out_lights", "calibration", "instrument", "shadows", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
+  ["Images", ["channels", "held_out_lights", "calibration", "accept_calibration", "instrument", "shadows", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
   ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "image_tolerance", "search_candidates", "advise", "seed", "priority", "workers", "device"]],
   ["Slab", ["dictionary", "particle_index", "particle_absorption", "effort"]],
   ["Solver", ["solver", "loss", "adam_steps", "adam_rate", "prior", "held"]],
@@ -45,8 +45,9 @@ export class SubmitView {
   }
 
   async start(): Promise<void> {
-    const [schema, presets, captures] = await Promise.all([getOptions(), listPresets(), listCaptures()]);
+    const [schema, presets, captures, calibrations] = await Promise.all([getOptions(), listPresets(), listCaptures(), listCalibrations()]);
     this.fill(schema, presets, captures.captures.filter((one) => one.state === "committed"));
+    this.offer(calibrations);
   }
 
   stop(): void {}
@@ -77,6 +78,11 @@ export class SubmitView {
       this.options.append(group);
     }
     this.arrange(captures.length > 0);
+  }
+
+  private offer(calibrations: NamedCalibration[]): void {
+    const field = this.fields.find((one) => one.name === "calibration");
+    if (calibrations.length) field?.suggest(calibrations.map((one) => [`calibrations/${one.name}`, `${one.name}: ${one.state}`]));
   }
 
   private arrange(hasCaptures: boolean): void {
