@@ -44,6 +44,7 @@ class JobKind:
 _TEETH: Mapping[StageName, str] = {
     "phantom": "services.phantom.stage:run",
     "capture": "services.capture.stage:run",
+    "register": "services.calibrate.stage:run",
     "prepare": "services.preprocess.stage:run",
     "fit": "services.fit.stage:run",
     "export": "services.fit.stage:export",

@@ -12,7 +12,7 @@ from services.core.geometry import Record
 
 CANCEL_FLAG = "cancel"
 """File in a job's folder that asks whoever works on it to stop."""
-StageName = Literal["phantom", "capture", "prepare", "fit", "export"]
+StageName = Literal["phantom", "capture", "register", "prepare", "fit", "export"]
 
 
 class StageEvent(Record):

@@ -5,6 +5,8 @@
     JOB/
       phantom/     published by the phantom stage, of a demonstration alone
       capture/     published by the capture stage
+      registered/  published by the register stage, where a raw folder has a scan and no teeth
+      registration/          pictures of a registration that was refused
       prepared/    published by the prepare stage
       fit/         published by the fit stage
       asset/       published by the export stage

@@ -16,9 +16,23 @@ from services.pipeline.database import patiently
 from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
 
-PUBLISHED_AS = {"phantom": "phantom", "capture": "capture", "prepare": "prepared", "fit": "fit", "export": "asset"}
+PUBLISHED_AS = {
+    "phantom": "phantom",
+    "capture": "capture",
+    "register": "registered",
+    "prepare": "prepared",
+    "fit": "fit",
+    "export": "asset",
+}
 """Folder of what each stage publishes, in the job's."""
-_EXTRAS = {"phantom": "fit", "capture": "capture", "prepare": "preprocess", "fit": "fit", "export": "fit"}
+_EXTRAS = {
+    "phantom": "fit",
+    "capture": "capture",
+    "register": "calibrate",
+    "prepare": "preprocess",
+    "fit": "fit",
+    "export": "fit",
+}
 """What to install where a stage runs."""
 
 

@@ -2,9 +2,10 @@
 
 ::
 
-    phantom {STAGES: 1} -> capture {DOME: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}
+    phantom {STAGES: 1} -> capture {DOME: 1} -> register {STAGES: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}
 
-A capture only where the job names a rig, a phantom only where that is the demonstration's.
+A capture only where the job names a rig, a phantom only where that is the demonstration's, a registration only where a raw folder has a
+scan and no teeth; that is looked for when the job runs, so such a stage is in the plan once it has begun.
 
 Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its part: a rig may go away
 after its capture. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task whose worker dies is run again by
@@ -15,7 +16,7 @@ same workers and secedes from its own slot meanwhile.
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -30,6 +31,7 @@ from services.core.errors import (
 )
 from services.core.job_kinds import job_kinds
 from services.core.masks import is_stale
+from services.core.raw.registration import lacks_pose
 from services.core.records import LIMITS_OF_A_RIG, JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import CANCEL_FLAG, StageName
@@ -55,10 +57,15 @@ DOORS: Mapping[StageName, str] = MappingProxyType({})
 """``module:function`` of stages that are entered elsewhere than a job's kind says."""
 
 
-def stages_of(spec: JobSpec) -> tuple[StageName, ...]:
-    """The stages a job goes through, in order."""
+def stages_of(spec: JobSpec, begun: Collection[StageName | None] = ()) -> tuple[StageName, ...]:
+    """The stages a job goes through, in order.
+
+    Args:
+        begun: those that were started; a registration is one of the stages if it is among them.
+    """
     made = (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()))
-    return (*made, *job_kinds()[spec.kind].stages)
+    registered: tuple[StageName, ...] = ("register",) if "register" in begun else ()
+    return (*made, *registered, *job_kinds()[spec.kind].stages)
 
 
 def first_stage(spec: JobSpec, root: Path) -> StageName | None:
@@ -135,7 +142,9 @@ def run_stages(
         if "prepare" in stages and is_stale(root):
             _withdraw_prepared(root)
         address = events or folder_events(root)
-        todo = tuple(stage for stage in stages if again or not is_published(root, PUBLISHED_AS[stage]))
+        todo = tuple(
+            stage for stage in _with_registration(spec, stages) if again or not is_published(root, PUBLISHED_AS[stage])
+        )
         with address.open() as log:
             watch = Watch(log, listener, log.newest_id())
             if todo:
@@ -149,6 +158,14 @@ def run_stages(
                 with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
                     _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
             watch.tell()
+
+
+def _with_registration(spec: JobSpec, stages: tuple[StageName, ...]) -> tuple[StageName, ...]:
+    """The stages with a registration before the preparation of a raw folder whose scan has no pose yet."""
+    if "prepare" not in stages or spec.capture is None or "register" not in job_kinds()[spec.kind].doors:
+        return stages
+    at = stages.index("prepare")
+    return (*stages[:at], "register", *stages[at:]) if lacks_pose(spec.capture) else stages
 
 
 def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
@@ -225,7 +242,7 @@ def _remembering_damage(root: Path) -> Iterator[None]:
 
 def _withdraw_damaged(root: Path) -> None:
     """Remove published stages that are not as published, so that they are run again; those after them were made of the whole ones. Never a capture."""
-    for stage in ("prepared", "fit", "asset"):
+    for stage in ("registered", "prepared", "fit", "asset"):
         try:
             require_intact(root, stage)
         except CorruptStoreError:

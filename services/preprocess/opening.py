@@ -11,6 +11,7 @@ from services.core.calibration.record import Calibration, lit_at, published_capt
 from services.core.calibration.state import broken_limits, require_within_limits, warning_of_age
 from services.core.files.meshes import read_teeth
 from services.core.raw.folder import is_raw_folder
+from services.core.raw.registration import teeth_root
 from services.core.records import CaptureManifest, JobSpec
 from services.core.store import open_stage, read_record
 from services.preprocess.folder import FolderSource
@@ -29,7 +30,13 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
         CaptureInputError: it cannot be read, contradicts itself, or its calibration is beyond its limits. StoreError: a published capture is damaged.
     """
     if spec.capture is not None and is_raw_folder(spec.capture):
-        raw = RawSource(spec.capture, spec.calibration, spec.sensor_noise_relative, spec.sensor_noise_floor)
+        raw = RawSource(
+            spec.capture,
+            spec.calibration,
+            spec.sensor_noise_relative,
+            spec.sensor_noise_floor,
+            teeth_root(spec.capture, root),
+        )
         return _calibrated(raw, raw.calibration, "of the raw folder" if spec.calibration is None else "", spec)
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
     if published is not None:

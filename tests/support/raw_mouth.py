@@ -53,10 +53,13 @@ def write_raw_mouth(
     cameras, frames = [], []
     for view in mouth.views:
         name, size = view.camera.name, list(view.camera.size)
-        np.save(root / f"{name}.npy", (BLACK + FULL_SCALE * np.clip(view.image, 0, 1)).round().astype(np.uint16))
         cameras.append({"name": name, "size": size, "bits": BITS})
-        frames.append({"camera": name, "file": f"{name}.npy", "kind": "tracking", "exposure_s": 0.1})
-    calibrated = tuple(CalibratedCamera(**camera.model_dump(), black_counts=BLACK) for camera in mouth.cameras.values())
+        for kind, lit in (("tracking", {}), ("light", {"light": "l0"})):
+            counts = (BLACK + FULL_SCALE * np.clip(view.image, 0, 1)).round().astype(np.uint16)
+            np.save(root / f"{name}_{kind}.npy", counts)
+            frames.append({"camera": name, "file": f"{name}_{kind}.npy", "kind": kind, "exposure_s": 0.1} | lit)
+    known = {"black_counts": BLACK, "radiance_per_count": (1 / FULL_SCALE,) * 3}
+    calibrated = tuple(CalibratedCamera(**camera.model_dump(), **known) for camera in mouth.cameras.values())
     lights = (CalibratedLight(name="l0", position_mm=(0.0, 900.0, 0.0), intensity=(1.0, 1.0, 1.0)),)
     channels = ("red", "green", "blue")
     write_record(
@@ -75,6 +78,7 @@ def write_raw_mouth(
         assert isinstance(pixels, list)
         pixels.append({"camera": one.camera, "xy_px": one.pixel.tolist()})
     tree: Tree = {"units": "mm", "calibration": {"file": "calibration.json"}, "camera": cameras, "frame": frames}
+    tree["light"] = [{"name": "l0"}]
     tree["scan"] = {"file": "scan.ply", "units": "mm", "labels": "label", "jaw": "upper"}
     if not is_labelled:
         tree["scan"] = {"file": "scan.stl", "units": "mm", "jaw": "upper"}

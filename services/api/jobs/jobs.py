@@ -264,7 +264,7 @@ class Jobs:
     def progress(self, job: Job) -> list[StageProgress]:
         """How far each stage is, from the event table."""
         latest = {event.stage: event for event in self.repository.events_of(job.id).latest()}
-        return [_stage_progress(job, stage, latest.get(stage)) for stage in stages_of(job.spec)]
+        return [_stage_progress(job, stage, latest.get(stage)) for stage in stages_of(job.spec, latest)]
 
     def free_bytes(self) -> int:
         """Free space where jobs are stored."""

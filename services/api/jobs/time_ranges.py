@@ -221,7 +221,7 @@ class _Past:
 
 def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position | None:
     """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is left."""
-    stages = stages_of(job.spec)
+    stages = stages_of(job.spec, [event.stage for event in latest])
     if job.state is JobState.QUEUED:
         if not latest:
             return Position()

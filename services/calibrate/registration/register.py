@@ -57,6 +57,7 @@ def register_folder(
     calibration_file: Path | None = None,
     out: Path | None = None,
     max_misfit_mm: float = MAX_MISFIT_MM,
+    refused: Path | None = None,
 ) -> Registration:
     """Register the scan of a raw folder and write teeth, gums, record, pictures and page.
 
@@ -65,6 +66,7 @@ def register_folder(
         calibration_file: in place of the one that ``raw.toml`` names.
         out: where to write; the raw folder itself by default, whose teeth they then are.
         max_misfit_mm: median distance of outlines beyond which the scan is refused.
+        refused: where pictures of a refusal are written; beside the others by default.
 
     Raises:
         CaptureInputError: something is missing or contradicts, or the pose is not to be believed; where a picture shows
@@ -79,7 +81,7 @@ def register_folder(
     scanned = scanned_teeth(root, folder)
     views, clicks = photographs(root, folder, calibration), clicks_of(folder, calibration)
     require_on_their_teeth(clicks, scanned)
-    steps, cut, misfit_mm = _registered(views, clicks, scanned, out / PICTURES, max_misfit_mm)
+    steps, cut, misfit_mm = _registered(views, clicks, scanned, refused or out / PICTURES, max_misfit_mm)
 
     pose = steps[-1].pose
     pictures = []

@@ -67,8 +67,11 @@ def read_calibration(root: Path, folder: RawFolder, chosen: Path | None) -> Cali
     return calibration
 
 
-def described(root: Path, folder: RawFolder, calibration: Calibration) -> FolderCapture:
+def described(root: Path, folder: RawFolder, calibration: Calibration, teeth_root: Path | None = None) -> FolderCapture:
     """The cameras and those lights that frames were taken under, with the calibration's places; no image is listed.
+
+    Args:
+        teeth_root: folder of the teeth and of their registration; the raw folder by default.
 
     Raises:
         CaptureInputError: no frame is lit, or under a light that is not calibrated.
@@ -88,5 +91,5 @@ def described(root: Path, folder: RawFolder, calibration: Calibration) -> Folder
         channels=folder.channels,
         cameras=tuple(by_name[camera.name] for camera in folder.camera),
         lights=tuple(known[light.name] for light in folder.light if light.name in lit),
-        uncertainty=with_registration(root, calibration.uncertainty),
+        uncertainty=with_registration(teeth_root or root, calibration.uncertainty),
     )

@@ -9,10 +9,14 @@ import numpy as np
 from pydantic import Field
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.errors import CaptureInputError
 from services.core.geometry import Matrix4, Record, Vector3
+from services.core.raw.folder import DESCRIPTION, is_raw_folder, parse_raw_folder
 from services.core.store import read_record
 
 REGISTRATION = "registration.json"
+REGISTERED = "registered"
+"""Folder in a job's that holds teeth, gums and record of a registration that the job made itself."""
 
 
 class RegistrationStep(Record):
@@ -44,6 +48,26 @@ class Registration(Record):
     repairs: str = Field(description="what was mended in the scan, in words")
     inputs: dict[str, str] = Field(description="SHA-256 of the scan and of the calibration, by file name")
     pictures: tuple[str, ...] = Field(description="overlays, one a camera")
+
+
+def lacks_pose(capture: Path) -> bool:
+    """Whether a capture is a raw folder with a scan whose teeth nobody has registered yet.
+
+    A description that cannot be read has no scan here; whoever prepares it says what is wrong.
+    """
+    if not is_raw_folder(capture) or (capture / "teeth").exists():
+        return False
+    try:
+        origin = capture / DESCRIPTION
+        return parse_raw_folder(origin.read_bytes(), str(origin)).scan is not None
+    except CaptureInputError:
+        return False
+
+
+def teeth_root(capture: Path, job: Path) -> Path:
+    """Folder of the teeth of a raw folder: its own, or the job's where the job has registered them."""
+    registered = job / REGISTERED
+    return registered if not (capture / "teeth").exists() and registered.is_dir() else capture
 
 
 def with_registration(root: Path, uncertainty: CalibrationUncertainty | None) -> CalibrationUncertainty | None:

@@ -27,23 +27,33 @@ class RawSource:
     held_out: tuple[tuple[str, str], ...] = ()
     measures_motion = True
 
-    def __init__(self, root: Path, calibration: Path | None, noise_relative: float, noise_floor: float) -> None:
+    def __init__(
+        self,
+        frames_root: Path,
+        calibration: Path | None,
+        noise_relative: float,
+        noise_floor: float,
+        teeth_root: Path | None = None,
+    ) -> None:
         """Read the description and the calibration; no pixel is read yet.
 
         Args:
+            frames_root: the raw folder.
             calibration: that of the job, in place of the folder's own.
             noise_relative: assumed noise where nothing tells it, fraction of the value.
             noise_floor: and of full scale.
+            teeth_root: folder of the teeth, where it is not the raw folder.
 
         Raises:
             CaptureInputError: names what is missing or contradictory.
         """
-        self.root, self._noise = root, (noise_relative, noise_floor)
+        self.root = teeth_root or frames_root
+        self._frames_root, self._noise = frames_root, (noise_relative, noise_floor)
         self._measured: dict[str, CameraFrames] = {}
-        self._folder = read_raw_folder(root)
-        self.calibration = read_calibration(root, self._folder, calibration)
+        self._folder = read_raw_folder(frames_root)
+        self.calibration = read_calibration(frames_root, self._folder, calibration)
         self._cameras = {camera.name: camera for camera in self.calibration.cameras}
-        self.description = described(root, self._folder, self.calibration)
+        self.description = described(frames_root, self._folder, self.calibration, self.root)
         self._frames = _in_time(frame for frame in self._folder.frame if frame.kind in {"light", "tracking"})
         self.notes: tuple[str, ...] = tuple(missing_exposures(self._folder))
         fewest = min(sum(frame.kind == "tracking" for frame in self._of(camera.name)) for camera in self._folder.camera)
@@ -60,7 +70,7 @@ class RawSource:
         """See ``Source``: every frame's size and time of change, so that one that was exported again counts."""
         lines = [self.description.model_dump_json(), self._folder.model_dump_json(), repr(self._noise)]
         lines.append(self.calibration.model_dump_json())
-        paths = [path for frame in self._folder.frame if (path := self.root / frame.file).is_file()]
+        paths = [path for frame in self._folder.frame if (path := self._frames_root / frame.file).is_file()]
         lines += [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
         return "\n".join(lines)
 
@@ -86,10 +96,12 @@ class RawSource:
     def _raw_view(self, view: View) -> RawView:
         name = view.whole.name
         if name not in self._measured:
-            self._measured[name] = CameraFrames(self.root, self._folder, self._cameras[name], self._noise, view.scratch)
+            self._measured[name] = CameraFrames(
+                self._frames_root, self._folder, self._cameras[name], self._noise, view.scratch
+            )
             self.notes += tuple(self._measured[name].notes)
         motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name))
-        return RawView(self.root, self._measured[name], view, motion, self.description.channels)
+        return RawView(self._frames_root, self._measured[name], view, motion, self.description.channels)
 
     def _table(self, camera: str) -> list[FrameRecord]:
         return [_row(index, frame) for index, frame in enumerate(self._of(camera))]
