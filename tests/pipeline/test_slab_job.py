@@ -32,6 +32,7 @@ from services.fit.slab.results.kept import IMAGES, Kept, read_kept
 from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 from services.fit.slab.results.tabphase import tabphase_values
 from services.fit.slab.schedule import WavelengthTask, run_wavelengths
+from services.fit.slab.solve.standing import Standing
 from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
@@ -231,6 +232,32 @@ def test_blocks_on_many_workers_give_the_answer_of_one(job: Path, spec: JobSpec,
     assert kept is not None
     for name in ("parameters", "phase", "errors"):
         assert json.loads(getattr(kept.fit, name).model_dump_json()) == stored_fits(job)[0][name]
+
+
+def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec: JobSpec, tmp_path: Path) -> None:
+    class CutShortError(Exception):
+        pass
+
+    def cut_short(_wavelength_nm: float, standing: Standing) -> None:
+        if standing.stage == 1:
+            raise CutShortError
+
+    assert spec.capture is not None
+    options = SlabOptions(seed=spec.seed, effort=spec.effort)
+    task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
+    first, second = ManyThreads(), ManyThreads()
+    with pytest.raises(CutShortError):
+        list(run_wavelengths(first, [task], workers=1, told=cut_short))
+    stood: list[Standing] = []
+    list(run_wavelengths(second, [task], workers=1, told=lambda _, standing: stood.append(standing)))
+    # The last stage and what is rendered after it alone; the search and the first stage had more blocks than that.
+    assert stood[0].stage == 1
+    assert len(second.ran) < len(first.ran)
+    kept = read_kept(task.place)
+    assert kept is not None
+    for name in ("parameters", "phase", "errors"):
+        assert json.loads(getattr(kept.fit, name).model_dump_json()) == stored_fits(job)[0][name]
+    assert {one.name for one in task.place.iterdir()} == {"fit.json", IMAGES}
 
 
 def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
 from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.standing import StandingFile
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
@@ -71,13 +72,20 @@ def fit_images(
     options: SlabOptions,
     blocks: Blocks,
     dictionary: ChosenDictionary,
+    kept: StandingFile | None = None,
 ) -> Wavelength:
-    """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``."""
+    """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``.
+
+    Args:
+        kept: where the fit goes on from, and keeps how far it has come.
+    """
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
     rig = rig_of(folder, wavelength_nm, index.value)
-    solver = GaussNewton(rig, measured, options.seed, _budget(options, dictionary), blocks, dictionary.coordinates)
-    solution = solver.solve(start(rig, measured, options.seed, blocks))
+    solver = GaussNewton(
+        rig, measured, options.seed, _budget(options, dictionary), blocks, dictionary.coordinates, kept=kept
+    )
+    solution = solver.solve(lambda: start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
     advice = (
         next_measurement(folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks)
@@ -109,14 +117,8 @@ def fit_images(
 
 
 def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
-    plain, effort = Budget(), options.effort
-    last = tuple((max(1, round(effort * paths)), batches) for paths, batches in plain.last)
-    return Budget(
-        first_paths=max(1, round(effort * plain.first_paths)),
-        search_paths=max(1, round(effort * plain.search_paths)),
-        last=last,
-        most_steps=STEPS_OF_ATOMS if dictionary.names else plain.most_steps,
-    )
+    plain = Budget(most_steps=STEPS_OF_ATOMS) if dictionary.names else Budget()
+    return plain.scaled(options.effort)
 
 
 def last_look(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:

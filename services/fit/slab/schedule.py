@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from services.fit.slab.model.dictionary import KNOTS
 from services.fit.slab.model.forward import Block, Blocks, BlockSums
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.kept import fingerprint, keep, read_kept
+from services.fit.slab.solve.standing import Standing, StandingFile
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
 """Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones stay where they are."""
@@ -36,7 +38,13 @@ class WavelengthTask:
     """The job is cancelled once it exists."""
 
 
-def run_wavelengths(run_on: Executor, tasks: Sequence[WavelengthTask], workers: int) -> Iterator[Path]:
+Told = Callable[[float, Standing], None]
+"""Takes a wavelength and where its fit stands."""
+
+
+def run_wavelengths(
+    run_on: Executor, tasks: Sequence[WavelengthTask], workers: int, told: Told = lambda *_: None
+) -> Iterator[Path]:
     """Fit wavelengths, unless an earlier attempt has; gives the folder of each as soon as it is done.
 
     With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other here, and
@@ -45,6 +53,7 @@ def run_wavelengths(run_on: Executor, tasks: Sequence[WavelengthTask], workers: 
 
     Args:
         workers: that the job asked for; some may still be starting.
+        told: called before each of the last steps of a wavelength whose blocks run on all workers.
 
     Raises:
         JobCancelledError: between two blocks of paths.
@@ -53,7 +62,7 @@ def run_wavelengths(run_on: Executor, tasks: Sequence[WavelengthTask], workers: 
         yield from run_on.as_they_end([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
         return
     for task in tasks:
-        yield fit_wavelength(task, _spread(run_on, task))
+        yield fit_wavelength(task, _spread(run_on, task), partial(told, task.wavelength_nm))
 
 
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
@@ -73,15 +82,18 @@ def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, fl
     return trace(block)
 
 
-def fit_wavelength(task: WavelengthTask, blocks: Blocks) -> Path:
-    """Fit one wavelength into its folder, unless an earlier attempt has."""
+def fit_wavelength(task: WavelengthTask, blocks: Blocks, told: Callable[[Standing], None] = lambda _: None) -> Path:
+    """Fit one wavelength into its folder, unless an earlier attempt has; one that was cut short goes on before its last step."""
     mark = fingerprint(task.root, task.wavelength_nm, task.options)
     kept = read_kept(task.place)
     if kept is None or kept.of != mark:
         folder = read_folder(task.root)
         measured = read_images(task.root, folder, task.wavelength_nm)
         dictionary = dictionary_of(task.root, folder, task.wavelength_nm, task.options)
-        keep(task.place, mark, fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary))
+        standing = StandingFile(task.place, mark, told)
+        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, standing)
+        keep(task.place, mark, fit)
+        standing.remove()
     return task.place
 
 

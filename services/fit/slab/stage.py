@@ -18,9 +18,10 @@ from services.core.verdict import VERDICT
 
 if TYPE_CHECKING:
     from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.solve.standing import Standing
 
 CHECKPOINT = "fit-checkpoint"
-"""Below the job's folder: one folder for every wavelength that is done, so that a new attempt goes on after them."""
+"""Below the job's folder, one folder a wavelength: its result once it is done, until then where its fit stands, so that a new attempt goes on there."""
 
 
 def run(spec: JobSpec, context: StageContext) -> SlabReport:
@@ -50,8 +51,14 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
     tasks = [WavelengthTask(root, nm, options, place, flag) for nm, place in places.items()]
+
+    def told(wavelength_nm: float, standing: Standing) -> None:
+        where = f"before step {standing.step + 1} of stage {standing.stage + 1}"
+        message = f"{wavelength_nm:g} nm: {where}, σs {standing.material.scattering_per_mm:.4g} per mm."
+        context.report(StageEvent(stage="fit", kind="log", message=message))
+
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
-        for number, place in enumerate(run_wavelengths(run_on, tasks, spec.workers), 1):
+        for number, place in enumerate(run_wavelengths(run_on, tasks, spec.workers, told), 1):
             kept = read_kept(place)
             assert kept is not None
             which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}

@@ -8,7 +8,8 @@ finish      one more step, from many more paths
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.normal import NormalEquations, normal_equations
 from services.fit.slab.solve.prior import THICK, Quadratic
 from services.fit.slab.solve.seen import broad_step, step_matrix
+from services.fit.slab.solve.standing import Standing, StandingFile
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
@@ -52,6 +54,15 @@ class Budget:
     most_last_thick: int = 8
     """The same where sigma_t w exceeds ``prior.THICK``."""
     most_steps: int = 10
+
+    def scaled(self, effort: float) -> Budget:
+        """The same with so many times the paths."""
+        return replace(
+            self,
+            first_paths=max(1, round(effort * self.first_paths)),
+            search_paths=max(1, round(effort * self.search_paths)),
+            last=tuple((max(1, round(effort * paths)), batches) for paths, batches in self.last),
+        )
 
 
 @dataclass(frozen=True)
@@ -105,16 +116,27 @@ class GaussNewton:
     paths: int = 0
     path_noise: tuple[Array, ...] | None = None
     """Monte Carlo covariance of one path by light (pixels, C, C), a running mean over the renders before."""
+    kept: StandingFile | None = None
+    """Where to go on from, and where to keep how far the fit has come; None for neither."""
 
-    def solve(self, material: Material) -> Solution:
-        """Iterate from a guess to the solution."""
+    def solve(self, guess: Callable[[], Material]) -> Solution:
+        """From a guess to the solution, or from where an earlier attempt stood before a step of the last stages."""
+        standing = None if self.kept is None else self.kept.read()
+        if standing is None:
+            return self.finish(self.search(guess()))
+        self.renders, self.paths, self.path_noise = standing.renders, standing.paths, standing.path_noise
+        return self.finish(standing)
+
+    def search(self, material: Material) -> Standing:
+        """Iterate with few paths, as far as these tell."""
         state = self.init(self.coordinates.begun(material))
         steps = 0
         converged = False
         while steps < self.budget.most_steps and not converged:
             state, converged = self.step(state)
             steps += 1
-        return self.finish(state, steps, converged)
+        assert self.path_noise is not None
+        return Standing(state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise)
 
     def init(self, material: Material) -> State:
         """The first point."""
@@ -145,29 +167,51 @@ class GaussNewton:
             state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping
         ), False
 
-    def finish(self, state: State, steps: int, converged: bool) -> Solution:
+    def finish(self, standing: Standing) -> Solution:
         """Steps from many paths, then from the most: each stage until its paths tell of nothing more."""
-        material = state.material
-        for paths, batches in self.budget.last:
-            for _ in range(self.budget.most_last_thick if self.is_thick(material) else self.budget.most_last):
-                equations = self.linearised(material, paths, batches)
-                x = self.coordinates.unknowns(material)
-                quadratic = quadratic_at(x, equations)
-                scale = self.coordinates.scale(material, self.rig.width_mm, quadratic)
-                prior = self.coordinates.precision(scale)
-                change = self.change(quadratic, prior, material, DAMPING)
-                material = self.coordinates.material_at(x + change)
-                noise = noise_of_promise(quadratic, prior, equations.gradient_noise)
-                promise = promised(quadratic, prior, x, change)
-                finished = promise < UNFINISHED * noise
-                if promise < (UNFINISHED_THICK if self.is_thick(material) else UNFINISHED) * noise:
-                    break
+        while standing.stage < len(self.budget.last):
+            if self.kept is not None:
+                self.kept.write(standing)
+            material, (paths, batches) = standing.material, self.budget.last[standing.stage]
+            equations = self.linearised(material, paths, batches)
+            x = self.coordinates.unknowns(material)
+            quadratic = quadratic_at(x, equations)
+            scale = self.coordinates.scale(material, self.rig.width_mm, quadratic)
+            prior = self.coordinates.precision(scale)
+            change = self.change(quadratic, prior, material, DAMPING)
+            moved = self.coordinates.material_at(x + change)
+            worth = promised(quadratic, prior, x, change) / noise_of_promise(quadratic, prior, equations.gradient_noise)
+            standing = self.after(standing, moved, worth)
         return Solution(
-            material, quadratic, equations.gradient_noise, scale, equations.used, steps, converged and finished, self.paths,
+            moved, quadratic, equations.gradient_noise, scale, equations.used, standing.search_steps,
+            standing.is_converged and worth < UNFINISHED, self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
-            self.is_thick(material),
-            equations.matrix_error @ (self.coordinates.unknowns(material) - x),
+            self.is_thick(moved),
+            equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
         )  # fmt: skip
+
+    def after(self, standing: Standing, moved: Material, worth: float) -> Standing:
+        """The next step of the stage, or the first of the next stage where this one has ended.
+
+        Args:
+            worth: what the last step promised, in units of what noise alone does.
+        """
+        enough, most = (
+            (UNFINISHED_THICK, self.budget.most_last_thick)
+            if self.is_thick(moved)
+            else (UNFINISHED, self.budget.most_last)
+        )
+        is_over = worth < enough or standing.step + 1 >= most
+        assert self.path_noise is not None
+        return replace(
+            standing,
+            material=moved,
+            stage=standing.stage + is_over,
+            step=0 if is_over else standing.step + 1,
+            renders=self.renders,
+            paths=self.paths,
+            path_noise=self.path_noise,
+        )
 
     def is_thick(self, material: Material) -> bool:
         """Whether cameras of one side see nearly the same of every path, and sigma_s and g are hardly told apart."""

@@ -1,0 +1,88 @@
+"""Where a fit stands before each step of its last stages, kept so that a new attempt goes on there to the same digits."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.store import write_atomic
+from services.fit.slab.model.dictionary import Material
+from services.fit.slab.solve.mixture import Mixture
+
+Array = NDArray[np.float64]
+
+FILE = "steps.npz"
+
+
+@dataclass(frozen=True)
+class Standing:
+    """All that a step of the last stages depends on, beside the measurements and the options."""
+
+    material: Material
+    stage: int
+    step: int
+    """Of the stage, from 0."""
+    search_steps: int
+    is_converged: bool
+    """Whether the search before came as far as its paths could tell."""
+    renders: int
+    paths: int
+    path_noise: tuple[Array, ...]
+    """See ``GaussNewton``."""
+
+
+@dataclass(frozen=True)
+class StandingFile:
+    """Keeps the newest standing of one wavelength in a folder."""
+
+    folder: Path
+    of: str
+    """What the result depends on; a standing of anything else is not read."""
+    told: Callable[[Standing], None] = lambda _: None
+    """Called with each standing that is kept."""
+
+    def write(self, standing: Standing) -> None:
+        """Keep it in place of the one before."""
+        arrays: dict[str, Any] = {name: np.array(getattr(standing, name)) for name in _NUMBERS}
+        arrays |= {f"path_noise_{k}": one for k, one in enumerate(standing.path_noise)}
+        for field in fields(standing.material):
+            arrays[f"material_{field.name}"] = np.asarray(getattr(standing.material, field.name))
+        stream = io.BytesIO()
+        np.savez(stream, of=np.array(self.of), **arrays)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(self.folder / FILE, stream.getvalue())
+        self.told(standing)
+
+    def read(self) -> Standing | None:
+        """The newest; None where nothing whole of this fit is there."""
+        try:
+            with np.load(io.BytesIO((self.folder / FILE).read_bytes()), allow_pickle=False) as held:
+                arrays = dict(held)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            return None
+        if str(arrays.pop("of", "")) != self.of:
+            return None
+        numbers: dict[str, Any] = {name: arrays[name].item() for name in _NUMBERS}
+        noise = tuple(arrays[f"path_noise_{k}"] for k in range(sum(name.startswith("path_noise_") for name in arrays)))
+        return Standing(_material(arrays), path_noise=noise, **numbers)
+
+    def remove(self) -> None:
+        """The fit is done."""
+        (self.folder / FILE).unlink(missing_ok=True)
+
+
+_NUMBERS = ("stage", "step", "search_steps", "is_converged", "renders", "paths")
+
+
+def _material(arrays: dict[str, Array]) -> Material:
+    scattering, absorption = arrays["material_scattering"], float(arrays["material_absorption_per_mm"])
+    if "material_atom_weights" in arrays:
+        return Mixture(scattering, absorption, arrays["material_atom_weights"])
+    return Material(scattering, absorption)

@@ -1,0 +1,59 @@
+"""Where a slab's fit stands, kept in a file: read again to the last digit, and not at all where it is torn or of another fit."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.fit.slab.model.dictionary import Material, henyey_greenstein
+from services.fit.slab.solve.mixture import Mixture
+from services.fit.slab.solve.standing import FILE, Standing, StandingFile
+
+
+def standing(material: Material) -> Standing:
+    noise = tuple(np.random.default_rng(k).random((4, 2, 2)) for k in range(11))
+    return Standing(material, 1, 2, 7, True, 12, 345_678, noise)
+
+
+def same(one: Standing, other: Standing) -> bool:
+    pairs = [(getattr(one, field.name), getattr(other, field.name)) for field in fields(Standing)[1:]]
+    pairs += [
+        (getattr(one.material, field.name), getattr(other.material, field.name)) for field in fields(one.material)
+    ]
+    return type(one.material) is type(other.material) and all(
+        np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs
+    )
+
+
+MEDIUM = henyey_greenstein(1.2, 0.6, 0.05)
+
+
+@pytest.mark.parametrize("material", [MEDIUM, Mixture(MEDIUM.scattering, 0.05, np.array([0.1, 1.1]))])
+def test_a_standing_is_read_as_it_was_written(material: Material, tmp_path: Path) -> None:
+    told: list[Standing] = []
+    file, written = StandingFile(tmp_path / "532", "mark", told.append), standing(material)
+    assert file.read() is None
+    file.write(written)
+    read = file.read()
+    assert read is not None
+    assert same(read, written)
+    assert told == [written]
+    file.remove()
+    assert file.read() is None
+
+
+def test_a_standing_of_another_fit_is_not_read(tmp_path: Path) -> None:
+    StandingFile(tmp_path, "mark").write(standing(MEDIUM))
+    assert StandingFile(tmp_path, "other").read() is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_torn_file_is_not_read(share: float, tmp_path: Path) -> None:
+    file = StandingFile(tmp_path, "mark")
+    file.write(standing(MEDIUM))
+    content = (tmp_path / FILE).read_bytes()
+    (tmp_path / FILE).write_bytes(content[: int(share * len(content))])
+    assert file.read() is None
