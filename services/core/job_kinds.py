@@ -53,7 +53,14 @@ _SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export"
 
 SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_absorption"})
 """What only a slab may be told."""
-_OF_A_JAW: Mapping[str, Any] = {"lobes": 1, "held": {}, "stains": False, "solver": "gauss-newton", "loss": "l2"}
+_OF_A_JAW: Mapping[str, Any] = {
+    "fdi": None,
+    "lobes": 1,
+    "held": {},
+    "stains": False,
+    "solver": "gauss-newton",
+    "loss": "l2",
+}
 
 ENTRY_POINTS = "dentine.job_kinds"
 """Group of entry points by which installed packages add kinds."""

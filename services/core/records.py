@@ -173,6 +173,12 @@ class JobSpec(Record):
     accept_calibration: bool = Field(
         default=False, description="use a calibration also where it is beyond the limits that it was held to"
     )
+    fdi: Whole | None = Field(
+        default=None,
+        ge=11,
+        le=85,
+        description="of kind tooth: the tooth to fit, by its FDI number, where the capture has several; the others are in the way",
+    )
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(

@@ -56,7 +56,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it."
         )
     masks = HandMasks(context.root, source.description)
-    subject = read_subject(source.root, whole=spec.kind == "jaw")
+    subject = read_subject(source.root, whole=spec.kind == "jaw", fdi=spec.fdi)
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
 
     workshop = Workshop(StageWriter(context.root, STAGE, context.attempt))

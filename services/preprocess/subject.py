@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.errors import CaptureInputError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.preprocess.projection import Footprint, project
@@ -27,6 +28,8 @@ class Subject:
     """Open, seen from either side."""
     whole: bool
     """Whether gums and wall are to be fitted too; else gums are in the way."""
+    others: tuple[Mesh, ...] = ()
+    """Teeth that are not to be fitted, and so are in the way."""
 
     @property
     def gums_number(self) -> int:
@@ -37,6 +40,11 @@ class Subject:
     def cavity_number(self) -> int:
         """Of the wall in a footprint."""
         return len(self.teeth) + 1
+
+    @property
+    def in_the_way(self) -> tuple[Mesh, ...]:
+        """What hides and shades, and is not to be fitted."""
+        return self.others if self.gums is None or self.whole else (*self.others, self.gums)
 
     def fitted_meshes(self) -> list[Mesh]:
         """What a camera's window is to hold."""
@@ -53,7 +61,7 @@ class Subject:
         """What a camera sees of all that is to be fitted."""
         outers = [tooth.outer for tooth in self.teeth]
         if not self.whole:
-            return project(camera, outers, () if self.gums is None else (self.gums,))
+            return project(camera, outers, self.in_the_way)
         shown = dict(enumerate(outers))
         if self.gums is not None:
             shown[self.gums_number] = self.gums
@@ -74,19 +82,30 @@ class Subject:
         return np.bincount(labels, minlength=len(self.teeth))[: len(self.teeth)]
 
 
-def read_subject(root: Path, whole: bool) -> Subject:
+def read_subject(root: Path, whole: bool, fdi: int | None = None) -> Subject:
     """Read ``teeth/``, ``gums.ply`` and, where all is to be fitted, ``cavity.ply`` of a capture.
 
+    Args:
+        root: of the capture.
+        whole: whether gums and wall are to be fitted too.
+        fdi: the one tooth that is to be fitted; None for all.
+
     Raises:
-        CaptureInputError: no tooth is there, or a file cannot be read. MeshError: a surface cannot bound a medium.
+        CaptureInputError: no tooth is there, or not this one, or a file cannot be read. MeshError: a surface cannot bound a medium.
     """
     teeth, gums = read_teeth(root), _optional(root / "gums.ply")
+    chosen = tuple(tooth for tooth in teeth if fdi in {None, tooth.fdi})
+    if not chosen:
+        raise CaptureInputError(
+            f"Option 'fdi' names tooth {fdi}, but the capture has {', '.join(str(tooth.fdi) for tooth in teeth)}; name one of these."
+        )
     cavity = _optional(root / "cavity.ply") if whole else None
     if whole and gums is not None:
         gums.require_solid("gums.ply")
     if cavity is not None:
         cavity.require_surface("cavity.ply")
-    return Subject(teeth, gums, cavity, whole)
+    others = tuple(tooth.outer for tooth in teeth if fdi not in {None, tooth.fdi})
+    return Subject(chosen, gums, cavity, whole, others)
 
 
 def _optional(path: Path) -> Mesh | None:

@@ -134,7 +134,7 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
     folder, manifest = open_stage(root, "prepared", PreparedManifest)
     if spec.kind == "tooth" and len(manifest.fdi) != 1:
         raise CaptureInputError(
-            f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); keep one folder below teeth/, or set kind to 'jaw'."
+            f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); name one by the option 'fdi', or set kind to 'jaw'."
         )
     if spec.kind == "jaw" and len(manifest.fdi) < 2:
         raise CaptureInputError(

@@ -49,7 +49,7 @@ class _Coarse:
 def shade(workshop: Workshop, source: Source, subject: Subject, view: View, context: StageContext) -> None:
     """Flag SHADOW in all images of a camera and store how sure that is, in per cent.
 
-    Surfaces that the fit renders throw their shadows there; gums that it does not render shade here by their geometry, and
+    Surfaces that the fit renders throw their shadows there; gums and teeth that it does not render shade here by their geometry, and
     what no scan shows by comparing the camera's lights.
 
     Raises:
@@ -66,8 +66,8 @@ def shade(workshop: Workshop, source: Source, subject: Subject, view: View, cont
         lamp = source.description.lights[j]
         radiance[place], variance[place] = _brightness(workshop, view, j, coarse)
         irradiance[place], facing[place] = _light_on(coarse, lamp, rendered)
-        if subject.gums is not None and not subject.whole:
-            free = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, [subject.gums])
+        if subject.in_the_way:
+            free = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, list(subject.in_the_way))
             by_geometry[place] = coarse.seen & (irradiance[place] > 0) & ~free
             irradiance[place][by_geometry[place]] = 0
     confidence = by_geometry.astype(np.float32)

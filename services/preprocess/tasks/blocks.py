@@ -61,7 +61,7 @@ class Block:
         context.raise_if_cancelled()
         self.workshop.writer.require_lease()
         source = open_source(self.spec, context.root, verify=False)
-        subject = read_subject(source.root, whole=self.spec.kind == "jaw")
+        subject = read_subject(source.root, whole=self.spec.kind == "jaw", fdi=self.spec.fdi)
         if self.step == "look":
             _look(self.workshop, source, subject, self.camera)
             return

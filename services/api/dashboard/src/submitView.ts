@@ -8,7 +8,7 @@ import { OptionField } from "./optionField";
 const SOURCES = new Set(["capture", "rig"]);
 /** Groups by the options that they hold; what the schema has besides comes last, so that no option is missing. */
 const GROUPS: [string, string[]][] = [
-  ["What is fitted", ["kind", "boundary", "ior", "dentin", "stains", "lobes"]],
+  ["What is fitted", ["kind", "fdi", "boundary", "ior", "dentin", "stains", "lobes"]],
   ["Images", ["channels", "held_out_lights", "calibration", "accept_calibration", "instrument", "shadows", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
   ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "image_tolerance", "search_candidates", "advise", "seed", "priority", "workers", "device"]],
   ["Slab", ["dictionary", "particle_index", "particle_absorption", "effort"]],
