@@ -1,10 +1,13 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo bom deploy-test deploy-check manifests gallery figures test test-all faults contracts attacks roles bare-test lint bench dashboard setup
+.PHONY: demo lab-demo bom deploy-test deploy-check manifests gallery figures test test-all faults contracts attacks roles bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 
 demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and report, below demo/
 	@$(BIN)/dentine demo --out demo
+
+lab-demo: setup ## virtual laboratory: raw frames -> calibration -> registration -> preparation -> fit -> comparison with the truth, below lab/
+	@$(BIN)/dentine lab-demo --out lab
 
 gallery: setup ## pictures of a tooth in an ordinary scene, in gallery/, some minutes
 	@$(BIN)/python -m services.bench.figures.gallery --out gallery

@@ -57,6 +57,7 @@ def build_app() -> typer.Typer:
     from services.cli.dome_sim import dome_sim
     from services.cli.export import export
     from services.cli.import_folder import import_command
+    from services.cli.lab_demo import lab_demo
     from services.cli.phantom import phantom
     from services.cli.register import register
     from services.cli.run import run
@@ -83,6 +84,7 @@ def build_app() -> typer.Typer:
     app.command("import")(import_command)
     app.command("board")(board_command)
     app.command("calibrate")(calibrate_command)
+    app.command("lab-demo")(lab_demo)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
     simulate.command("slab")(simulate_slab_command)

@@ -14,8 +14,8 @@ from services.core.calibration.cameras_and_lights import CalibratedCamera, Calib
 from services.core.calibration.record import Calibration
 from services.core.geometry import Mesh
 from services.core.store import write_record
+from services.phantom.lab.scan import scan_of
 from tests.support.labelled_scan import write_labelled_ply
-from tests.support.phantom_scan import scan_of
 from tests.support.photographed_mouth import clicks_on, photographed_mouth
 from tests.support.raw_folders import Tree, write_toml
 

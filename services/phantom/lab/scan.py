@@ -1,8 +1,11 @@
-"""A scan of a phantom jaw as a scanner would give it: one open labelled surface, cut off above the gums' base, with noise."""
+"""A scan of a phantom jaw as a scanner gives it: one open labelled surface, cut off above the gums' base, with noise."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from numpy.typing import NDArray
 
 from services.anatomy.scans.scan import LabelledScan
 from services.anatomy.scans.separation import separate
@@ -45,3 +48,13 @@ def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) ->
         kept &= near & ((labels == 0) | (labels % 10 <= places))
     joined = joined + np.random.default_rng(seed).normal(0, noise_mm, joined.shape)
     return LabelledScan(Mesh(joined, faces[kept]), labels[kept])
+
+
+def write_labelled_ply(path: Path, mesh: Mesh, labels: NDArray[np.int64]) -> None:
+    """Write a text PLY with the property ``label`` of each face."""
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices_mm)}"]
+    lines += [f"property double {axis}" for axis in "xyz"]
+    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label"]
+    lines += ["end_header", *(" ".join(map(repr, row)) for row in mesh.vertices_mm.tolist())]
+    lines += [f"3 {a} {b} {c} {label}" for (a, b, c), label in zip(mesh.faces.tolist(), labels.tolist(), strict=True)]
+    path.write_text("\n".join(lines) + "\n")

@@ -1,0 +1,87 @@
+"""From the raw frames of a virtual laboratory to a measured tooth, by what a real laboratory's commands do; no truth is read here.
+
+LAB/calibration/    what ``dentine calibrate LAB/session --out LAB/calibration`` writes
+LAB/mouth/          gets teeth, gums and registration.json, as by ``dentine register LAB/mouth``
+LAB/job/            what ``dentine run JOB.toml --out LAB/job`` writes, with the options of ``job_of``
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from services.calibrate.registration.register import register_folder
+from services.calibrate.session.report import write_report
+from services.calibrate.session.run import CALIBRATION as CALIBRATION_FILE
+from services.calibrate.session.run import calibrate, write_session
+from services.core.raw.registration import REGISTRATION, Registration
+from services.core.records import JobSpec
+from services.core.store import read_record
+from services.phantom.lab.make import CALIBRATION, MOUTH, SESSION
+from services.phantom.lab.mouth import FITTED
+
+JOB, COMPARISON = "job", "comparison"
+COARSE: Mapping[str, Any] = MappingProxyType(
+    {
+        "samples_per_pixel": 16,
+        "max_samples_per_pixel": 64,
+        "max_steps": 3,
+        "search_candidates": 2000,
+        "accept_calibration": True,
+    }
+)
+"""Options of a first look."""
+PIXELS_MM = 0.5
+"""Edge of the squares of pixels that are fitted: what a tooth's light spreads over anyway."""
+
+
+def calibrated(root: Path, tell: Callable[[str], None]) -> None:
+    """Calibrate the rig from the session's frames, unless that is done."""
+    out = root / CALIBRATION
+    if (out / CALIBRATION_FILE).is_file():
+        return
+    session = calibrate(root / SESSION, tell)
+    write_report(session, out)
+    write_session(session, out)
+    for limit in session.judgement.broken:
+        tell(f"{limit.what}: {limit.value:.3g} {limit.unit} is beyond its limit of {limit.limit:g}")
+
+
+def registered(root: Path, tell: Callable[[str], None]) -> Registration:
+    """Find where the scan's teeth stand, unless that is done."""
+    folder = root / MOUTH
+    if (folder / REGISTRATION).is_file():
+        return read_record(folder / REGISTRATION, Registration)
+    # Teeth without a record are those of an attempt that was ended.
+    shutil.rmtree(folder / "teeth", ignore_errors=True)
+    tell("registration: landmarks, outlines")
+    return register_folder(folder)
+
+
+def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpec:
+    """The job that measures the tooth.
+
+    Args:
+        capture: raw folder with its teeth.
+        pixel_mm: edge of a photograph's pixel at the teeth.
+        options: of the job, that are others than here.
+    """
+    told = {
+        "capture": capture.resolve(),
+        "fdi": FITTED,
+        "boundary": "matched",
+        "dentin": "fit",
+        "channels": ("green",),
+        "pixel_step": max(round(PIXELS_MM / pixel_mm), 1),
+        "advise": False,
+    }
+    return JobSpec.model_validate(told | dict(options))
+
+
+def forget(root: Path) -> None:
+    """Remove all that was made of other frames."""
+    for name in (CALIBRATION, JOB, COMPARISON):
+        shutil.rmtree(root / name, ignore_errors=True)

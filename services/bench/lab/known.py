@@ -1,0 +1,148 @@
+"""The same photographs with a part of the truth given: which step of the chain brings how much of the error.
+
+All stays in the frame of the calibration session, so that a true part fits to what the chain found of the others.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibration.record import Calibration
+from services.core.files.meshes import read_mesh, read_teeth, write_mesh
+from services.core.geometry import Mesh, teeth_folder
+from services.core.raw.folder import DESCRIPTION
+from services.core.raw.registration import REGISTRATION, Registration
+from services.core.store import read_record, write_atomic, write_record
+from services.phantom.lab.folder import written
+from services.phantom.lab.make import CALIBRATION, CALIBRATION_FILE, LAB_RECORD, MOUTH, TRUTH, LabRecord
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What of the truth is given.
+
+    Attributes:
+        cameras, lights, radiometry: of the rig; radiometry is the lights' intensities and the cameras' radiance per count.
+        pose: of the teeth.
+    """
+
+    cameras: bool = False
+    lights: bool = False
+    radiometry: bool = False
+    pose: bool = False
+
+    @property
+    def is_all(self) -> bool:
+        """Whether calibration and pose are perfect."""
+        return self.cameras and self.lights and self.radiometry and self.pose
+
+
+VARIANTS = {
+    "perfect": Known(cameras=True, lights=True, radiometry=True, pose=True),
+    "true pose": Known(pose=True),
+    "true cameras": Known(cameras=True),
+    "true lights": Known(lights=True),
+    "true radiometry": Known(radiometry=True),
+}
+"""What may be compared, by name; the first is what the chain is held to."""
+
+
+def true_calibration(root: Path) -> Calibration:
+    """The true rig in the frame of the session's first board."""
+    told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
+    rig = read_record(root / TRUTH / CALIBRATION_FILE, Calibration)
+    world_from_session = np.array(told.world_from_session)
+    session_from_world = np.linalg.inv(world_from_session)
+    cameras = tuple(
+        one.model_copy(update={"camera_from_world": _rows(np.array(one.camera_from_world) @ world_from_session)})
+        for one in rig.cameras
+    )
+    lights = tuple(
+        one.model_copy(
+            update={"position_mm": tuple(_applied(session_from_world, np.array([one.position_mm]))[0].tolist())}
+        )
+        for one in rig.lights
+    )
+    return rig.model_copy(update={"cameras": cameras, "lights": lights})
+
+
+def session_from_scan(root: Path) -> Floats:
+    """Where the scan truly lies (4, 4) in the session's frame."""
+    told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
+    return np.asarray(np.linalg.inv(np.array(told.world_from_session)) @ np.array(told.world_from_scan))
+
+
+def write_variant(root: Path, out: Path, known: Known) -> Path:
+    """Write a raw folder of the same frames with a part of the truth; returns its path.
+
+    Args:
+        root: the laboratory, calibrated and registered.
+        out: folder to fill; one that is there is replaced.
+        known: what is given.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    mouth, (found, true) = (
+        root / MOUTH,
+        (read_record(root / CALIBRATION / CALIBRATION_FILE, Calibration), true_calibration(root)),
+    )
+    registration = read_record(mouth / REGISTRATION, Registration)
+    move = np.eye(4)
+    if known.pose:
+        move = session_from_scan(root) @ np.linalg.inv(np.array(registration.rig_from_scan))
+    for tooth in read_teeth(mouth):
+        write_mesh(teeth_folder(out, tooth.fdi) / "outer.ply", _placed(tooth.outer, move))
+    write_mesh(out / "gums.ply", _placed(read_mesh(mouth / "gums.ply"), move))
+    if not known.pose:
+        shutil.copyfile(mouth / REGISTRATION, out / REGISTRATION)
+
+    tree = tomllib.loads((mouth / DESCRIPTION).read_text())
+    for frame in tree["frame"]:
+        _linked(mouth / frame["file"], out / frame["file"])
+    tree = {key: value for key, value in tree.items() if key not in {"scan", "landmark"}}
+    tree["calibration"] = {"file": CALIBRATION_FILE}
+    write_record(out / CALIBRATION_FILE, _mixed(found, true, known))
+    write_atomic(out / DESCRIPTION, written(tree))
+    return out
+
+
+def _mixed(found: Calibration, true: Calibration, known: Known) -> Calibration:
+    cameras = []
+    for one, real in zip(found.cameras, true.cameras, strict=True):
+        geometry, light = (real if known.cameras else one), (real if known.radiometry else one)
+        told = {"radiance_per_count": light.radiance_per_count, "vignetting": light.vignetting}
+        cameras.append(geometry.model_copy(update=told))
+    lights = []
+    for lamp in found.lights:
+        actual = next(light for light in true.lights if light.name == lamp.name)
+        place, bright = (actual if known.lights else lamp), (actual if known.radiometry else lamp)
+        lights.append(place.model_copy(update={"intensity": bright.intensity, "lobe": bright.lobe}))
+    uncertainty = None if known.is_all else found.uncertainty
+    return found.model_copy(update={"cameras": tuple(cameras), "lights": tuple(lights), "uncertainty": uncertainty})
+
+
+def _linked(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without links, or another one
+        shutil.copyfile(source, target)
+
+
+def _placed(mesh: Mesh, move: Floats) -> Mesh:
+    return Mesh(_applied(move, mesh.vertices_mm), mesh.faces)
+
+
+def _applied(move: Floats, points_mm: Floats) -> Floats:
+    return np.asarray(points_mm @ move[:3, :3].T + move[:3, 3])
+
+
+def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))

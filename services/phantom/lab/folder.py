@@ -1,0 +1,83 @@
+"""A raw folder as it is filled: frames one by one, then ``raw.toml``, which makes it whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibration.record import Calibration
+from services.core.raw.folder import DESCRIPTION
+from services.core.store import write_atomic
+from services.phantom.lab.sensor import Sensor
+
+Floats = NDArray[np.float64]
+Entry = dict[str, Any]
+
+
+class RawWriter:
+    """Photographs radiance with a rig's cameras and lists the frames."""
+
+    def __init__(self, root: Path, rig: Calibration, sensor: Sensor, random: np.random.Generator) -> None:
+        root.mkdir(parents=True, exist_ok=True)
+        self.root, self.rig, self.sensor, self._random = root, rig, sensor, random
+        self._frames: list[Entry] = []
+
+    def shoot(self, camera: int, name: str, radiance: Floats, exposure_s: float, **told: Any) -> None:
+        """Photograph an image (H, W, 3) and write it as NAME.npy.
+
+        Args:
+            camera: its number.
+            name: of the file, behind the camera's.
+            radiance: as the lens throws it on the sensor.
+            exposure_s: of the frame.
+            told: further keys of the frame in ``raw.toml``.
+        """
+        taken = self.rig.cameras[camera]
+        file = f"{taken.name}_{name}.npy"
+        np.save(self.root / file, self.sensor.photograph(taken, radiance, exposure_s, self._random))
+        self._frames.append({"camera": taken.name, "file": file, "exposure_s": exposure_s, **told})
+
+    def black(self, camera: int, exposures_s: Sequence[float], count: int) -> None:
+        """Photograph nothing some times with each exposure."""
+        width, height = self.rig.cameras[camera].size
+        for exposure_s in exposures_s:
+            for number in range(count):
+                nothing = np.zeros((height, width, 3))
+                self.shoot(camera, f"black{number}_{exposure_s:g}", nothing, exposure_s, kind="black")
+
+    def finish(self, others: Mapping[str, Any]) -> None:
+        """Write ``raw.toml`` with cameras, lights, frames and other tables."""
+        cameras = [
+            {"name": one.name, "size": list(one.size), "bits": self.sensor.bits, "mosaic": self.sensor.mosaic}
+            for one in self.rig.cameras
+        ]
+        lights = [{"name": one.name} for one in self.rig.lights]
+        tree = {"units": "mm", "camera": cameras, "light": lights, "frame": self._frames, **others}
+        write_atomic(self.root / DESCRIPTION, written(tree))
+
+
+def written(tree: Mapping[str, Any]) -> bytes:
+    """TOML of a description: plain values, then tables, then lists of tables with values in one line."""
+    lines = [f"{key} = {_inline(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
+    for key, value in tree.items():
+        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
+        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
+        for head, table in tables:
+            lines += ["", head, *(f"{name} = {_inline(one)}" for name, one in table.items() if one is not None)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _inline(value: object) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_inline(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return repr(value)

@@ -1,0 +1,110 @@
+"""What light comes from the mouth of a virtual laboratory to a camera, under each of its lights.
+
+The tooth that is measured is walked through by the engine, path by path. What stands around it only has to look like teeth, gums
+and lips, so it is shaded: no light passes between it and that tooth, which is what a fit of one tooth takes for granted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.anatomy.dentin_shape import DentinShape
+from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
+from services.fit.optics.parameters import Tissue
+from services.fit.transport.engine import Engine
+from services.fit.transport.rays import RayScene, pixel_rays
+from services.fit.transport.scene.recipe import single_tooth
+from services.phantom.lab.mouth import FITTED, LabMouth
+from services.phantom.lab.rig import CHANNELS
+from services.phantom.render import render_engine
+
+Floats = NDArray[np.float64]
+SUBPIXELS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+TOOTH, GUMS, LIP, DARK = (0.75, 0.66, 0.52), (0.50, 0.24, 0.22), (0.45, 0.28, 0.27), (0.01, 0.01, 0.01)
+"""Reflectances in red, green and blue of what is shaded, and of the dark of the mouth."""
+SMOOTHING_PX = 1.5
+"""Less than light spreads inside a tooth, and than the squares of pixels that a fit reads."""
+WRAP = 0.3
+"""By how much light wraps around a shaded tooth: scattering inside softens the border between light and dark."""
+
+
+class MouthLight:
+    """Radiance of a mouth in the cameras of a rig, each as a pinhole has it."""
+
+    def __init__(self, mouth: LabMouth, lights: tuple[CalibratedLight, ...], tissues: dict[str, Tissue]) -> None:
+        self._lights, self._tissues = lights, tissues
+        order = sorted(mouth.teeth, key=lambda tooth: tooth.fdi != FITTED)
+        outers = [tooth.outer for tooth in order]
+        self._all, self._alone = RayScene(*outers, mouth.gums, mouth.lips), RayScene(outers[0])
+        self._colours = np.array([*[TOOTH] * len(outers), GUMS, LIP, DARK])
+        self._wrap = np.array([*[WRAP] * len(outers), 0.0, 0.0, 0.0])
+        tooth = order[0]
+        assert tooth.dentin is not None
+        # Images are linear in each light's intensity, so one scene serves all channels.
+        places, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))
+        self._engine = Engine(single_tooth(tooth.outer, DentinShape.known(tooth.dentin), places, unit))
+
+    def images(self, camera: CalibratedCamera, samples: int, seed: int) -> Floats:
+        """Radiance (L, H, W, 3) under each light, averaged over the pixels.
+
+        Args:
+            camera: whose lens is left out.
+            samples: paths per pixel in green, of the fitted tooth; red and blue have a quarter of them.
+            seed: of the paths.
+        """
+        drawn, shaded, visible, met = self._around(camera)
+        share = np.where(met > 0, visible / np.maximum(met, 1), 0.0)
+        for channel, name in enumerate(CHANNELS):
+            paths = samples if name == "green" else max(samples // 4, 1)
+            own = render_engine(self._engine, self._tissues[name], camera, visible > 0, paths, seed)[0]
+            intensity = np.array([light.intensity[channel] for light in self._lights])
+            own = _smoothed(own * intensity[:, None, None], visible > 0, share)
+            # Its neighbours are as bright as the tooth itself, over all lights and pixels.
+            whole = visible == len(SUBPIXELS)
+            like = own[:, whole].sum() / max(float(shaded[:, whole, channel].sum()), 1e-30)
+            teeth, others = drawn[0][..., channel], drawn[1][..., channel]
+            drawn[1][..., channel] = own + like * teeth + others
+        return drawn[1]
+
+    def _around(
+        self, camera: CalibratedCamera
+    ) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.int64], NDArray[np.int64]]:
+        """Shaded neighbours and all else, the fitted tooth as if it were shaded (L, H, W, 3), and how many subpixels see it and could."""
+        width, height = camera.size
+        neighbours, others, fitted = (np.zeros((len(self._lights), height * width, 3)) for _ in range(3))
+        visible, met = (np.zeros(height * width, dtype=np.int64) for _ in range(2))
+        last_tooth = len(self._colours) - 4
+        for offset in SUBPIXELS:
+            origin, directions = pixel_rays(camera, offset)
+            hits = self._all.first_hits(origin, directions)
+            met += self._alone.first_hits(origin, directions).hit
+            visible += hits.mesh == 0
+            for n, light in enumerate(self._lights):
+                towards = np.array(light.position_mm) - hits.points_mm
+                distance = np.linalg.norm(towards, axis=1)
+                wrap = self._wrap[hits.mesh]
+                cosine = ((hits.normals * towards).sum(axis=1) / distance + wrap) / (1 + wrap)
+                lit = np.where(hits.hit, np.maximum(cosine, 0), 0.2) / (np.pi * distance**2) / len(SUBPIXELS)
+                light_out = lit[:, None] * self._colours[hits.mesh] * np.array(light.intensity)
+                for target, where in (
+                    (fitted, hits.mesh == 0),
+                    (neighbours, (hits.mesh > 0) & (hits.mesh <= last_tooth)),
+                    (others, (hits.mesh < 0) | (hits.mesh > last_tooth)),
+                ):
+                    target[n] += np.where(where[:, None], light_out, 0.0)
+        shape = (len(self._lights), height, width, 3)
+        seen = visible.reshape(height, width), met.reshape(height, width)
+        return (neighbours.reshape(shape), others.reshape(shape)), fitted.reshape(shape), *seen
+
+
+def _smoothed(images: Floats, seen: NDArray[np.bool_], share: Floats) -> Floats:
+    """Images (L, H, W) of a tooth, as much of each pixel as shows it, with the noise of single paths spread over neighbours.
+
+    A few hundred paths leave some pixels several times too bright, which would clip in a sensor as no light does.
+    """
+    import cv2
+
+    weight = cv2.GaussianBlur(seen.astype(np.float64), (0, 0), SMOOTHING_PX)
+    smooth = [cv2.GaussianBlur(image * seen, (0, 0), SMOOTHING_PX) for image in images]
+    return np.where(seen, np.stack(smooth) / np.maximum(weight, 1e-12), 0.0) * share

@@ -1,0 +1,123 @@
+"""Makes a virtual laboratory once: two raw folders that hold all that a real one would have, and the truth in a third.
+
+LAB/session/   raw.toml and frames of boards, spheres, flat field and chart
+LAB/mouth/     raw.toml, frames of the mouth, scan.ply; its calibration is to be in LAB/calibration/
+LAB/truth/     calibration.json, teeth/11, lab.json: what the last comparison alone reads
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.core.calibration.record import Calibration
+from services.core.files.meshes import write_mesh
+from services.core.geometry import Matrix4, Record, teeth_folder
+from services.core.store import read_record, write_record
+from services.phantom.files import medium_truth
+from services.phantom.lab.capture import Shown, write_capture
+from services.phantom.lab.light import MouthLight
+from services.phantom.lab.mouth import FITTED, true_mouth
+from services.phantom.lab.rig import CHANNELS, RigSize, true_rig
+from services.phantom.lab.sensor import Sensor
+from services.phantom.lab.session import write_session
+from services.phantom.subjects import subject_tissues
+
+SESSION, MOUTH, TRUTH = "session", "mouth", "truth"
+CALIBRATION, CALIBRATION_FILE = "calibration", "calibration.json"
+LAB_RECORD = "lab.json"
+
+
+@dataclass(frozen=True)
+class LabSize:
+    """How large a laboratory is.
+
+    Attributes:
+        rig: images, cameras and lights.
+        boards, mirror, white: places of the board and of the spheres.
+        samples: paths per pixel of the tooth, in green.
+    """
+
+    rig: RigSize
+    boards: int
+    mirror: int
+    white: int
+    samples: int
+
+
+DEMO_SIZE = LabSize(RigSize((720, 520), 0.13, 3, 9), boards=10, mirror=5, white=2, samples=256)
+"""Of ``make lab-demo``: rendered once in some minutes on two cores."""
+COARSE_SIZE = LabSize(RigSize((400, 288), 0.23, 3, 6), boards=7, mirror=4, white=1, samples=32)
+"""Shows that the steps fit together, and no more."""
+
+
+class LabRecord(Record):
+    """What a laboratory was made from; ``truth/lab.json``, written last, so a folder that has it is whole."""
+
+    recipe: str
+    """All options, by which a laboratory of others is known."""
+    world_from_scan: Matrix4
+    world_from_session: Matrix4
+    """The session's frame is that of its first board."""
+    media: dict[str, dict[str, dict[str, float]]]
+    """By channel, then enamel and dentin."""
+
+
+def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[[str], None]) -> bool:
+    """Make a laboratory, unless the folder holds this one already; returns whether it was made.
+
+    Args:
+        root: of the laboratory.
+        size: of it.
+        subject: whose teeth and optics.
+        seed: of everything that is drawn.
+        tell: is told each step as it begins.
+    """
+    recipe = repr((size, subject, seed))
+    kept = root / TRUTH / LAB_RECORD
+    if kept.is_file() and read_record(kept, LabRecord).recipe == recipe:
+        return False
+    for part in (SESSION, MOUTH, TRUTH):
+        shutil.rmtree(root / part, ignore_errors=True)
+    sensor = Sensor()
+    rig, mouth, tissues = (
+        true_rig(size.rig, sensor.black, seed),
+        true_mouth(subject, seed),
+        subject_tissues(subject, CHANNELS),
+    )
+    tell("calibration session: boards, spheres, flat field and chart")
+    numbers = {"n_boards": size.boards, "n_mirror": size.mirror, "n_white": size.white}
+    first_board = write_session(root / SESSION, rig, sensor, seed, **numbers)
+    light = MouthLight(mouth, rig.lights, tissues)
+    shown = []
+    for number, camera in enumerate(rig.cameras):
+        tell(f"mouth: camera {camera.name} is rendered under {len(rig.lights)} lights")
+        shown.append(Shown(camera, light.images(camera, size.samples, seed + 7919 * number)))
+    tell("mouth: the capture's frames")
+    write_capture(root / MOUTH, rig, sensor, mouth, shown, f"../{CALIBRATION}/{CALIBRATION_FILE}", seed)
+    _write_truth(root / TRUTH, rig)
+    tooth = mouth.fitted
+    for name, mesh in (("outer.ply", tooth.outer), ("dentin.ply", tooth.dentin)):
+        if mesh is not None:
+            write_mesh(teeth_folder(root / TRUTH, FITTED) / name, mesh)
+    media = {
+        channel: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)}
+        for channel, tissue in tissues.items()
+    }
+    record = LabRecord.model_validate(
+        {
+            "recipe": recipe,
+            "world_from_scan": mouth.world_from_scan.tolist(),
+            "world_from_session": first_board.tolist(),
+            "media": media,
+        }
+    )
+    write_record(kept, record)
+    return True
+
+
+def _write_truth(root: Path, rig: Calibration) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    write_record(root / CALIBRATION_FILE, rig)

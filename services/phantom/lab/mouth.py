@@ -1,0 +1,108 @@
+"""The mouth of a virtual laboratory: the six upper front teeth of a subject, their gums, lips and a retractor, and a scan of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.anatomy.scans.scan import LabelledScan
+from services.anatomy.templates.jaw import build_jaw
+from services.core.geometry import Mesh, Tooth
+from services.phantom.lab.scan import scan_of, write_labelled_ply
+from services.phantom.lips import lips_and_retractor
+
+Floats = NDArray[np.float64]
+PLACES = 3
+"""Teeth on each side of the midline."""
+FITTED = 11
+"""FDI number of the tooth whose optics are measured."""
+SCAN_NOISE_MM = 0.02
+SCAN_TURN_RAD, SCAN_SHIFT_MM = 1.0, 30.0
+"""How far the scanner's frame lies from the mouth's, half widths."""
+
+
+@dataclass(frozen=True)
+class LabMouth:
+    """Surfaces as they truly are, in the world of the rig, whose origin is the middle of the crowns.
+
+    Attributes:
+        teeth: from the patient's right to the left, the fitted one with its dentin among them.
+        gums, lips: what is around them.
+        scan: in the frame of its own.
+        world_from_scan: rigid transform (4, 4).
+    """
+
+    teeth: tuple[Tooth, ...]
+    gums: Mesh
+    lips: Mesh
+    scan: LabelledScan
+    world_from_scan: Floats
+
+    @property
+    def fitted(self) -> Tooth:
+        """The tooth that is measured."""
+        return next(tooth for tooth in self.teeth if tooth.fdi == FITTED)
+
+
+def true_mouth(subject: int | None, seed: int) -> LabMouth:
+    """Build a mouth.
+
+    Args:
+        subject: whose teeth; None for the average.
+        seed: of the scan's noise and frame.
+    """
+    from scipy.spatial.transform import Rotation
+
+    jaw = build_jaw(subject)
+    own = [tooth for tooth in jaw.teeth if tooth.fdi % 10 <= PLACES]
+    crowns = np.concatenate([tooth.outer.vertices_mm for tooth in own])
+    shift = -(crowns.min(axis=0) + crowns.max(axis=0)) / 2
+    shift[1] = -np.quantile(crowns[:, 1], 0.9)
+    teeth = tuple(Tooth(one.fdi, _moved(one.outer, shift), _moved(one.dentin, shift)) for one in own)
+
+    random = np.random.default_rng([seed, 0x5CA])
+    scan = scan_of(jaw, SCAN_NOISE_MM, seed, PLACES)
+    turn = Rotation.from_rotvec(random.uniform(-SCAN_TURN_RAD, SCAN_TURN_RAD, 3)).as_matrix()
+    away = random.uniform(-SCAN_SHIFT_MM, SCAN_SHIFT_MM, 3)
+    vertices = (scan.mesh.vertices_mm + shift) @ turn.T + away
+    world_from_scan = np.eye(4)
+    world_from_scan[:3, :3], world_from_scan[:3, 3] = turn.T, -turn.T @ away
+    return LabMouth(
+        teeth,
+        _near(_moved(jaw.gums, shift), float(min(tooth.outer.vertices_mm[:, 1].min() for tooth in teeth))),
+        lips_and_retractor([tooth.outer for tooth in teeth]),
+        LabelledScan(Mesh(vertices, scan.mesh.faces), scan.fdi),
+        world_from_scan,
+    )
+
+
+def landmarks_mm(mouth: LabMouth) -> dict[tuple[int, str], Floats]:
+    """Points (3,) of the scan that an operator clicks on, by tooth and name: each tooth's lowest point, and the height of its neck."""
+    found = {}
+    world = mouth.scan.mesh.vertices_mm @ mouth.world_from_scan[:3, :3].T + mouth.world_from_scan[:3, 3]
+    for tooth in mouth.teeth:
+        own = np.unique(mouth.scan.mesh.faces[mouth.scan.fdi == tooth.fdi])
+        front = own[world[own, 1] > np.median(world[own, 1])]
+        # Along the tooth's middle, as the neck rises towards the neighbours.
+        middle = front[np.abs(world[front, 0] - np.median(world[front, 0])) < 1.0]
+        for name, vertex in (("edge", own[world[own, 2].argmax()]), ("neck", middle[world[middle, 2].argmin()])):
+            found[tooth.fdi, name] = mouth.scan.mesh.vertices_mm[vertex]
+    return found
+
+
+def write_scan(path: Path, mouth: LabMouth) -> None:
+    """Write the scan as a scanner's program exports it."""
+    write_labelled_ply(path, mouth.scan.mesh, mouth.scan.fdi)
+
+
+def _near(gums: Mesh, behind_mm: float) -> Mesh:
+    # Open behind the last teeth, where lips and cheeks would hide it.
+    kept = gums.vertices_mm[gums.faces].mean(axis=1)[:, 1] > behind_mm
+    return Mesh(gums.vertices_mm, gums.faces[kept])
+
+
+def _moved(mesh: Mesh, by_mm: Floats) -> Mesh:
+    return Mesh(mesh.vertices_mm + by_mm, mesh.faces)

@@ -1,0 +1,140 @@
+"""The true rig of a virtual laboratory: cameras with their lenses, lights with their brightness, all a little off what was planned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
+from services.core.calibration.record import Calibration
+from services.core.geometry import Mesh
+from services.phantom.dome_rig import dome_cameras, dome_lights
+
+Floats = NDArray[np.float64]
+CHANNELS = ("red", "green", "blue")
+CAMERA_MM = 500.0
+"""From the teeth to each camera: near enough that boards tell focal length from distance."""
+LENS = (-0.35, 0.3, 0.001, -0.0006)
+"""Radial and tangential distortion as OpenCV has it: one or two pixels in the corners of an image of half a megapixel."""
+OFF_CAMERA_MM, OFF_CAMERA_DEG, OFF_FOCAL, OFF_CENTRE_PX = 4.0, 0.5, 0.02, 6.0
+"""Standard deviations of a mounted camera from the plan: its place, its direction, its focal length and its principal point."""
+OFF_LIGHT_MM, LIGHT_SPREAD = 8.0, 0.2
+"""Of a light's place, and of its brightness in each channel, relative."""
+WHITE_COUNTS_PER_S = 1.3e5
+"""Of a white diffuser at a metre from a light of intensity 1, in a camera's green: 2600 counts in a fiftieth of a second."""
+RESPONSE = (0.8, 1.0, 0.7)
+"""Of a sensor in red, green and blue."""
+OFF_RESPONSE = 0.05
+"""Standard deviation between cameras and channels."""
+
+
+@dataclass(frozen=True)
+class RigSize:
+    """How large a rig's images are, and how many lights it has.
+
+    Attributes:
+        pixels: width and height of an image.
+        pixel_mm: edge of a pixel at the teeth.
+        cameras, lights: how many there are.
+    """
+
+    pixels: tuple[int, int]
+    pixel_mm: float
+    cameras: int
+    lights: int
+
+
+def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
+    """Draw a rig about its plan; the world is the mouth's, whose teeth stand about the origin.
+
+    Args:
+        size: of images, and how many cameras and lights there are.
+        sensor_black: counts without light.
+        seed: of the draw.
+    """
+    random = np.random.default_rng([seed, 0x716])
+    planned = dome_cameras(size.cameras, 1.0, (Mesh(np.zeros((1, 3)), np.zeros((0, 3), dtype=np.int32)),))
+    cameras = [_camera(one.name, np.array(one.camera_from_world), size, sensor_black, random) for one in planned]
+    places = np.array([one.position_mm for one in dome_lights(size.lights, CHANNELS, seed)])
+    places += random.normal(0, OFF_LIGHT_MM, places.shape)
+    intensity = 1 + LIGHT_SPREAD * random.uniform(-1, 1, (size.lights, 1)) + 0.03 * random.normal(size=(size.lights, 3))
+    # The gauge of all calibrations: the mean of the lights' intensities is 1 in every channel.
+    intensity /= intensity.mean(axis=0)
+    lights = [
+        CalibratedLight(name=f"L{n}", position_mm=tuple(place), intensity=tuple(own))
+        for n, (place, own) in enumerate(zip(places.tolist(), intensity.tolist(), strict=True))
+    ]
+    return Calibration(units="mm", channels=CHANNELS, cameras=tuple(cameras), lights=tuple(lights))
+
+
+def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.random.Generator) -> CalibratedCamera:
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(np.radians(random.normal(0, OFF_CAMERA_DEG, 3))).as_matrix()
+    rotation = turn @ planned[:3, :3]
+    centre = -planned[:3, :3].T @ planned[:3, 3]
+    centre = CAMERA_MM * centre / np.linalg.norm(centre) + random.normal(0, OFF_CAMERA_MM, 3)
+    # Whoever mounts it turns it until the teeth are in the middle of the picture.
+    rotation = _aimed(rotation, -centre)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    focal = CAMERA_MM / size.pixel_mm * (1 + OFF_FOCAL * random.normal())
+    middle = np.array(size.pixels) / 2 + random.normal(0, OFF_CENTRE_PX, 2)
+    response = WHITE_COUNTS_PER_S * np.array(RESPONSE) * (1 + OFF_RESPONSE * random.normal(size=3))
+    return CalibratedCamera.model_validate(
+        {
+            "name": name,
+            "size": size.pixels,
+            "K": ((focal, 0.0, middle[0]), (0.0, focal * (1 + 0.001 * random.normal()), middle[1]), (0.0, 0.0, 1.0)),
+            "distortion": tuple(np.array(LENS) * random.uniform(0.7, 1.3, 4)),
+            "camera_from_world": pose.tolist(),
+            # Radiance of the diffuser over its counts a second.
+            "radiance_per_count": (1 / (np.pi * 1e6) / response).tolist(),
+            "black_counts": black,
+        }
+    )
+
+
+def _aimed(rotation: Floats, forward: Floats) -> Floats:
+    """A camera's rotation with its line of sight turned along a direction, and about it by as little as can be."""
+    z = forward / np.linalg.norm(forward)
+    x = rotation[0] - (rotation[0] @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+class Lens:
+    """Where a camera's pixels look, and where they lie in the image of a pinhole in its place; by OpenCV's own formulas."""
+
+    def __init__(self, camera: CalibratedCamera) -> None:
+        self.camera = camera
+
+    def undistorted(self, pixels: Floats) -> Floats:
+        """Pixels (N, 2) of the photograph as a pinhole would have them."""
+        import cv2
+
+        K = np.array(self.camera.K)
+        K[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers.
+        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+        points = (np.asarray(pixels, dtype=np.float64) - 0.5).reshape(-1, 1, 2)
+        found = cv2.undistortPoints(points, K, np.array(self.camera.distortion), R=np.eye(3), P=K, criteria=until)
+        return np.asarray(found.reshape(-1, 2) + 0.5)
+
+    def seen(self, points_mm: Floats) -> Floats:
+        """Pixels (N, 2) of the photograph that show points (N, 3)."""
+        import cv2
+
+        K, pose = np.array(self.camera.K), np.array(self.camera.camera_from_world)
+        K[:2, 2] -= 0.5
+        turn = cv2.Rodrigues(pose[:3, :3])[0]
+        found = cv2.projectPoints(np.asarray(points_mm), turn, pose[:3, 3], K, np.array(self.camera.distortion))[0]
+        return np.asarray(found.reshape(-1, 2) + 0.5)
+
+    def rays(self) -> tuple[Floats, Floats]:
+        """Centre (3,) of the camera, and unit directions (H · W, 3) through all pixels' centres."""
+        width, height = self.camera.size
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pinhole = self.undistorted(np.stack([x.ravel(), y.ravel()], axis=1))
+        return self.camera.rays(pinhole[:, 0], pinhole[:, 1])

@@ -1,0 +1,213 @@
+"""The calibration session of a virtual laboratory: boards, mirror and white spheres, an even source and a chart.
+
+Everything is drawn ray by ray from its geometry: planes and spheres are met by the rays of the distorted lens, and a mirror's
+highlight lies where the law of reflection puts it. Nothing of the calibration's own code draws what it is to find.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.calibration.record import Calibration
+from services.core.raw.targets import Board
+from services.phantom.lab.folder import RawWriter
+from services.phantom.lab.rig import Lens
+from services.phantom.lab.sensor import Sensor
+
+Floats = NDArray[np.float64]
+BOARD = Board(name="plate", type="charuco", squares=(9, 7), square_mm=7, marker_mm=5, dictionary="DICT_5X5_100")
+TEXELS_PER_MM = 20
+BLUR_MM = 0.08
+"""Of the board's print and the lens together, standard deviation."""
+TILT_RAD, SHIFT_MM = 0.5, (14.0, 8.0, 15.0)
+"""How far the board is turned and moved from place to place at most."""
+MIRROR_MM, WHITE_MM = 16.0, 14.0
+"""Radii of the spheres."""
+REFLECTANCE = (0.92, 0.91, 0.90)
+PLACES = np.array(
+    [[-1.0, 0.4, -1.0], [1.0, -0.6, -0.9], [-0.9, -0.8, 1.0], [1.0, 0.6, 1.0], [0.0, 1.4, 0.1], [0.0, -1.4, -0.1]]
+)
+"""Of the spheres' centres, in units of how far they may stand from the middle and still be seen whole."""
+MARGIN_MM, DEPTH_MM = 4.0, 10.0
+"""Around a sphere in the picture, and the unit along the cameras' line of sight."""
+WALL, BODY, GLINT = 0.25, 0.02, 1.5
+"""Radiance behind the spheres, of the mirror's own surface, and of its highlights, over that of a white diffuser."""
+GLINT_PX = 1.6
+"""Radius of a highlight: the LED's own image and the lens' blur."""
+NEUTRALS = (0.9, 0.59, 0.36, 0.19, 0.09, 0.032)
+"""Reflectances of a chart's grey row."""
+XYZ_FROM_SENSOR = np.array([[0.62, 0.22, 0.12], [0.28, 0.70, 0.02], [0.03, 0.12, 0.68]])
+CHART_CORNERS = np.array([[0.14, 0.2], [0.86, 0.2], [0.86, 0.8], [0.14, 0.8]])
+"""Centres of the patches 1, 6, 24 and 19, as fractions of the image."""
+WHITE_RADIANCE = 1 / (np.pi * 1e6)
+"""Of a perfect diffuser at a metre from a light of intensity 1."""
+EXPOSURE_S = 0.02
+
+
+class Session:
+    """Draws the frames of one session."""
+
+    def __init__(self, writer: RawWriter, random: np.random.Generator, n_places: int) -> None:
+        self._writer = writer
+        self._lenses = [Lens(camera) for camera in writer.rig.cameras]
+        self._rays = [lens.rays() for lens in self._lenses]
+        self.places = [self._place(random, is_first=number == 0) for number in range(n_places)]
+        self.centres_mm = PLACES * self._reach_mm()
+        self._texture = _board_texture()
+
+    def _reach_mm(self) -> Floats:
+        """How far (3,) from the middle a sphere may stand."""
+        halves = [
+            np.array(camera.size) / 2 * np.linalg.norm(np.array(camera.camera_from_world)[:3, 3]) / camera.K[0][0]
+            for camera in self._writer.rig.cameras
+        ]
+        x, z = np.maximum(np.min(halves, axis=0) - MIRROR_MM - MARGIN_MM, 1.0)
+        return np.array([x, min(x, DEPTH_MM), z])
+
+    def _place(self, random: np.random.Generator, *, is_first: bool) -> Floats:
+        """Pose (4, 4) world_from_board: the plate faces the cameras, which look along the world's −y."""
+        from scipy.spatial.transform import Rotation
+
+        facing = Rotation.from_euler("x", 90, degrees=True)
+        tilt = 0.1 if is_first else TILT_RAD
+        turn = (Rotation.from_rotvec(random.uniform(-tilt, tilt, 3)) * facing).as_matrix()
+        columns, rows = BOARD.squares
+        middle = np.array([columns, rows, 0]) * BOARD.square_mm / 2
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        pose[:3, 3] = random.uniform(-1, 1, 3) * np.array(SHIFT_MM) * (not is_first) - turn @ middle
+        return pose
+
+    def board(self, camera: int, place: int) -> None:
+        """The board at one place: each ray meets its plane at a point of the print."""
+        import cv2
+
+        centre, rays = self._rays[camera]
+        board_from_world = np.linalg.inv(self.places[place])
+        origin, towards = board_from_world[:3, :3] @ centre + board_from_world[:3, 3], rays @ board_from_world[:3, :3].T
+        on_plate = origin[:2] - towards[:, :2] * (origin[2] / towards[:, 2:3])
+        width, height = self._writer.rig.cameras[camera].size
+        maps = (on_plate.reshape(height, width, 2) * TEXELS_PER_MM - 0.5).astype(np.float32)
+        seen = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=0.8)
+        light = WHITE_RADIANCE * (0.05 + 0.75 * seen.astype(np.float64))
+        image = np.repeat(light[..., None], 3, axis=2)
+        self._writer.shoot(camera, f"board{place}", image, EXPOSURE_S, kind="board", board="plate", place=f"p{place}")
+
+    def sphere(self, camera: int, place: int, light: int, kind: str) -> None:
+        """A mirror or a white sphere before a wall, under one light."""
+        taken, lamp = self._writer.rig.cameras[camera], self._writer.rig.lights[light]
+        centre, rays = self._rays[camera]
+        radius = MIRROR_MM if kind == "mirror" else WHITE_MM
+        middle_mm = self.centres_mm[place]
+        along = rays @ (middle_mm - centre)
+        nearest = np.sqrt(np.maximum(((middle_mm - centre) ** 2).sum() - along**2, 0))
+        # A pixel at the edge shows as much of the sphere as a straight edge would cut off.
+        covered = np.clip(0.5 - (nearest - radius) / (along / taken.K[0][0]), 0, 1)[:, None]
+        if kind == "mirror":
+            body = np.full((len(rays), 3), BODY) + self._glint(camera, middle_mm, radius, np.array(lamp.position_mm))
+            body = body * WHITE_RADIANCE
+        else:
+            points = centre + (along - np.sqrt(np.maximum(radius**2 - nearest**2, 0)))[:, None] * rays
+            to_light = np.array(lamp.position_mm) - points
+            distance = np.linalg.norm(to_light, axis=1, keepdims=True)
+            normals = (points - middle_mm) / radius
+            cosine = np.maximum((normals * to_light).sum(axis=1, keepdims=True) / distance, 0)
+            body = np.array(REFLECTANCE) / np.pi * np.array(lamp.intensity) * cosine / distance**2
+        wall = WALL * WHITE_RADIANCE if kind == "mirror" else 0.02 * WHITE_RADIANCE
+        image = (covered * body + (1 - covered) * wall).reshape(*taken.size[::-1], 3)
+        told = {"light": lamp.name, "sphere": kind, "place": f"s{place}"}
+        self._writer.shoot(camera, f"{kind}{place}_{lamp.name}", image, EXPOSURE_S, kind=f"{kind}-sphere", **told)
+
+    def _glint(self, camera: int, middle_mm: Floats, radius_mm: float, light_mm: Floats) -> Floats:
+        """Light (N, 1) of a highlight, none where it would lie at the outline."""
+        lens, eye = self._lenses[camera], self._rays[camera][0]
+        normal = eye - middle_mm
+        for _ in range(50):
+            point = middle_mm + radius_mm * normal / np.linalg.norm(normal)
+            to_eye, to_light = eye - point, light_mm - point
+            # Law of reflection: the normal halves the angle between eye and light.
+            normal = to_eye / np.linalg.norm(to_eye) + to_light / np.linalg.norm(to_light)
+        normal /= np.linalg.norm(normal)
+        width, height = lens.camera.size
+        if normal @ to_eye / np.linalg.norm(to_eye) < 0.3:
+            return np.zeros((width * height, 1))
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        spot = lens.seen(point[None])[0]
+        off = (x - spot[0]) ** 2 + (y - spot[1]) ** 2
+        return np.asarray(GLINT * np.exp(-off / (2 * GLINT_PX**2))).reshape(-1, 1)
+
+    def flat(self, camera: int) -> None:
+        """An even source that fills the view."""
+        width, height = self._writer.rig.cameras[camera].size
+        for number in range(2):
+            even = np.full((height, width, 3), 0.6 * WHITE_RADIANCE)
+            self._writer.shoot(camera, f"flat{number}", even, EXPOSURE_S, kind="flat")
+
+    def chart(self, camera: int, xyz: Floats) -> None:
+        """A chart of 24 patches that fills the middle."""
+        width, height = self._writer.rig.cameras[camera].size
+        image = np.full((height, width, 3), 0.03)
+        rgb = xyz @ np.linalg.inv(XYZ_FROM_SENSOR).T
+        corners = CHART_CORNERS * [width, height]
+        step = (corners[2] - corners[0]) / [5, 3]
+        for patch in range(24):
+            x, y = corners[0] + step * [patch % 6, patch // 6]
+            rows, columns = (
+                slice(int(y - 0.4 * step[1]), int(y + 0.4 * step[1])),
+                slice(int(x - 0.4 * step[0]), int(x + 0.4 * step[0])),
+            )
+            image[rows, columns] = rgb[patch]
+        told = {"chart": "colours", "corners_px": corners.tolist()}
+        self._writer.shoot(camera, "chart", image * WHITE_RADIANCE, EXPOSURE_S, kind="chart", **told)
+
+
+def write_session(
+    root: Path, rig: Calibration, sensor: Sensor, seed: int, *, n_boards: int, n_mirror: int, n_white: int
+) -> Floats:
+    """Write a raw folder with all frames of a session; returns world_from_board (4, 4) of the first board, the calibration's frame."""
+    random = np.random.default_rng([seed, 0x5E5])
+    writer = RawWriter(root, rig, sensor, random)
+    session = Session(writer, random, n_boards)
+    cameras = range(len(rig.cameras))
+    for place in range(n_boards):
+        for camera in cameras:
+            session.board(camera, place)
+    for kind, count in (("mirror", n_mirror), ("white", n_white)):
+        for place in range(count):
+            for camera in cameras:
+                for light in range(len(rig.lights)):
+                    session.sphere(camera, place, light, kind)
+    xyz = random.uniform(0.05, 0.8, (24, 3)) @ XYZ_FROM_SENSOR.T
+    xyz[18:] = np.array(NEUTRALS)[:, None] * XYZ_FROM_SENSOR.sum(axis=1)
+    for camera in cameras:
+        writer.black(camera, (EXPOSURE_S,), 2)
+        session.flat(camera)
+        session.chart(camera, xyz)
+    table = "\n".join(",".join(f"{100 * value:.6f}" for value in row) for row in xyz)
+    (root / "chart.csv").write_text(f"X,Y,Z\n{table}\n")
+    board = {key: list(value) if isinstance(value, tuple) else value for key, value in BOARD.model_dump().items()}
+    writer.finish(
+        {
+            "board": [board],
+            "sphere": [
+                {"name": "mirror", "kind": "mirror", "radius_mm": MIRROR_MM},
+                {"name": "white", "kind": "white", "radius_mm": WHITE_MM, "reflectance": list(REFLECTANCE)},
+            ],
+            "chart": [{"name": "colours", "type": "colorchecker-24", "reference": "chart.csv"}],
+        }
+    )
+    return session.places[0]
+
+
+def _board_texture() -> NDArray[np.float32]:
+    """The print, 0 to 1, by OpenCV's own drawing."""
+    import cv2
+
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(BOARD.dictionary)))
+    board = cv2.aruco.CharucoBoard(BOARD.squares, BOARD.square_mm, BOARD.marker_mm, dictionary)
+    columns, rows = (round(n * BOARD.square_mm * TEXELS_PER_MM) for n in BOARD.squares)
+    drawn = board.generateImage((columns, rows)).astype(np.float32) / 255
+    return np.asarray(cv2.GaussianBlur(drawn, (0, 0), BLUR_MM * TEXELS_PER_MM))
