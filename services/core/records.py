@@ -220,6 +220,13 @@ class JobSpec(Record):
         default=False,
         description="leave out pixels that a camera's other lights show to lie in the shadow of lips, retractor or a hand",
     )
+    memory_gib: Number = Field(
+        default=2.0,
+        ge=0.5,
+        le=1024,
+        description="most memory, GiB, that a worker takes to prepare a raw folder's images: "
+        "its photographs are worked on in strips as high as that allows",
+    )
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
     samples_per_pixel: Whole = Field(
         default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs"

@@ -89,3 +89,9 @@ def bands(shape: tuple[int, int]) -> Iterator[slice]:
     step = max(1, BAND_PIXELS // max(shape[1], 1))
     for top in range(0, shape[0], step):
         yield slice(top, min(top + step, shape[0]))
+
+
+def bands_of(rows: slice, width: int) -> Iterator[slice]:
+    """Some rows of an image of so many columns, a few at a time."""
+    for part in bands((rows.stop - rows.start, width)):
+        yield slice(rows.start + part.start, rows.start + part.stop)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
-from services.core.raw.frames import read_counts
+from services.core.raw.frames import Counts, read_counts
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.mosaic import sites
 from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
@@ -23,9 +23,12 @@ from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
+from services.preprocess.scratch import write_array
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
+Part = tuple[slice, slice] | tuple[NDArray[np.intp], ...]
+"""Rows and columns of a frame, as one indexes an array by them."""
 
 MEASURES = "measures.json"
 """In the scratch folder of a camera."""
@@ -74,10 +77,10 @@ class CameraFrames:
         Raises:
             CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the frame.
         """
-        self._root, self._folder, self.calibrated = root, folder, camera
+        self._root, self._folder, self.calibrated, self._scratch = root, folder, camera, scratch
         self.raw = folder.camera_named(camera.name)
         self.notes: list[str] = []
-        self._blacks: dict[tuple[float, float], tuple[Image, float]] = {}
+        self._blacks: dict[tuple[float, float], Image] = {}
         self._ambient: Image | None = None
         self._full = np.float32(np.inf if self.raw.full_counts is None else self.raw.full_counts)
         self._black_frames = folder.frames_of(camera.name, "black")
@@ -116,23 +119,36 @@ class CameraFrames:
         self.lens = Lens(self.calibrated, told.vignetting)
         self.notes += told.notes
 
-    def exposure(self, frame: RawFrame, region: Window | None = None) -> Exposure:
-        """Counts of a frame above black, linear, without the room's own light; (H, W) of a mosaic, else (H, W, C).
-
-        Args:
-            region: the part of the photograph that is wanted; None for all of it.
+    def exposure(self, frame: RawFrame) -> Exposure:
+        """Counts of a whole frame above black, linear, without the room's light; (H, W) of a mosaic, else (H, W, C).
 
         Raises:
             CaptureInputError: it cannot be read; names it.
         """
-        part = (slice(None), slice(None)) if region is None else (region.rows, region.columns)
-        counts = read_counts(self._root, self._folder, frame)[part].astype(np.float32)
+        return self.exposure_of(frame, read_counts(self._root, self._folder, frame), (slice(None), slice(None)))
+
+    def counts(self, frame: RawFrame, region: Window) -> Counts:
+        """Counts of a part of a frame as they were read; nothing of the rest is kept.
+
+        Raises:
+            CaptureInputError: it cannot be read; names it.
+        """
+        return read_counts(self._root, self._folder, frame)[region.rows, region.columns].copy()
+
+    def exposure_of(self, frame: RawFrame, counts: Counts, part: Part) -> Exposure:
+        """Some of a frame's counts as an exposure.
+
+        Args:
+            part: where these counts lie in the frame.
+        """
         black, variance = self._black(frame)
-        signal = self.linearity.linearised(counts - (black[part] if black.ndim else black))
+        above = np.subtract(counts, black[part] if black.ndim > 1 else black, dtype=np.float32)
+        signal = self.linearity.linearised(above)
         seconds = frame.exposure_s * frame.gain
         if self._ambient is not None and frame.kind not in DARK:
-            signal -= self._ambient[part] * np.float32(seconds)
-        return Exposure(signal, variance, self._full - counts, seconds * frame.level, frame.gain)
+            signal = signal - self._ambient[part] * np.float32(seconds)
+        headroom = np.subtract(self._full, counts, dtype=np.float32)
+        return Exposure(signal, variance, headroom, seconds * frame.level, frame.gain)
 
     def _black(self, frame: RawFrame) -> tuple[Image, float]:
         """Mean of the black frames nearest in gain and exposure, or one number for all pixels, and its variance."""
@@ -145,14 +161,24 @@ class CameraFrames:
 
         nearest = min(self._black_frames, key=distance)
         key = nearest.gain, nearest.exposure_s
+        own = [one for one in self._black_frames if (one.gain, one.exposure_s) == key]
         if key not in self._blacks:
-            own = [one for one in self._black_frames if (one.gain, one.exposure_s) == key]
-            mean = np.zeros_like(self._black_counts(own[0]))
-            for one in own:
-                mean += self._black_counts(one) / np.float32(len(own))
-            zero = np.zeros((), dtype=np.float32)
-            self._blacks[key] = mean, float(self.noise.variance(zero, nearest.gain)) / len(own)
-        return self._blacks[key]
+            self._blacks[key] = self._mean_of_black(own)
+        zero = np.zeros((), dtype=np.float32)
+        return self._blacks[key], float(self.noise.variance(zero, nearest.gain)) / len(own)
+
+    def _mean_of_black(self, frames: Sequence[RawFrame]) -> Image:
+        """Mean counts of black frames of one gain and exposure; made once for all blocks that share a folder."""
+        name = f"black-{frames[0].gain!r}-{frames[0].exposure_s!r}.npy"
+        kept = None if self._scratch is None else self._scratch / name
+        if kept is not None and kept.is_file():
+            return np.asarray(np.load(kept, mmap_mode="r"))
+        mean = np.zeros_like(self._black_counts(frames[0]))
+        for frame in frames:
+            mean += self._black_counts(frame) / np.float32(len(frames))
+        if kept is not None:
+            write_array(kept, mean)
+        return mean
 
     def _black_counts(self, frame: RawFrame) -> Image:
         counts = read_counts(self._root, self._folder, frame).astype(np.float32)
@@ -183,7 +209,6 @@ class CameraFrames:
         self.noise = NoiseModel(0.0, 0.0)
         read = self._read_noise()
         measured = shot_noise(self._lit_pairs(), read)
-        self._blacks.clear()
         if measured is not None:
             slope, read = measured
             self.notes.append(

@@ -21,13 +21,21 @@ _SITES_OF_FOUR = (1, 2, 1)
 """How many of the four pixels of a pattern see red, green and blue."""
 
 
-def demosaic(values: Image, mosaic: Mosaic) -> Image:
+def channel_means(values: Image, mosaic: Mosaic) -> NDArray[np.float32]:
+    """Mean brightness (3,) of red, green and blue in a mosaic (H, W)."""
+    means = [np.mean([abs(float(own.mean())) for c, own in sites(values, mosaic) if c == k]) for k in range(3)]
+    return np.array(means, dtype=np.float32)
+
+
+def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = None) -> Image:
     """Image (H, W, 3) of a mosaic (H, W).
 
-    Channels are brought to the same mean before and back after, since the filters take edges of one channel for those of another.
+    Args:
+        means: of the channels of the whole photograph that this is a part of; None where it is the whole. They are brought
+            to one mean before and back after, since the filters take edges of one channel for those of another.
     """
-    means = np.array([np.mean([abs(float(v.mean())) for c, v in sites(values, mosaic) if c == k]) for k in range(3)])
-    scale = np.where(means > 0, means / max(means.max(), 1e-30), 1).astype(np.float32)
+    means = channel_means(values, mosaic) if means is None else means
+    scale = np.where(means > 0, means / max(float(means.max()), 1e-30), 1).astype(np.float32)
     balanced = values.copy()
     for channel, own in sites(balanced, mosaic):
         np.divide(own, scale[channel], out=own)
@@ -42,7 +50,8 @@ def demosaic(values: Image, mosaic: Mosaic) -> Image:
                 beside = "row" if channels[y, 1 - x] == wanted else "column"
                 name = "green" if wanted == 1 else beside if own == 1 else "across"
                 image[*place, wanted] = filtered[name][place]
-    return np.asarray(image * scale, dtype=np.float32)
+    image *= scale
+    return image
 
 
 def demosaic_variance(variance: Image, mosaic: Mosaic) -> Image:

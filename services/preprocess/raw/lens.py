@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,14 +102,25 @@ class Sampler:
         found = cv2.remap(self._source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
-    def sampled(self, image: Image, places: Image) -> Image:
-        """Values (H, W, C) of an image that holds ``region`` at indices of the photograph; 0 outside of it."""
+    def source(self, places: Sequence[Image]) -> Window:
+        """The rows of ``region`` that places (2, h, W) sample, with what demosaicing and interpolation look at around them."""
+        low, high = min(float(one[1].min()) for one in places), max(float(one[1].max()) for one in places)
+        region = self.region
+        top = int(np.clip(np.floor(low) - REACH_PX, region.top, max(region.bottom - EVEN, region.top)))
+        top = top // EVEN * EVEN
+        bottom = int(np.clip(np.ceil(high) + 1 + REACH_PX, min(top + EVEN, region.bottom), region.bottom))
+        return Window(top, bottom, region.left, region.right)
+
+    def sampled(self, image: Image, places: Image, held: Window | None = None) -> Image:
+        """Values (H, W, C) of an image at indices of the photograph; 0 outside of it.
+
+        Args:
+            held: the part of the photograph that the image is; None for ``region``.
+        """
         import cv2
 
-        x, y = (
-            np.ascontiguousarray(places[k] - np.float32(start))
-            for k, start in ((0, self.region.left), (1, self.region.top))
-        )
+        held = self.region if held is None else held
+        x, y = (np.ascontiguousarray(places[k] - np.float32(start)) for k, start in ((0, held.left), (1, held.top)))
         planes = np.atleast_3d(image)
         # OpenCV takes four channels at most at once.
         parts = [

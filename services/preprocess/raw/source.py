@@ -34,6 +34,7 @@ class RawSource:
         noise_relative: float,
         noise_floor: float,
         teeth_root: Path | None = None,
+        memory_bytes: float = np.inf,
     ) -> None:
         """Read the description and the calibration; no pixel is read yet.
 
@@ -43,12 +44,14 @@ class RawSource:
             noise_relative: assumed noise where nothing tells it, fraction of the value.
             noise_floor: and of full scale.
             teeth_root: folder of the teeth, where it is not the raw folder.
+            memory_bytes: most that this process may take to make images.
 
         Raises:
             CaptureInputError: names what is missing or contradictory.
         """
         self.root = teeth_root or frames_root
         self._frames_root, self._noise = frames_root, (noise_relative, noise_floor)
+        self._memory_bytes = memory_bytes
         self._measured: dict[str, CameraFrames] = {}
         self._folder = read_raw_folder(frames_root)
         self.calibration = read_calibration(frames_root, self._folder, calibration)
@@ -101,7 +104,9 @@ class RawSource:
             )
             self.notes += tuple(self._measured[name].notes)
         motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name))
-        return RawView(self._frames_root, self._measured[name], view, motion, self.description.channels)
+        return RawView(
+            self._frames_root, self._measured[name], view, motion, self.description.channels, self._memory_bytes
+        )
 
     def _table(self, camera: str) -> list[FrameRecord]:
         return [_row(index, frame) for index, frame in enumerate(self._of(camera))]

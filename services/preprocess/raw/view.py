@@ -3,39 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.raw.frames import Counts
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.records import RawFrame
 from services.core.records import MaskBit
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import colour_of, require_like_exposures
-from services.preprocess.raw.demosaic import demosaic, demosaic_variance, spoiled
-from services.preprocess.raw.lens import Sampler
+from services.preprocess.raw.demosaic import channel_means, demosaic, demosaic_variance, spoiled
+from services.preprocess.raw.lens import EVEN, Sampler
+from services.preprocess.raw.room import Room, strips
 from services.preprocess.rig import STILL_PX, UNCERTAIN_PX
 from services.preprocess.source import Image, LightImage, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion
-from services.preprocess.window import bands
+from services.preprocess.window import Window, bands_of
 
 BoolArray = NDArray[np.bool_]
+Values = tuple[Image, Image, BoolArray, BoolArray]
+"""Radiance, variance (H, W, C), where it is lost, and where it lies beyond the photograph (H, W)."""
+
+COMPARED_PIXELS = 1_000_000
+"""Of a photograph, to hold exposures against each other: they tell a mean to a thousandth of a pixel's contrast."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph, read.
+
+    Attributes:
+        counts: of the sampler's region, (H, W) or (H, W, C).
+        move: of the subject since the first frame.
+    """
+
+    frame: RawFrame
+    counts: Counts
+    move: Displacement
 
 
 class RawView:
-    """The photographs of one camera, brought to a view.
+    """The photographs of one camera, brought to a view, a strip of rows at a time.
 
     Attributes:
         motion: of the subject in it.
     """
 
     def __init__(
-        self, root: Path, frames: CameraFrames, view: View, motion: ViewMotion, channels: tuple[str, ...]
+        self,
+        root: Path,
+        frames: CameraFrames,
+        view: View,
+        motion: ViewMotion,
+        channels: tuple[str, ...],
+        memory_bytes: float,
     ) -> None:
+        """Lay out what is read.
+
+        Args:
+            memory_bytes: most that this process may take; strips are as high as it allows.
+        """
         self._root, self._frames, self._view, self.motion, self._channels = root, frames, view, motion, channels
         self._mosaic, camera = frames.raw.mosaic, frames.calibrated
         self._sampler = Sampler(frames.lens, motion.window)
+        self._room = Room(memory_bytes, frames.raw, len(channels), view.window, self._sampler.region)
         assert camera.radiance_per_count is not None
         self._scale = np.array(camera.radiance_per_count, dtype=np.float32)
         self._unmixed = (
@@ -44,34 +78,43 @@ class RawView:
 
     def brightness(self, frame: RawFrame) -> Image:
         """Mean of the channels of one frame in ``motion.window`` (H, W), undistorted; its unit does not matter."""
-        signal = self._frames.exposure(frame, self._sampler.region).signal
-        colour = signal if self._mosaic == "none" else demosaic(signal, self._mosaic)
-        grey = colour.mean(axis=-1, keepdims=True)
+        counts = self._frames.counts(frame, self._sampler.region)
+        means = self._means([self._sparse(frame, counts)])
         height, width = self.motion.window.shape
         image = np.empty((height, width), dtype=np.float32)
-        for rows in bands((height, width)):
-            y, x = np.mgrid[rows, 0:width].astype(np.float32)
-            image[rows] = self._sampler.sampled(grey, self._sampler.places(np.stack([x, y])))[..., 0]
+        for strip in strips(height, self._room.rows(1)):
+            parts = list(bands_of(strip, width))
+            places = [self._sampler.places(_indices(rows, slice(0, width))) for rows in parts]
+            held = self._sampler.source(places)
+            signal = self._exposure(frame, counts, held).signal
+            colour = signal if self._mosaic == "none" else demosaic(signal, self._mosaic, means)
+            grey = colour.mean(axis=-1, keepdims=True)
+            for rows, at in zip(parts, places, strict=True):
+                image[rows] = self._sampler.sampled(grey, at, held)[..., 0]
         return image
 
     def image(self, frames: Sequence[RawFrame], moves: Sequence[Displacement]) -> LightImage:
         """The exposures of one light, merged before they are interpolated where the subject was still between them, and after otherwise.
 
         Raises:
-            CaptureInputError: they contradict each other; names the frame.
+            CaptureInputError: they contradict each other; names the frame. SettingsError: there is too little memory.
         """
-        exposures = [self._frames.exposure(frame, self._sampler.region) for frame in frames]
-        require_like_exposures(self._root, frames, exposures, self._channels)
+        strip_rows = self._room.rows(len(frames))
+        shots = [
+            Shot(frame, self._frames.counts(frame, self._sampler.region), move)
+            for frame, move in zip(frames, moves, strict=True)
+        ]
+        sparse = [self._sparse(shot.frame, shot.counts) for shot in shots]
+        require_like_exposures(self._root, frames, sparse, self._channels)
+        means = self._means(sparse)
         height, width = self._view.window.shape
         radiance, variance = (np.empty((height, width, len(self._channels)), dtype=np.float32) for _ in range(2))
         bits = np.zeros((height, width), dtype=np.uint16)
-        groups = self._groups(exposures, moves)
-        merged = [(self._colours_of(group), move) for group, move in groups]
-        is_warped = [move.median_px > STILL_PX or not self._sampler.is_still_exact for _, move in groups]
-        for rows in bands((height, width * len(self._channels))):
+        groups = self._groups(shots)
+        is_warped = [own[0].move.median_px > STILL_PX or not self._sampler.is_still_exact for own in groups]
+        for rows in strips(height, strip_rows):
             parts = [
-                self._band(colours, move, rows, warped=warped)
-                for (colours, move), warped in zip(merged, is_warped, strict=True)
+                self._strip(own, rows, means, warped=warped) for own, warped in zip(groups, is_warped, strict=True)
             ]
             radiance[rows], variance[rows], lost, beyond = _joined(parts)
             bits[rows][lost & ~beyond] = np.uint16(MaskBit.SATURATED)
@@ -85,64 +128,96 @@ class RawView:
         told = [error for move in moves if (error := move.told_error_px) is not None]
         return LightImage(radiance, variance, bits, *moved, colour, max(told, default=None))
 
-    def _groups(
-        self, exposures: Sequence[Exposure], moves: Sequence[Displacement]
-    ) -> list[tuple[list[Exposure], Displacement]]:
-        """Exposures that show the subject at one place, and its motion there."""
+    def _groups(self, shots: Sequence[Shot]) -> list[list[Shot]]:
+        """Exposures that show the subject at one place."""
         height, width = self._view.window.shape
         middle = slice(height // 2, height // 2 + 1)
         covered = self._view.footprint.covered[middle]
         seen = covered if covered.any() else np.ones((1, width), dtype=bool)
-        first = self.motion.places(moves[0], middle)
+        first = self.motion.places(shots[0].move, middle)
         apart = max(
-            float(np.linalg.norm(self.motion.places(move, middle) - first, axis=0)[seen].mean()) for move in moves
+            float(np.linalg.norm(self.motion.places(shot.move, middle) - first, axis=0)[seen].mean()) for shot in shots
         )
-        if apart < STILL_PX:
-            return [(list(exposures), moves[0])]
-        return [([one], move) for one, move in zip(exposures, moves, strict=True)]
+        return [list(shots)] if apart < STILL_PX else [[shot] for shot in shots]
 
-    def _colours_of(self, exposures: Sequence[Exposure]) -> Image:
-        """Counts a second, their variances (C of each) and 1 where they are lost, of the region; all (H, W, 2 C + 1)."""
+    def _sparse(self, frame: RawFrame, counts: Counts) -> Exposure:
+        """An exposure of evenly spaced cells of the region, which tell what all of it has in common."""
+        region, cell = self._sampler.region, 1 if self._mosaic == "none" else EVEN
+        step = cell * max(1, int(np.sqrt(counts.shape[0] * counts.shape[1] / COMPARED_PIXELS)))
+        rows, columns = (
+            (np.arange(0, length - cell + 1, step)[:, None] + np.arange(cell)).ravel() for length in counts.shape[:2]
+        )
+        there = np.ix_(rows, columns)
+        return self._frames.exposure_of(frame, counts[there], np.ix_(rows + region.top, columns + region.left))
+
+    def _means(self, sparse: Sequence[Exposure]) -> NDArray[np.float32] | None:
+        """Mean brightness of a mosaic's channels; None of other cameras."""
+        rate, _, _ = merge(sparse, self._frames.noise)
+        return None if self._mosaic == "none" else channel_means(rate, self._mosaic)
+
+    def _exposure(self, frame: RawFrame, counts: Counts, held: Window) -> Exposure:
+        """An exposure of a part of the region."""
+        return self._frames.exposure_of(frame, counts[held.within(self._sampler.region)], (held.rows, held.columns))
+
+    def _colours(self, shots: Sequence[Shot], held: Window, means: NDArray[np.float32] | None) -> Image:
+        """Counts a second, their variances (C of each) and 1 where they are lost (H, W, 2 C + 1), of a part of the region."""
+        exposures = [self._exposure(shot.frame, shot.counts, held) for shot in shots]
         rate, variance, lost = merge(exposures, self._frames.noise)
+        del exposures
         if self._mosaic != "none":
             spoilt = spoiled(lost)
-            rate, variance = demosaic(rate, self._mosaic), demosaic_variance(variance, self._mosaic)
+            rate, variance = demosaic(rate, self._mosaic, means), demosaic_variance(variance, self._mosaic)
         else:
             spoilt = np.asarray(lost.any(axis=-1))
         if self._unmixed is not None:
             rate, variance = rate @ self._unmixed.T, variance @ (self._unmixed.T**2)
         return np.concatenate([rate, variance, spoilt[..., None]], axis=-1, dtype=np.float32)
 
-    def _band(
-        self, colours: Image, move: Displacement, rows: slice, *, warped: bool
-    ) -> tuple[Image, Image, BoolArray, BoolArray]:
-        """Radiance, variance (H, W, C), and where it is lost or lies beyond the photograph (H, W), of some rows of the view.
+    def _strip(self, shots: Sequence[Shot], strip: slice, means: NDArray[np.float32] | None, *, warped: bool) -> Values:
+        """Some rows of the view from exposures that show the subject at one place.
 
         Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right.
         """
-        window, region, count = self._view.window, self._sampler.region, len(self._channels)
-        if warped:
-            within = self.motion.places(move, rows) if move.median_px > STILL_PX else self._unmoved(rows)
-            places = self._sampler.places(within)
-            found, beyond = self._sampler.sampled(colours, places), self._sampler.beyond(places)
-        else:
-            top, left = window.top - region.top, window.left - region.left
-            found = colours[top + rows.start : top + rows.stop, left : left + window.shape[1]]
-            y, x = np.mgrid[window.top + rows.start : window.top + rows.stop, window.left : window.right]
-            places = np.stack([x, y]).astype(np.float32)
-            beyond = np.zeros(found.shape[:2], dtype=bool)
-        fall = self._frames.lens.fall(places[0], places[1])
-        scale = self._scale if fall is None else self._scale / fall[..., None]
-        return found[..., :count] * scale, found[..., count:-1] * scale**2, found[..., -1] > 0, beyond
+        height, width, count = strip.stop - strip.start, self._view.window.shape[1], len(self._channels)
+        parts = list(bands_of(strip, width))
+        places = [self._places(shots[0].move, rows, warped=warped) for rows in parts]
+        held = self._sampler.source(places)
+        colours = self._colours(shots, held, means)
+        radiance, variance = (np.empty((height, width, count), dtype=np.float32) for _ in range(2))
+        lost, beyond = (np.zeros((height, width), dtype=bool) for _ in range(2))
+        for rows, at in zip(parts, places, strict=True):
+            own = slice(rows.start - strip.start, rows.stop - strip.start)
+            if warped:
+                found = self._sampler.sampled(colours, at, held)
+                beyond[own] = self._sampler.beyond(at)
+            else:
+                top, left = self._view.window.top - held.top, self._view.window.left - held.left
+                found = colours[top + rows.start : top + rows.stop, left : left + width]
+            fall = self._frames.lens.fall(at[0], at[1])
+            scale = self._scale if fall is None else self._scale / fall[..., None]
+            np.multiply(found[..., :count], scale, out=radiance[own])
+            np.multiply(found[..., count:-1], scale**2, out=variance[own])
+            lost[own] = found[..., -1] > 0
+        return radiance, variance, lost, beyond
 
-    def _unmoved(self, rows: slice) -> Image:
-        """Indices x, y (2, rows, W) of ``motion.window`` of some rows of the view."""
-        inner = self._view.window.within(self.motion.window)
-        y, x = np.mgrid[inner[0].start + rows.start : inner[0].start + rows.stop, inner[1]]
-        return np.stack([x, y]).astype(np.float32)
+    def _places(self, move: Displacement, rows: slice, *, warped: bool) -> Image:
+        """Indices x, y (2, rows, W) of the photograph of some rows of the view."""
+        window = self._view.window
+        if not warped:
+            return _indices(slice(window.top + rows.start, window.top + rows.stop), window.columns)
+        if move.median_px > STILL_PX:
+            return self._sampler.places(self.motion.places(move, rows))
+        inner = window.within(self.motion.window)
+        return self._sampler.places(_indices(slice(inner[0].start + rows.start, inner[0].start + rows.stop), inner[1]))
 
 
-def _joined(parts: Sequence[tuple[Image, Image, BoolArray, BoolArray]]) -> tuple[Image, Image, BoolArray, BoolArray]:
+def _indices(rows: slice, columns: slice) -> Image:
+    """Indices x and y (2, H, W)."""
+    y, x = np.mgrid[rows, columns]
+    return np.stack([x, y]).astype(np.float32)
+
+
+def _joined(parts: Sequence[Values]) -> Values:
     """Aligned exposures joined by inverse variance; a pixel is lost where it is in all of them."""
     if len(parts) == 1:
         radiance, variance, lost, beyond = parts[0]

@@ -14,7 +14,7 @@ from services.preprocess.stabilisation.motion import stored_step
 
 FORMAT = 6
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
-INDIFFERENT = frozenset({"workers", "priority"})
+INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
 """Options that change no pixel."""
 CHUNK_PX = 512
 """Edge of the pieces of a shard, which are read or left empty at once: whole rows, or 256 or 1024 px, took longer to write a tooth's window."""

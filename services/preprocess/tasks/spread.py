@@ -77,6 +77,16 @@ class OnWorkers:
                 self._client.cancel(list(pending))
 
 
+def threads_here() -> int:
+    """How many blocks this process may run at once, and share its memory among: as many as its worker has threads."""
+    from distributed import get_worker
+
+    try:
+        return max(1, int(get_worker().state.nthreads))
+    except ValueError:
+        return 1
+
+
 @contextmanager
 def spread(priority: Priority) -> Iterator[Spread]:
     """Inside a Dask task its cluster, holding no thread meanwhile; elsewhere this process."""

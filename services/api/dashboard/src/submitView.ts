@@ -10,7 +10,7 @@ const SOURCES = new Set(["capture", "rig"]);
 const GROUPS: [string, string[]][] = [
   ["What is fitted", ["kind", "fdi", "boundary", "ior", "dentin", "stains", "lobes"]],
   ["Images", ["channels", "held_out_lights", "calibration", "accept_calibration", "instrument", "shadows", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
-  ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "image_tolerance", "search_candidates", "advise", "seed", "priority", "workers", "device"]],
+  ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "image_tolerance", "search_candidates", "advise", "seed", "priority", "workers", "memory_gib", "device"]],
   ["Slab", ["dictionary", "particle_index", "particle_absorption", "effort"]],
   ["Solver", ["solver", "loss", "adam_steps", "adam_rate", "prior", "held"]],
 ];
