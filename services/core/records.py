@@ -192,7 +192,7 @@ class JobSpec(Record):
     )
     instrument: Literal["on", "off"] = Field(
         default="on",
-        description="of kind tooth: fit the instrument's errors too (gain, lights, flare), within the calibration's ±",
+        description="of a tooth or jaw: fit the instrument's errors too (gain, lights, flare), within the calibration's ±",
     )
     loss: Loss = Field(
         default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders"
@@ -213,6 +213,11 @@ class JobSpec(Record):
         default=None,
         fail_fast=True,
         description="lights kept from the fit; default: the capture's own, else every fourth",
+    )
+    held_out_cameras: tuple[str, ...] = Field(
+        default=(),
+        fail_fast=True,
+        description="cameras kept from the fit, under all lights; the others then lose those of held_out_lights alone",
     )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")

@@ -94,6 +94,10 @@ class FitReport(Record):
         default=(),
         description="the instrument's errors whose size no calibration states, by name; teeth and dome of their moves",
     )
+    instrument_faults: dict[str, tuple[str, ...]] = Field(
+        default={},
+        description="per channel: the instrument's errors, by name, that the images put down to a fault of the calibration",
+    )
     instrument_told: tuple[str, ...] = Field(
         default=(),
         description="what to know of the instrument, one sentence each: what was assumed, what seems at fault",

@@ -267,6 +267,8 @@ def test_three_channels_and_no_dentin(tmp_path: Path) -> None:
         ({"light_count": 1, "held_out": ()}, {}, CaptureInputError, "1 light"),
         ({}, {"held_out_lights": ("l0", "l1", "l2", "l3", "l4", "l5")}, SettingsError, "held out"),
         ({}, {"held_out_lights": ("sun",)}, SettingsError, "'sun'"),
+        ({}, {"held_out_cameras": ("c0", "c1")}, SettingsError, "held out"),
+        ({}, {"held_out_cameras": ("moon",)}, SettingsError, "'moon'"),
         ({}, {"channels": ("violet",)}, SettingsError, "'violet'"),
     ],
 )

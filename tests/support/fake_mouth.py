@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.rays import RayScene, pixel_rays
 from services.fit.transport.scene.recipe import SceneRecipe, View
-from tests.support.fake_engine import FakeEngine, Slowly
+from tests.support.fake_engine import NOISE, FakeEngine, Slowly
 
 Array = NDArray[np.float64]
 
@@ -51,3 +51,9 @@ class FakeMouthEngine(FakeEngine):
 
 class SlowFakeMouthEngine(Slowly, FakeMouthEngine):
     """The same, slowly."""
+
+
+class QuietFakeMouthEngine(FakeMouthEngine):
+    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that counts."""
+
+    path_noise = 0.1 * NOISE

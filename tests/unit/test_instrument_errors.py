@@ -28,6 +28,7 @@ from services.fit.solve.covariance import _prior_parts, estimates, instrument_es
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import normal_equations
+from services.fit.solve.recombination import Fault
 from services.fit.transport.scene.recipe import View, single_tooth
 from tests.support.prepared import camera, sphere
 
@@ -187,15 +188,16 @@ def test_the_prior_of_the_errors_joins_slope_and_change() -> None:
 def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     spec = JobSpec.model_validate({"capture": "c"})
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), None)}
-    found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
     kinds = assumed_names(errors, None, {"teeth", "dome"})
     assert kinds == (*errors["green"].names, "teeth", "dome")
-    (assumed,) = instrument_sentences(spec, errors, found, kinds)
+    (assumed,) = instrument_sentences(spec, errors, {}, kinds)
     assert assumed.startswith("Assumed, as the calibration does not state")
     assert "1 % for the gain, 1 % for each light, 0.3 % for flare, 0.05 mm and 0.1° for where the scan lies" in assumed
-    found["green"]["light_gain.b"] = -0.05
-    _, fault = instrument_sentences(spec, errors, found, kinds)
-    assert fault.startswith("In green the images put light_gain.b off by -5.0 %, 5.0 times its ± of 1 %")
+    _, fault = instrument_sentences(spec, errors, {"green": (Fault(2, -0.05, -4.2),)}, kinds)
+    assert fault.startswith(
+        "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its ± of 1 %"
+    )
+    assert "check that light, its cable and its name" in fault
     off = spec.model_copy(update={"instrument": "off"})
     assert instrument_sentences(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(
         "The ± take the instrument for perfect"
@@ -208,8 +210,7 @@ def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
     # No move was measured, so what was assumed of moves is in no ±.
     names = assumed_names(errors, stated, ())
     assert names == ("light_gain.a", "flare.c0.green")
-    found = {"green": dict.fromkeys(errors["green"].names, 0.0)}
-    (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, found, names, stated)
+    (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, {}, names, stated)
     assert "may be: 1 % for light_gain.a and 0.3 % for flare. The ±" in told
 
 
@@ -299,8 +300,7 @@ def test_a_gain_that_goes_with_a_light_is_known_twice_as_well_when_it_is_said_so
 
 def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     stated = CalibrationUncertainty(names=("camera.c0.rx", "light.a.x"), covariance=((1e-6, 0.0), (0.0, 1.0)))
-    found = {"green": dict.fromkeys(NAMES, 0.0)}
-    told = instrument_sentences(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, found, (), stated)
+    told = instrument_sentences(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, {}, (), stated)
     assert told == (
         "The calibration states how wrong camera.c0.rx and 1 more may be, which the ± do not know: no fit moves single cameras and lights.",
     )

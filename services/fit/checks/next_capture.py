@@ -30,8 +30,9 @@ from services.fit.instrument.columns import columns
 from services.fit.instrument.errors import DEFAULT_SE
 from services.fit.instrument.moves import rigid
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Sandwich, Uncertainty, estimates
+from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.solve.information import Addition, addition, covariance_after
+from services.fit.solve.sandwich import Sandwich
 from services.fit.transport.scene.recipe import SceneRecipe, View
 
 Array = NDArray[np.float64]

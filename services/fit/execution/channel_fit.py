@@ -94,6 +94,13 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
     return np.zeros(len(x))
 
 
+def _settled(
+    problem: StackProblem[Optics], solution: Solution, known: Uncertainty
+) -> tuple[StackProblem[Optics], Solution]:
+    # Both where the last measurement puts the answer.
+    return replace(problem, base=problem.domain.tissue_at(known.x, problem.base)), replace(solution, x=known.x)
+
+
 @dataclass(frozen=True)
 class ChannelFit(Generic[Optics]):
     """A channel's result."""
@@ -273,7 +280,9 @@ class Stages(ABC, Generic[Optics]):
         # noise does, and is better by that promise and by images together.
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
-            return problem, solution, uncertainty(domain, x, equations)
+            found = uncertainty(domain, x, equations)
+            # Only errors of the instrument move x once more.
+            return (*_settled(problem, solution, found), found) if domain.errors.names else (problem, solution, found)
         known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
@@ -293,7 +302,7 @@ class Stages(ABC, Generic[Optics]):
         measured = uncertainty(
             domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.body for m in moves]
         )
-        return replace(problem, base=domain.tissue_at(x + step, problem.base)), replace(solution, x=x + step), measured
+        return *_settled(problem, solution, measured), measured
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 from services.core.results import Estimate, FitReport
-from services.fit.instrument.sentences import FAULT
 
 SOURCES = {
     "photographs": "photographs",
@@ -35,7 +34,7 @@ def source_tables(
         label: what it is called.
     """
     tables = []
-    for channel, table in report.parameters.items():
+    for channel, table in _tables(report).items():
         shown = {name: one for name, one in table.items() if leading(name) and one.se and one.se_parts}
         present = [name for name in SOURCES if any(_share(one, name) >= MIN_SHARE for one in shown.values())]
         rows = [(label(name), [_percent(_share(one, source)) for source in present]) for name, one in shown.items()]
@@ -58,11 +57,24 @@ def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
                     "se": f"{100 * (one.se or 0.0):.2f}",
                     "before": f"{100 * before:.2g}",
                     "assumed": name in report.assumed,
-                    "fault": abs(one.value) > FAULT * before,
+                    "fault": name in report.instrument_faults.get(channel, ()),
                 }
             )
         tables.append({"channel": channel, "rows": rows})
     return tables
+
+
+def _tables(report: FitReport) -> dict[str, dict[str, Estimate]]:
+    # A jaw's parameters are those of gums and wall, and each tooth's by its number.
+    teeth = {
+        channel: {
+            f"{fdi}.{name}": one
+            for fdi, tooth in report.teeth.items()
+            for name, one in tooth.parameters.get(channel, {}).items()
+        }
+        for channel in report.parameters
+    }
+    return {channel: dict(table) | teeth[channel] for channel, table in report.parameters.items()}
 
 
 def _share(estimate: Estimate, source: str) -> float:

@@ -101,7 +101,7 @@ def write_report(
         notes=report.notes,
         instrument_told=report.instrument_told,
         instrument=instrument_tables(report),
-        sources=source_tables(report, _is_leading, lambda name: f"{_group(name)}, {_label(name)}"),
+        sources=source_tables(report, _is_leading, _source_label),
         told=report.told,
         next_capture=report.next_capture,
         correlations=_correlations(report.correlations),
@@ -244,6 +244,12 @@ def _parameter_rows(parameters: dict[str, dict[str, Estimate]]) -> list[dict[str
 
 def _is_leading(name: str) -> bool:
     return name.rpartition(".")[2] in LEADING or name.startswith("shape.")
+
+
+def _source_label(name: str) -> str:
+    # Of a jaw's tooth, such as "11.enamel.sigma_a", by its number.
+    fdi, _, own = name.partition(".")
+    return f"{fdi} {_group(own).lower()}, {_label(own)}" if fdi.isdigit() else f"{_group(name)}, {_label(name)}"
 
 
 def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:

@@ -164,7 +164,7 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
     """Which images (camera, light) stay out of the fit: the job's choice, else the capture's, else every fourth light, at least one.
 
     Raises:
-        SettingsError: a light is unknown or none is left to fit. CaptureInputError: fewer than two lights.
+        SettingsError: a light or camera is unknown or none is left to fit. CaptureInputError: fewer than two lights.
     """
     cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
     if len(lights) < 2:
@@ -179,14 +179,24 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
                     f"Option held_out_lights names '{name}', which the capture does not have; it has {', '.join(lights)}."
                 )
             chosen[:, lights.index(name)] = True
+    elif spec.held_out_cameras:
+        pass
     elif manifest.held_out:
         for camera, light in manifest.held_out:
             chosen[cameras.index(camera), lights.index(light)] = True
     else:
         chosen[:, 3::4] = True
         chosen[:, -1] |= not chosen.any()
+    for name in spec.held_out_cameras:
+        if name not in cameras:
+            raise SettingsError(
+                f"Option held_out_cameras names '{name}', which the capture does not have; it has {', '.join(cameras)}."
+            )
+        chosen[cameras.index(name)] = True
     if chosen.all():
-        raise SettingsError("Every image is held out and none is left to fit; name fewer lights in held_out_lights.")
+        raise SettingsError(
+            "Every image is held out and none is left to fit; name fewer in held_out_lights or held_out_cameras."
+        )
     return chosen
 
 
@@ -224,8 +234,12 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
             "No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres."
         )
     require_signal(views, f"Channel {channel}")
-    if spec.held_out_lights != () and not any((v.valid & v.held_out[:, None]).any() for v in views):
-        raise CaptureInputError("No pixel is valid in any held-out image; name other lights in held_out_lights.")
+    if (spec.held_out_lights != () or spec.held_out_cameras) and not any(
+        (v.valid & v.held_out[:, None]).any() for v in views
+    ):
+        raise CaptureInputError(
+            "No pixel is valid in any held-out image; name others in held_out_lights or held_out_cameras."
+        )
     return tuple(views)
 
 
@@ -238,7 +252,7 @@ def require_signal(views: Sequence[ViewStack], name: str) -> None:
     fitted = [v.fitted for v in views]
     if not any(f.any() for f in fitted):
         raise CaptureInputError(
-            "No pixel is valid in any fitted image; name fewer lights in held_out_lights or check the masks."
+            "No pixel is valid in any fitted image; name fewer in held_out_lights or held_out_cameras, or check the masks."
         )
     signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
     if signal <= 0:

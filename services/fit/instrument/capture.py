@@ -16,6 +16,10 @@ from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_na
 from services.fit.instrument.moves import Move, move_covariance, write_moves
 from services.fit.transport.scene.recipe import SceneRecipe
 
+MAX_JAW_LIGHTS = 12
+"""A jaw under more lights takes the gain of each for exact. How noisy the products of derivatives and single lights' images are has to be kept
+for every tooth and its neighbours: 2 MB a tooth with 12 lights, which grows with their square. And where there are many, their errors average out."""
+
 
 @dataclass(frozen=True)
 class Instrument:
@@ -26,6 +30,8 @@ class Instrument:
     stated: CalibrationUncertainty | None
     dome_centre_mm: tuple[float, ...]
     """Mean position of all lights."""
+    max_light_gains: int | None = None
+    """Under more fitted lights than this, gains of single lights are no coordinates; None for any number."""
 
     def moves(self, folder: Path, recipe: SceneRecipe) -> tuple[Move, ...]:
         """Moves of scan and dome under the lights of a recipe, with their scenes."""
@@ -33,7 +39,10 @@ class Instrument:
 
     def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
         """Those of a channel that act on the fitted photographs of some cameras under the lights (L,) that are used."""
-        return errors_of(channel, self._chosen(used), cameras, self.stated)
+        lights = self._chosen(used)
+        if self.max_light_gains is not None and len(lights) > self.max_light_gains:
+            lights = []
+        return errors_of(channel, lights, cameras, self.stated)
 
     def acting(self, channel: str, camera: str, brightest: float, chosen: NDArray[np.bool_]) -> BlockInstrument:
         """Those that act on a camera's photographs under the chosen lights (L,).
@@ -49,9 +58,10 @@ class Instrument:
 
 
 def instrument_of(manifest: PreparedManifest, spec: JobSpec) -> Instrument | None:
-    """What is known of the instrument; None where the job takes it for perfect, and for jaws and the solver adam, which do not know it."""
-    if spec.instrument == "off" or spec.kind != "tooth" or spec.solver == "adam":
+    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not know it."""
+    if spec.instrument == "off" or spec.solver == "adam":
         return None
     positions = np.array([light.position_mm for light in manifest.lights])
     names = tuple(light.name for light in manifest.lights)
-    return Instrument(names, manifest.uncertainty, tuple(positions.mean(axis=0).tolist()))
+    most = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
+    return Instrument(names, manifest.uncertainty, tuple(positions.mean(axis=0).tolist()), most)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, kind_of_error
 from services.fit.instrument.moves import move_covariance
+from services.fit.solve.recombination import Fault
 
-FAULT = 3.0
-"""An error that the images move by more than so many of its ± before the fit is told as a fault: 1 good one in 370 is."""
 SIZES = {
     "gain": f"{100 * DEFAULT_SE['gain']:g} % for the gain",
     "light_gain": f"{100 * DEFAULT_SE['light_gain']:g} % for each light",
@@ -40,7 +39,7 @@ def assumed_names(
 def instrument_sentences(
     spec: JobSpec,
     errors: Mapping[str, InstrumentErrors],
-    found: Mapping[str, Mapping[str, float]],
+    faults: Mapping[str, Sequence[Fault]],
     assumed: tuple[str, ...],
     stated: CalibrationUncertainty | None = None,
 ) -> tuple[str, ...]:
@@ -50,21 +49,22 @@ def instrument_sentences(
         stated: by the calibration.
         assumed: names, as ``assumed_names`` gives them.
         errors: by channel, as they were known before the fit.
-        found: by channel and name, what the images make of them.
+        faults: by channel, which of them the images put down to the calibration.
     """
     if spec.instrument == "off":
         return (
             "The ± take the instrument for perfect, as instrument = 'off' says: gain, lights and flare may be wrong.",
         )
     if not any(own.names for own in errors.values()):
-        whose = "a jaw" if spec.kind == "jaw" else f"the solver {spec.solver}"
-        return (f"The ± take the instrument for perfect: a fit of {whose} does not know its gain, lights and flare.",)
+        return (
+            f"The ± take the instrument for perfect: a fit of the solver {spec.solver} does not know its gain, lights and flare.",
+        )
     unmoved = (
         ("The ± of a fit with two lobes take the scan and the dome to lie where the calibration says.",)
         if spec.lobes == 2
         else ()
     )
-    return (*_assumed(assumed, errors), *_unused(stated), *unmoved, *_faults(errors, found))
+    return (*_assumed(assumed, errors), *_unused(stated), *_exact_lights(errors), *unmoved, *_faults(errors, faults))
 
 
 def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
@@ -97,12 +97,17 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
         )
 
 
-def _faults(errors: Mapping[str, InstrumentErrors], found: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
-    for channel, own in errors.items():
-        for name, before in zip(own.names, own.se.tolist(), strict=True):
-            value = found[channel][name]
-            if abs(value) > FAULT * before:
-                yield (
-                    f"In {channel} the images put {name} off by {100 * value:+.1f} %, {abs(value) / before:.1f} times "
-                    f"its ± of {100 * before:.2g} %: the calibration seems at fault; {REMEDY[kind_of_error(name)]}."
-                )
+def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
+    if not any(kind_of_error(name) == "light_gain" for own in errors.values() for name in own.names):
+        yield "The ± take single lights for as bright as the calibration says: under so many a jaw's fit knows their common gain alone."
+
+
+def _faults(errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]) -> Iterator[str]:
+    for channel, own in faults.items():
+        for fault in own:
+            name, before = errors[channel].names[fault.place], errors[channel].se[fault.place]
+            yield (
+                f"In {channel} the images put {name} off by {100 * fault.size:+.1f} %, {abs(fault.z):.1f} times what "
+                f"their own error and its ± of {100 * before:.2g} % allow together: the calibration seems at fault; "
+                f"{REMEDY[kind_of_error(name)]}."
+            )

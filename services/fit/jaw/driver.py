@@ -29,6 +29,7 @@ from services.fit.inputs.observations import (
     require_signal,
     write_channel,
 )
+from services.fit.instrument.capture import Instrument, instrument_of
 from services.fit.jaw.report import JawFit, report
 from services.fit.jaw.schedule import JawSchedule
 from services.fit.jaw.starts import GUMS_START, MIN_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
@@ -72,14 +73,20 @@ class JawDriver:
                 attempt.log(
                     f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh."
                 )
-        channels = []
+        channels, instrument = [], instrument_of(observations.manifest, spec)
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
             channels.append(
                 Channel(
                     name,
                     views,
-                    write_channel(attempt.inputs, channel_scene(observations, name, dentins, spec), name, views),
+                    write_channel(
+                        attempt.inputs,
+                        channel_scene(observations, name, dentins, spec),
+                        name,
+                        views,
+                        instrument=instrument,
+                    ),
                 )
             )
         journal = attempt.journal(channel.files for channel in channels)
@@ -92,7 +99,7 @@ class JawDriver:
             for number, channel in enumerate(order):
                 shapes = [tooth.shape for tooth in found[order[0].name].fit.tissue.teeth] if found else None
                 run = _ChannelRun(
-                    attempt, observations, dentins, channel, journal, run_on, (number, len(order)), shapes
+                    attempt, observations, dentins, channel, journal, run_on, (number, len(order)), instrument, shapes
                 )
                 found[channel.name] = run.fit()
         fits = {channel.name: found[channel.name] for channel in channels}
@@ -102,7 +109,7 @@ class JawDriver:
             {c: jaw.fit.evaluation for c, jaw in fits.items()},
             {c: jaw.views for c, jaw in fits.items()},
         )
-        return report(fits, order[0].name, dentins, observations, time.time() - begun)
+        return report(spec, fits, order[0].name, dentins, observations, time.time() - begun)
 
 
 def require_jaw_options(spec: JobSpec) -> None:
@@ -157,6 +164,8 @@ class _ChannelRun:
     run_on: Executor
     place: tuple[int, int]
     """Number of this channel, and of how many."""
+    instrument: Instrument | None
+    """Whose errors all teeth share; None for one without."""
     shapes: Sequence[tuple[float, ...]] | None = None
     """Known blend weights of each tooth; None where they are to be fitted."""
     steps: int = 0
@@ -186,7 +195,7 @@ class _ChannelRun:
                 channel_scene(observations, self.channel.name, dentins, self.attempt.spec),
                 without(views, failed),
             )
-            files = write_channel(self.attempt.inputs, scene, self.channel.name, views)
+            files = write_channel(self.attempt.inputs, scene, self.channel.name, views, instrument=self.instrument)
         self.attempt.log(f"{self.channel.name}: all {len(starts)} teeth together.")
         schedule = JawSchedule(
             files=files,

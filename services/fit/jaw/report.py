@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
+from services.core.records import JobSpec
 from services.core.results import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.alignment import offsets_told
@@ -17,6 +18,7 @@ from services.fit.checks.thickness import thickness_map
 from services.fit.execution.attempt import judge, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
 from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.instrument.found import instrument_report
 from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.covariance import estimates
@@ -38,6 +40,7 @@ class JawFit:
 
 
 def report(
+    spec: JobSpec,
     fits: Mapping[str, JawFit],
     shaped_by: str,
     dentins: Sequence[DentinShape | None],
@@ -79,6 +82,7 @@ def report(
         steps=sum(jaw.fit.steps for jaw in fits.values()),
         seconds=seconds,
         teeth=teeth,
+        **instrument_report(spec, {c: jaw.fit.known for c, jaw in fits.items()}, observations.manifest.uncertainty),
     )
 
 

@@ -14,6 +14,8 @@ exact      the same                                                        exact
 Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is asked with everything around it in
 place: alone, gums and wall are missing, and what they reflect is taken for the tooth's own.
 
+Gain, lights and flare of the instrument, and where scan and dome lie, are the same for all teeth. Like a tooth's they join in exact media.
+
 Teeth of which too little is seen, or whose own fit failed, have coordinates like all others, but with a Gaussian prior about the median of the front
 teeth, taken anew before each stage. So what little is seen of them still counts, and where nothing is, they follow.
 """
@@ -172,7 +174,8 @@ class JawSchedule(Stages[Mouth]):
                 *self._domain(mouth).coordinates,
                 Coordinate(enamel, *COSINE),
                 *(Coordinate((name,), *SHAPE) for name in weights),
-            )
+            ),
+            self.files.errors,
         )
 
     @property

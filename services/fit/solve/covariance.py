@@ -12,12 +12,14 @@ M        the response of the answer, 1 where Jacobians are the images' own; S, s
 N        what noise in M does to steps p that were taken by it, diag(sum_b var(M_ab) p_b^2)
 r        what is left of the step to the minimum, where the fit ended short of it: M^-1 (gradient + Lambda (x - mean))
 =======  ==========================================================================================================================
+
+Where the instrument's errors are coordinates their prior is then used in full (``solve.recombination``), which moves x.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
 from types import MappingProxyType
 
@@ -31,6 +33,8 @@ from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, Response, response
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
+from services.fit.solve.recombination import Fault
+from services.fit.solve.sandwich import Sandwich, settle
 
 Array = NDArray[np.float64]
 NOISE_FACTOR = 3.0
@@ -49,23 +53,6 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Sandwich:
-    """Cov(x) = T M^-1 meat M^-T T', each (F, F)."""
-
-    transform: Array
-    inverse: Array
-    meat: Array
-    misfit: float
-    """Factor s by which residuals exceed the measurements' noise."""
-
-    @property
-    def covariance(self) -> Array:
-        """Of x, (F, F)."""
-        half = self.transform @ self.inverse
-        return np.asarray(half @ self.meat @ half.T)
-
-
-@dataclass(frozen=True)
 class Uncertainty:
     """Covariance (F, F) of x, and the scaled directions (F, K) that the data leave open."""
 
@@ -79,6 +66,8 @@ class Uncertainty:
     """What the covariance is made of, but for r r'."""
     parts: Mapping[str, Array] = field(default_factory=dict)
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
+    faults: tuple[Fault, ...] = ()
+    """Errors of the instrument that the images put down to a fault of the calibration."""
 
     def standard_error(self, slope: Array) -> float:
         """One standard error of a quantity with gradient ``slope`` (F,) to x."""
@@ -243,7 +232,7 @@ def uncertainty(
     step: Array | None = None,
     moved: Sequence[str] = (),
 ) -> Uncertainty:
-    """Uncertainty at a solution from the normal equations there.
+    """Uncertainty at a solution from the normal equations there. Its x is the solution, moved where errors of an instrument use their prior in full.
 
     Args:
         sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where Jacobians are the images' own.
@@ -279,12 +268,11 @@ def uncertainty(
     # What is left of the step counts as error along what is not open.
     rest = t @ inverse @ left / domain.scale
     rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
-    sandwich = Sandwich(t, inverse, meat, misfit)
-    unfinished = np.outer(rest, rest)
-    covariance = sandwich.covariance + unfinished
-    made_of = {name: replace(sandwich, meat=part).covariance for name, part in parts.items()}
-    made_of["unfinished"] = unfinished
-    return Uncertainty(domain, x, 0.5 * (covariance + covariance.T), known.open_directions, t @ t.T, sandwich, made_of)
+    found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest))
+    covariance = 0.5 * (found.covariance + found.covariance.T)
+    return Uncertainty(
+        domain, found.x, covariance, known.open_directions, t @ t.T, found.sandwich, found.parts, found.faults
+    )
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.covariance import Sandwich, Uncertainty, positive_part
+from services.fit.solve.covariance import Uncertainty, positive_part
+from services.fit.solve.sandwich import Sandwich
 
 Array = NDArray[np.float64]
 
@@ -80,7 +81,7 @@ def covariance_with(known: Sandwich, added: Addition) -> Array:
     own = added.left()
     information, meat = (positive_part(matrix) for matrix in (own.information, own.meat))
     inverse = np.linalg.inv(np.linalg.inv(known.inverse) + information)
-    return np.asarray(known.transform @ inverse @ (known.meat + meat) @ inverse.T @ known.transform.T)
+    return known.covariance_of(inverse, known.meat + meat)
 
 
 def covariance_after(known: Uncertainty, added: Addition) -> Array:

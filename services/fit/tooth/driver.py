@@ -36,10 +36,9 @@ from services.fit.inputs.observations import (
 )
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.instrument.capture import instrument_of
-from services.fit.instrument.moves import MOVED
-from services.fit.instrument.sentences import assumed_names, instrument_sentences
+from services.fit.instrument.found import instrument_report
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Uncertainty, estimates, instrument_estimates
+from services.fit.solve.covariance import Uncertainty, estimates
 from services.fit.tooth.schedule import ChannelSchedule
 
 
@@ -159,12 +158,6 @@ class FitDriver:
         )
         converged, advice = converged and not misplaced, misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
-        errors = {c: known[c].domain.errors for c in fits}
-        instrument = {c: found for c in fits if (found := instrument_estimates(known[c]))}
-        stated = observations.manifest.uncertainty
-        moved = {body for body in MOVED if any(body in one.parts for one in known.values())}
-        assumed = assumed_names(errors, stated, moved)
-        values = {c: {name: one.value for name, one in found.items()} for c, found in instrument.items()}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
             observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance
@@ -182,12 +175,9 @@ class FitDriver:
             shape_covariance=covariance,
             enamel_thickness=None if thickness is None else thickness.mean,
             correlations=correlations,
-            instrument=instrument,
-            instrument_prior={c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in instrument},
-            assumed=assumed,
-            instrument_told=instrument_sentences(self.attempt.spec, errors, values, assumed, stated),
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
+            **instrument_report(self.attempt.spec, known, observations.manifest.uncertainty),
         )
 
     def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:

@@ -67,12 +67,20 @@ def held_out_images(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...
     """(camera, light) pairs kept from the fit: as the job says, else as the capture marks, else every fourth light.
 
     Raises:
-        SettingsError: a light is unknown, or none is left to fit.
+        SettingsError: a light or camera is unknown, or none is left to fit.
     """
     names = [light.name for light in source.description.lights]
-    if spec.held_out_lights is None and source.held_out:
+    cameras = [camera.name for camera in source.description.cameras]
+    if unknown := [name for name in spec.held_out_cameras if name not in cameras]:
+        raise SettingsError(
+            f"Option 'held_out_cameras' names {unknown[0]}, but the capture has {', '.join(cameras)}; correct it."
+        )
+    if set(spec.held_out_cameras) == set(cameras):
+        raise SettingsError("Option 'held_out_cameras' keeps every camera from the fit; leave at least one to it.")
+    if spec.held_out_lights is None and source.held_out and not spec.held_out_cameras:
         return source.held_out
-    chosen = spec.held_out_lights if spec.held_out_lights is not None else tuple(names[3::4])
+    usual = () if spec.held_out_cameras else tuple(names[3::4])
+    chosen = spec.held_out_lights if spec.held_out_lights is not None else usual
     if unknown := [name for name in chosen if name not in names]:
         raise SettingsError(
             f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it."
@@ -83,5 +91,5 @@ def held_out_images(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...
         (camera.name, names[j])
         for k, camera in enumerate(source.description.cameras)
         for j in source.lights_of(k)
-        if names[j] in chosen
+        if names[j] in chosen or camera.name in spec.held_out_cameras
     )

@@ -295,6 +295,8 @@ def test_bad_input_ends_in_one_sentence(case: str, tmp_path: Path) -> None:
     [
         ({"held_out_lights": ("sun",)}, r"'held_out_lights' names sun, but the capture has left, right"),
         ({"held_out_lights": ("left", "right")}, r"keeps every light from the fit"),
+        ({"held_out_cameras": ("moon",)}, r"'held_out_cameras' names moon, but the capture has front, side"),
+        ({"held_out_cameras": ("front", "side")}, r"keeps every camera from the fit"),
         ({"channels": ()}, r"'channels' is empty"),
         ({"channels": ("red",)}, r"'channels' names red, but the capture has green, blue"),
     ],

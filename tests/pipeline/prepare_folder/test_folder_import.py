@@ -129,6 +129,16 @@ def test_held_out_lights_of_the_job_replace_the_captures(tmp_path: Path) -> None
     assert prepare(tmp_path, tmp_path / "none", held_out_lights=()).held_out == ()
 
 
+def test_a_camera_is_kept_from_the_fit_under_all_lights(tmp_path: Path) -> None:
+    tree = write_folder(tmp_path)
+    tree["images"][0]["held_out"] = True
+    write_tree(tmp_path, tree)
+    side = (("side", "left"), ("side", "right"))
+    assert prepare(tmp_path, tmp_path / "camera", held_out_cameras=("side",)).held_out == side
+    both = prepare(tmp_path, tmp_path / "both", held_out_cameras=("side",), held_out_lights=("left",)).held_out
+    assert both == (("front", "left"), *side)
+
+
 def test_a_camera_may_be_named_in_any_script(tmp_path: Path) -> None:
     tree = write_folder(tmp_path)
     rename_camera(tree, "Kamera 2.1 – öben")

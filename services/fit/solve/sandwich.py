@@ -1,0 +1,100 @@
+"""Cov(x) = T M^-1 meat M^-T T' of a fit's answer, and the same after the prior of the instrument's errors was used in full (``recombination``)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.instrument.errors import kind_of_error
+from services.fit.optics.domain import Domain
+from services.fit.solve.recombination import Fault, Recombination, faults, recombine
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sandwich:
+    """Cov(x) = T M^-1 meat M^-T T', each (F, F), with the prior of the last K coordinates used in full."""
+
+    transform: Array
+    inverse: Array
+    meat: Array
+    misfit: float
+    """Factor s by which residuals exceed the measurements' noise."""
+    prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """V (K, K) of the instrument's errors."""
+    unbelieved: tuple[int, ...] = ()
+    """Places of those whose prior is not used again."""
+
+    @property
+    def covariance(self) -> Array:
+        """Of x, (F, F)."""
+        return self.covariance_of(self.inverse, self.meat)
+
+    def covariance_of(self, inverse: Array, meat: Array) -> Array:
+        """The same of another M^-1 and meat, each (F, F)."""
+        plain = self.plain(inverse, meat)
+        if not len(self.prior):
+            return plain
+        found = recombine(plain, self.response(inverse), self.prior)
+        return np.asarray(plain - found.gain(self.unbelieved) @ found.cross.T)
+
+    def plain(self, inverse: Array, meat: Array) -> Array:
+        """T M^-1 meat M^-T T', (F, F): before the prior is used again."""
+        half = self.transform @ inverse
+        return np.asarray(half @ meat @ half.T)
+
+    def response(self, inverse: Array) -> Array:
+        """B = dx / dm (F, K): how the answer follows the mean of the errors' prior."""
+        own = self.transform[len(self.transform) - len(self.prior) :]
+        return np.asarray(self.transform @ inverse @ own.T @ np.linalg.inv(self.prior))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """An answer after its prior was used in full."""
+
+    x: Array
+    covariance: Array
+    parts: dict[str, Array]
+    sandwich: Sandwich
+    faults: tuple[Fault, ...]
+
+
+def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Array], unfinished: Array) -> Settled:
+    """Use the prior of the instrument's errors in full, but that of an error that is a fault of the calibration.
+
+    Args:
+        meats: whitened, by source; they add up to the sandwich's.
+        unfinished: covariance (F, F) of what is left of the step.
+    """
+    count, plain = domain.tissue_count, {name: sandwich.plain(sandwich.inverse, meat) for name, meat in meats.items()}
+    whole = sandwich.plain(sandwich.inverse, sandwich.meat) + unfinished
+    plain["unfinished"] = unfinished
+    if not domain.errors.names:
+        return Settled(x, whole, plain, sandwich, ())
+    sandwich = replace(sandwich, prior=domain.errors.matrix)
+    response = sandwich.response(sandwich.inverse)
+    found = recombine(whole, response, sandwich.prior)
+    wrong = faults(x[count:], found)
+    unbelieved = tuple(fault.place for fault in wrong)
+    gain = found.gain(unbelieved)
+    low, high = domain.bounds
+    settled = np.clip(x - gain @ x[count:], low, high)
+
+    # Every part but the prior's goes through 1 - G; the prior's columns are its own answer, and what its second use adds.
+    through = np.eye(len(x))
+    through[:, count:] -= gain
+    parts = {name: through @ part @ through.T for name, part in plain.items()}
+    parts |= _of_prior(domain, through @ response + gain, found)
+    return Settled(settled, whole - gain @ found.cross.T, parts, replace(sandwich, unbelieved=unbelieved), wrong)
+
+
+def _of_prior(domain: Domain, response: Array, found: Recombination) -> dict[str, Array]:
+    # dx / dn (F, K) of a prior's error n of covariance V = L L' by kind of error; what kinds that go together have in common counts for the first of them.
+    kinds = np.array([kind_of_error(name) for name in domain.errors.names])
+    halves = response @ np.linalg.cholesky(found.prior)
+    return {kind: halves[:, kinds == kind] @ halves[:, kinds == kind].T for kind in dict.fromkeys(kinds.tolist())}

@@ -1,0 +1,39 @@
+"""Which images a fit keeps to test itself with: by light, by camera, and both."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.core.geometry import Light
+from services.core.records import JobSpec, PreparedManifest
+from services.fit.inputs.observations import held_out_images
+from tests.support.prepared import camera
+
+
+def manifest() -> PreparedManifest:
+    lights = tuple(Light(name=f"l{k}", position_mm=(float(k), 500.0, 300.0), intensity=(1e6,)) for k in range(5))
+    return PreparedManifest(
+        channels=("green",), cameras=(camera("c0"), camera("c1"), camera("c2")), lights=lights, held_out=(("c0", "l1"),),
+        fdi=(11,), dentin_known=(), median_motion_px=None, valid_fraction=0.9,
+    )  # fmt: skip
+
+
+def chosen(**options: object) -> np.ndarray:
+    return held_out_images(manifest(), JobSpec.model_validate({"capture": "c"} | options))
+
+
+def test_a_camera_that_is_named_is_tested_under_all_lights_and_the_others_are_fitted_under_all() -> None:
+    found = chosen(held_out_cameras=("c1",))
+    assert found[1].all()
+    assert not found[[0, 2]].any()
+
+
+def test_lights_that_are_named_too_are_kept_from_all_cameras() -> None:
+    found = chosen(held_out_cameras=("c1",), held_out_lights=("l3",))
+    assert found[1].all()
+    assert found[:, 3].all()
+    assert found.sum() == 5 + 2
+
+
+def test_without_cameras_the_captures_own_choice_stays() -> None:
+    assert np.argwhere(chosen()).tolist() == [[0, 1]]

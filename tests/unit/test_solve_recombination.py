@@ -1,0 +1,115 @@
+"""The prior of an instrument's errors, used in full: smaller errors where a fit did not use it, true ones, and faults by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.solve.recombination import FAULT_Z, Recombination, faults, recombine
+
+Array = NDArray[np.float64]
+
+PRIOR = np.diag([0.01, 0.01, 0.003]) ** 2
+TISSUE, ERRORS, COUNT = 2, 3, 60
+
+
+@dataclass(frozen=True)
+class Crude:
+    """A linear fit by derivatives that are not the images' own, of images that a move changes too, of which it knows nothing."""
+
+    answer: Array
+    """What it makes of measurements, (F, M)."""
+    response: Array
+    """What it makes of the prior's means, B (F, K)."""
+    exact: Array
+    """The images' own derivatives, (M, F)."""
+    move: Array
+    """What one ± of the move changes, (M,)."""
+
+    @property
+    def covariance(self) -> Array:
+        """Of its answer about the truth, (F, F)."""
+        moved = self.answer @ self.move
+        return self.answer @ self.answer.T + self.response @ PRIOR @ self.response.T + np.outer(moved, moved)
+
+    @property
+    def found(self) -> Recombination:
+        return recombine(self.covariance, self.response, PRIOR)
+
+    def draw(self, random: np.random.Generator, fault: Array | float = 0.0) -> Array:
+        """One answer less the truth, and its errors less their prior's means, (F + K,)."""
+        means = random.standard_normal(ERRORS) @ np.sqrt(PRIOR) + fault
+        measured = self.move * random.standard_normal() + random.standard_normal(COUNT)
+        off = self.answer @ measured + self.response @ means
+        return np.concatenate([off, off[TISSUE:] - means])
+
+
+def crude(seed: int, misfit: float, moved: float) -> Crude:
+    """Measurements of unit noise, in which the tissue is well and the errors are about as well known as by their prior."""
+    random = np.random.default_rng(seed)
+    exact = np.concatenate(
+        [3 * random.standard_normal((COUNT, TISSUE)), 20 * random.standard_normal((COUNT, ERRORS))], axis=1
+    )
+    exact[:, 2] += 4 * exact[:, 0]
+    believed = exact + misfit * np.abs(exact).mean(axis=0) * np.concatenate(
+        [random.standard_normal((COUNT, TISSUE)), np.zeros((COUNT, ERRORS))], axis=1
+    )
+    precision = np.zeros((TISSUE + ERRORS,) * 2)
+    precision[TISSUE:, TISSUE:] = np.linalg.inv(PRIOR)
+    # The answer solves believed' (exact x - y) + precision (x - mean) = 0.
+    solved = np.linalg.inv(believed.T @ exact + precision)
+    return Crude(solved @ believed.T, (solved @ precision)[:, TISSUE:], exact, moved * random.standard_normal(COUNT))
+
+
+def test_a_fit_that_used_its_prior_in_full_stays_as_it_is() -> None:
+    whole = crude(1, misfit=0.0, moved=0.0)
+    np.testing.assert_allclose(whole.found.gain(), 0.0, atol=1e-9)
+
+
+def test_no_error_is_known_worse_than_its_prior_and_every_other_at_least_as_well() -> None:
+    one = crude(2, misfit=1.0, moved=2.0)
+    assert one.covariance[TISSUE, TISSUE] > 1.5 * PRIOR[0, 0], "the crude fit is not crude"
+    settled = one.covariance - one.found.gain() @ one.found.cross.T
+    assert (np.diag(settled)[TISSUE:] <= np.diag(PRIOR) * (1 + 1e-9)).all()
+    assert (np.diag(settled) <= np.diag(one.covariance) * (1 + 1e-9)).all()
+    assert settled[0, 0] < 0.9 * one.covariance[0, 0]
+
+
+def test_what_it_states_is_what_repeated_fits_show() -> None:
+    one, random = crude(2, misfit=1.0, moved=2.0), np.random.default_rng(3)
+    gain = one.found.gain()
+    draws = np.array([one.draw(random) for _ in range(4000)])
+    off, apart = draws[:, : TISSUE + ERRORS], draws[:, TISSUE + ERRORS :]
+    shown = np.cov((off - apart @ gain.T).T)
+    stated = one.covariance - gain @ one.found.cross.T
+    # A variance from 4,000 draws is known to 2.2 %: 4 of that.
+    np.testing.assert_allclose(np.diag(shown) / np.diag(stated), 1.0, atol=4 * np.sqrt(2 / 4000))
+    np.testing.assert_allclose(np.diag(np.cov(apart.T)) / np.diag(one.found.spread), 1.0, atol=4 * np.sqrt(2 / 4000))
+
+
+def test_a_fault_is_named_with_its_size_and_does_not_draw_others_along() -> None:
+    one, random, size = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(5), np.array([-0.1, 0.0, 0.0])
+    named = [faults(one.draw(random, fault=size)[TISSUE + ERRORS :], one.found) for _ in range(200)]
+    assert all(told and told[0].place == 0 for told in named)
+    sizes = np.array([told[0].size for told in named])
+    # The prior's mean is off by -0.1, so its error lies 0.1 above: mean of 200.
+    assert abs(sizes.mean() - 0.1) < 4 * sizes.std() / np.sqrt(200)
+    # Of two others each one in 370 is named by chance: 200 times as many are below 6 in all but one case of 10,000.
+    assert sum(len(told) - 1 for told in named) < 6
+
+
+def test_good_calibrations_are_told_as_wrong_as_rarely_as_their_errors_say() -> None:
+    one, random = crude(2, misfit=1.0, moved=2.0), np.random.default_rng(6)
+    false = sum(bool(faults(one.draw(random)[TISSUE + ERRORS :], one.found)) for _ in range(2000))
+    # Three errors at z of 3: at most 3 / 370 of 2,000, 16; 4 of their Poisson errors above it.
+    assert FAULT_Z == 3.0
+    assert false < 16 + 4 * np.sqrt(16)
+
+
+def test_an_unbelieved_prior_is_not_used_again() -> None:
+    found = crude(2, misfit=1.0, moved=2.0).found
+    gain = found.gain(without=(0,))
+    assert not gain[:, 0].any()
+    assert gain[:, 1].any()
