@@ -2,10 +2,12 @@
 
 python -m tests.benchmarks.instrument_errors --json instrument_errors.json
 python -m tests.benchmarks.instrument_errors --errors none,gain --pixel-step 3 --json gain.json
+python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 --instrument on --json faults.json
 
-The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one error: its images are scaled, or light is
-added to them, or its lights are said to be elsewhere. Bias is that of the fit with the error less that of the fit without, so that what the fit itself leaves
-cancels. Fits run in this process, on one thread; ``seconds`` is its processor time, ``paths`` what every image took of paths, which is what a fit costs.
+The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one error: its images are scaled, or
+light is added to them, or its lights, scan or dome are said to be elsewhere, by two of the ± that are assumed, or by far more, where the fit has to name
+the fault. Bias is that of the fit with the error less that of the fit without, so that what the fit itself leaves cancels; with several seeds of the
+sensor's noise, of the same seed. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the paths of its last step.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.fits.tooth_capture import prepared_tooth
+from services.core.files.meshes import read_mesh, write_mesh
+from services.core.geometry import Mesh
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
@@ -34,18 +39,42 @@ SUBJECT = "central-incisor"
 QUANTITIES = ("enamel.sigma_s_reduced", "enamel.sigma_a", "dentin.sigma_s_reduced", "dentin.sigma_a")
 OPTIONS: dict[str, Any] = {"boundary": "matched", "dentin": "known", "advise": False, "held_out_lights": SIDE_LIGHTS}
 LIGHT = "l0"
+FAR_LIGHT = "l1"
+EXCHANGED = ("l0", "l3")
+"""Lights that are fitted, of which each camera's photographs are exchanged."""
+SCAN_OFF_MM, FAR_SCAN_MM, DOME_OFF_MM, FAR_LIGHT_MM = 0.1, 1.0, 4.0, 30.0
+"""Two of the assumed ± of scan and dome; and what is far from any ±."""
+FAULTS: Mapping[str, Callable[[FitReport], bool]] = {
+    "far_gain": lambda report: "gain.green" in report.instrument_faults.get("green", ()),
+    "far_light": lambda report: f"light_gain.{FAR_LIGHT}" in report.instrument_faults.get("green", ()),
+    "far_scan": lambda report: "mm apart" in report.advice,
+    "exchanged": lambda report: all(name in report.advice for name in ("seem exchanged", *EXCHANGED)),
+}
+"""Whether a report names what is wrong."""
 LIGHTS_OFF_MM = 10.0
 """Root mean square distance of the stated lights from the true ones, in a direction of its own each."""
 
 
 def perturb(folder: Path, error: str) -> None:
-    """Change a written capture as an instrument with an error would have: ``gain``, ``light_gain``, ``flare`` or ``lights``."""
+    """Change a written capture as an instrument with an error would have, ``none`` or one of ``ERRORS``."""
     description = json.loads((folder / "capture.json").read_text())
-    if error == "lights":
-        directions = np.random.default_rng(7).standard_normal((len(description["lights"]), 3))
-        directions *= LIGHTS_OFF_MM / np.linalg.norm(directions, axis=1, keepdims=True)
-        for light, way in zip(description["lights"], directions, strict=True):
-            light["position_mm"] = (np.array(light["position_mm"]) + way).tolist()
+    if error in ("lights", "dome", "far_light"):
+        _move_lights(description["lights"], error)
+        (folder / "capture.json").write_text(json.dumps(description))
+        return
+    if error in ("scan", "far_scan"):
+        # Across the line of sight of the first camera, as the others see it aslant.
+        right = np.array(description["cameras"][0]["camera_from_world"])[0, :3]
+        for path in (folder / "teeth").rglob("*.ply"):
+            mesh = read_mesh(path)
+            moved = mesh.vertices_mm + (FAR_SCAN_MM if error == "far_scan" else SCAN_OFF_MM) * right
+            write_mesh(path, Mesh(moved, mesh.faces))
+        return
+    if error == "exchanged":
+        first, second = EXCHANGED
+        other = {first: second, second: first}
+        for one in description["images"]:
+            one["light"] = other.get(one["light"], one["light"])
         (folder / "capture.json").write_text(json.dumps(description))
         return
     images: dict[str, NDArray[np.float64]] = {
@@ -60,6 +89,7 @@ def perturb(folder: Path, error: str) -> None:
     changed: dict[str, Callable[[dict[str, str], NDArray[np.float64]], NDArray[np.float64]]] = {
         "none": lambda _, image: image,
         "gain": lambda _, image: 1.02 * image,
+        "far_gain": lambda _, image: 1.1 * image,
         "light_gain": lambda one, image: 1.02 * image if one["light"] == LIGHT else image,
         "flare": lambda one, image: image + 0.02 * brightest[one["camera"]],
     }
@@ -67,9 +97,31 @@ def perturb(folder: Path, error: str) -> None:
         np.save(folder / one["file"], changed[error](one, images[one["file"]]))
 
 
-def fit(folder: Path, error: str, **options: Any) -> dict[str, Any]:
-    """One fit of the perturbed capture: values, ± and what they are made of, the instrument's errors, and what it took."""
-    write_capture(SUBJECT, folder / "capture", seed=1)
+ERRORS = ("gain", "light_gain", "flare", "lights", "dome", "scan", *FAULTS)
+
+
+def _move_lights(lights: list[dict[str, Any]], error: str) -> None:
+    if error == "lights":
+        ways = np.random.default_rng(7).standard_normal((len(lights), 3))
+        ways *= LIGHTS_OFF_MM / np.linalg.norm(ways, axis=1, keepdims=True)
+    else:
+        # The dome to the side; one light towards the tooth, where it is told by its brightness.
+        towards = -np.array([light["position_mm"] for light in lights])
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        chosen = np.array([error == "dome" or light["name"] == FAR_LIGHT for light in lights])
+        way = np.array([DOME_OFF_MM, 0.0, 0.0]) if error == "dome" else FAR_LIGHT_MM * towards
+        ways = chosen[:, None] * way
+    for light, way in zip(lights, ways, strict=True):
+        light["position_mm"] = (np.array(light["position_mm"]) + way).tolist()
+
+
+def fit(folder: Path, error: str, seed: int = 1, **options: Any) -> dict[str, Any]:
+    """One fit of the perturbed capture: values, ± and what they are made of, the instrument's errors, and what it took.
+
+    Args:
+        seed: of the sensor's noise.
+    """
+    write_capture(SUBJECT, folder / "capture", seed=seed)
     perturb(folder / "capture", error)
     spec = JobSpec.model_validate(OPTIONS | {"capture": folder / "capture"} | options)
     began = time.process_time()
@@ -81,7 +133,11 @@ def fit(folder: Path, error: str, **options: Any) -> dict[str, Any]:
     history = json.loads((stage / "history.json").read_text())
     return {
         "error": error,
+        "seed": seed,
         "instrument": spec.instrument,
+        "faults": report.instrument_faults.get("green", ()),
+        "advice": report.advice,
+        "named": FAULTS[error](report) if error in FAULTS else None,
         "values": {name: table[name].model_dump() for name in QUANTITIES},
         "errors_found": {name: one.model_dump() for name, one in report.instrument.get("green", {}).items()},
         "told": report.instrument_told,
@@ -99,16 +155,19 @@ def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
     media = {part: truth.medium(part) for part in ("enamel", "dentin")}
     true = {f"{part}.sigma_s_reduced": one["sigma_s_reduced"] for part, one in media.items()}
     true |= {f"{part}.sigma_a": (1 - one["alpha"]) * one["sigma"] for part, one in media.items()}
-    clean = {one["instrument"]: one["values"] for one in fits if one["error"] == "none"}
+    clean = {(one["instrument"], one["seed"]): one["values"] for one in fits if one["error"] == "none"}
     found = []
     for one in fits:
         row: dict[str, Any] = {
             "error": one["error"],
             "instrument": one["instrument"],
+            "seed": one["seed"],
+            "named": one["named"],
+            "faults": one["faults"],
             "seconds": round(one["seconds"], 1),
         }
         for name, own in one["values"].items():
-            bias = own["value"] - clean[one["instrument"]][name]["value"]
+            bias = own["value"] - clean[one["instrument"], one["seed"]][name]["value"]
             row[name] = {
                 "bias_percent": round(100 * bias / true[name], 1),
                 "bias_over_se": round(bias / own["se"], 2),
@@ -125,24 +184,26 @@ def main() -> None:
     parser.add_argument(
         "--json", type=Path, required=True, help="where results go; fits that are in it are not run again"
     )
-    parser.add_argument("--errors", default="none,gain,light_gain,flare,lights")
+    parser.add_argument("--errors", default="none,gain,light_gain,flare,lights,dome,scan", help=f"none or of {ERRORS}")
+    parser.add_argument("--seeds", type=int, default=1, help="fits of each, by seeds of the sensor's noise from 1")
     parser.add_argument("--instrument", default="on,off")
     parser.add_argument("--pixel-step", type=int, default=2)
     parser.add_argument("--options", type=json.loads, default={}, help="further options of the job, as JSON")
     given = parser.parse_args()
     prepare_device(1)
     fits = json.loads(given.json.read_text())["fits"] if given.json.is_file() else []
-    for error in given.errors.split(","):
-        for instrument in given.instrument.split(","):
-            if any(one["error"] == error and one["instrument"] == instrument for one in fits):
-                continue
-            with tempfile.TemporaryDirectory() as folder:
-                options = {"instrument": instrument, "pixel_step": given.pixel_step} | given.options
-                fits.append(fit(Path(folder), error, **options))
-            told = [one for one in fits if one["error"] == "none"]
-            complete = {one["instrument"] for one in fits} <= {one["instrument"] for one in told}
-            given.json.write_text(json.dumps({"rows": rows(fits) if complete else [], "fits": fits}, indent=1))
-            print(json.dumps(rows(fits)[-1] if complete else fits[-1]["values"]), flush=True)
+    for seed, error, instrument in product(
+        range(1, given.seeds + 1), given.errors.split(","), given.instrument.split(",")
+    ):
+        if any((one["seed"], one["error"], one["instrument"]) == (seed, error, instrument) for one in fits):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            options = {"instrument": instrument, "pixel_step": given.pixel_step} | given.options
+            fits.append(fit(Path(folder), error, seed, **options))
+        told = {(one["instrument"], one["seed"]) for one in fits if one["error"] == "none"}
+        complete = {(one["instrument"], one["seed"]) for one in fits} <= told
+        given.json.write_text(json.dumps({"rows": rows(fits) if complete else [], "fits": fits}, indent=1))
+        print(json.dumps(rows(fits)[-1] if complete else fits[-1]["values"]), flush=True)
 
 
 if __name__ == "__main__":

@@ -62,6 +62,12 @@ def brighter(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]
 def test_a_gain_that_is_off_is_in_the_errors(brighter: tuple[Path, FitReport], tmp_path: Path) -> None:
     _, report = brighter
     assert report.converged, report.advice
+    assert "photograph" not in report.advice
+    assert not report.instrument_faults
+    for name, one in report.instrument["green"].items():
+        assert one.se is not None
+        # A prior that is used in full leaves no error worse known than it was.
+        assert one.se <= report.instrument_prior["green"][name] * (1 + 1e-9), name
     # The gain is off by two of its ±, so what it moves is off by at most two of theirs, and noise adds its own.
     assert max(map(abs, off(report).values())) < 2.5
     alone = fit(tmp_path, gains=(1.02,) * 6, instrument="off")
@@ -93,6 +99,21 @@ def test_a_light_that_is_far_off_is_named(tmp_path: Path) -> None:
     found: Estimate = report.instrument["green"]["light_gain.l1"]
     assert found.se is not None
     assert abs(found.value + 0.1) < 4 * found.se
+
+
+def test_photographs_that_were_exchanged_are_named(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+
+    def exchanged(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
+        first, second = read_channel(observations, channel, spec)
+        order = [2, 1, 0, 3, 4, 5]
+        return first, replace(second, reference=second.reference[order], variance=second.variance[order])
+
+    with patch("services.fit.tooth.driver.read_channel", exchanged):
+        spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path, "max_steps": 3})
+        report = run(spec, LocalContext(tmp_path), engine=ENGINE)
+    assert "The photographs of camera c1 under lights l0 and l2 seem exchanged" in report.advice
+    assert not report.converged
 
 
 def test_a_stated_calibration_takes_the_place_of_what_is_assumed(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.recombination import FAULT_Z, Recombination, faults, recombine
+from services.fit.solve.recombination import FAULT_Z, Recombination, faults
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Crude:
 
     @property
     def found(self) -> Recombination:
-        return recombine(self.covariance, self.response, PRIOR)
+        return Recombination(self.covariance, self.response, PRIOR)
 
     def draw(self, random: np.random.Generator, fault: Array | float = 0.0) -> Array:
         """One answer less the truth, and its errors less their prior's means, (F + K,)."""
@@ -65,13 +65,13 @@ def crude(seed: int, misfit: float, moved: float) -> Crude:
 
 def test_a_fit_that_used_its_prior_in_full_stays_as_it_is() -> None:
     whole = crude(1, misfit=0.0, moved=0.0)
-    np.testing.assert_allclose(whole.found.gain(), 0.0, atol=1e-9)
+    np.testing.assert_allclose(whole.found.change(), 0.0, atol=1e-9)
 
 
 def test_no_error_is_known_worse_than_its_prior_and_every_other_at_least_as_well() -> None:
     one = crude(2, misfit=1.0, moved=2.0)
     assert one.covariance[TISSUE, TISSUE] > 1.5 * PRIOR[0, 0], "the crude fit is not crude"
-    settled = one.covariance - one.found.gain() @ one.found.cross.T
+    settled = one.found.after(one.found.change()).covariance
     assert (np.diag(settled)[TISSUE:] <= np.diag(PRIOR) * (1 + 1e-9)).all()
     assert (np.diag(settled) <= np.diag(one.covariance) * (1 + 1e-9)).all()
     assert settled[0, 0] < 0.9 * one.covariance[0, 0]
@@ -79,11 +79,11 @@ def test_no_error_is_known_worse_than_its_prior_and_every_other_at_least_as_well
 
 def test_what_it_states_is_what_repeated_fits_show() -> None:
     one, random = crude(2, misfit=1.0, moved=2.0), np.random.default_rng(3)
-    gain = one.found.gain()
+    change = one.found.change()
     draws = np.array([one.draw(random) for _ in range(4000)])
     off, apart = draws[:, : TISSUE + ERRORS], draws[:, TISSUE + ERRORS :]
-    shown = np.cov((off - apart @ gain.T).T)
-    stated = one.covariance - gain @ one.found.cross.T
+    shown = np.cov((off + apart @ change.T).T)
+    stated = one.found.after(change).covariance
     # A variance from 4,000 draws is known to 2.2 %: 4 of that.
     np.testing.assert_allclose(np.diag(shown) / np.diag(stated), 1.0, atol=4 * np.sqrt(2 / 4000))
     np.testing.assert_allclose(np.diag(np.cov(apart.T)) / np.diag(one.found.spread), 1.0, atol=4 * np.sqrt(2 / 4000))
@@ -108,8 +108,16 @@ def test_good_calibrations_are_told_as_wrong_as_rarely_as_their_errors_say() -> 
     assert false < 16 + 4 * np.sqrt(16)
 
 
-def test_an_unbelieved_prior_is_not_used_again() -> None:
-    found = crude(2, misfit=1.0, moved=2.0).found
-    gain = found.gain(without=(0,))
-    assert not gain[:, 0].any()
-    assert gain[:, 1].any()
+def test_an_answer_that_is_freed_of_a_prior_does_not_follow_it_and_states_its_error() -> None:
+    one, random = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(7)
+    change = one.found.change(wrong=(0,))
+    after = one.found.after(change)
+    np.testing.assert_allclose(after.response[:, 0], 0.0, atol=1e-9)
+    # However far the prior's mean is off, the answer is not: mean and spread of 4,000 draws, 4 of their errors.
+    draws = np.array([one.draw(random, fault=np.array([-0.3, 0.0, 0.0])) for _ in range(4000)])
+    off = draws[:, : TISSUE + ERRORS] + draws[:, TISSUE + ERRORS :] @ change.T
+    stated = np.sqrt(np.diag(after.covariance))
+    assert (np.abs(off.mean(axis=0)) < 4 * stated / np.sqrt(4000)).all()
+    np.testing.assert_allclose(off.std(axis=0) / stated, 1.0, atol=4 / np.sqrt(2 * 4000))
+    # Two of the answer's errors keep theirs.
+    assert (stated[TISSUE + 1 :] <= np.sqrt(np.diag(PRIOR))[1:] * (1 + 1e-9)).all()

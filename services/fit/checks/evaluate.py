@@ -76,6 +76,34 @@ def error_sums(first: Array, second: Array, reference: Array, variance: Array, c
     return ErrorSums(float(((a - r) * (b - r)).sum()), float((r * r).sum()), float(v.sum()), float(spread @ spread))
 
 
+@dataclass(frozen=True)
+class FrameSums:
+    """Sums over pixels that both lights have, (L, L): row the render's light, column the photograph's; blocks of one camera add."""
+
+    product: Array
+    """(C1 - ref)(C2 - ref) less the reference's variance, of two independent renders."""
+    signal: Array
+    """ref^2 less its variance."""
+
+    def __add__(self, other: FrameSums) -> FrameSums:
+        return FrameSums(self.product + other.product, self.signal + other.signal)
+
+    @property
+    def errors(self) -> Array:
+        """Relative error (L, L) of each photograph against each render; infinite where there is nothing to compare."""
+        seen = self.signal > 0
+        square = np.where(seen, self.product, 0.0) / np.where(seen, self.signal, 1.0)
+        return np.where(seen, np.sqrt(np.maximum(square, 0.0)), np.inf)
+
+
+def frame_sums(first: Array, second: Array, reference: Array, variance: Array, valid: NDArray[np.bool_]) -> FrameSums:
+    """Sums of one block of a camera; all arrays (L, N)."""
+    a, b, r, v = (np.where(valid, values, 0.0) for values in (first, second, reference, variance))
+    counted = valid.astype(np.float64)
+    signal = counted @ (r**2 - v).T
+    return FrameSums((a * b) @ counted.T - (a + b) @ r.T + signal, signal)
+
+
 Shown = tuple[tuple[str, int], ...]
 """Images to return whole: camera name and light index."""
 
@@ -92,24 +120,36 @@ class Evaluation:
     """Of a jaw: sums on fitted and on held-out images by what the pixels show (``blocks.PixelParts``)."""
     spreads: dict[tuple[str, int], Array] = field(default_factory=dict)
     """Of the images in ``renders``, half of what the two renders differ by (N,): one standard error of their mean, from two values."""
+    frames: dict[str, FrameSums] = field(default_factory=dict)
+    """By camera, each photograph against the media's renders under all lights; where they were asked for."""
 
 
-def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = ()) -> Evaluation:
-    """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else."""
+def evaluate(
+    passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = (), *, by_frame: bool = False
+) -> Evaluation:
+    """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else.
+
+    Args:
+        by_frame: compare each photograph with the renders under all lights, too.
+    """
     seeds = passes.seeds(label, "evaluate-1"), passes.seeds(label, "evaluate-2")
     found: list[BlockErrors] = passes.run(
-        f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown
+        f"{passes.seeds.channel}-{label}-evaluate", tissue, samples, evaluate_task, seeds, shown, by_frame
     )
     passes.record([block.trace for block in found])
     fitted, held_out = ErrorSums(), ErrorSums()
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = {}
     pieces: dict[tuple[str, int], list[tuple[NDArray[np.int32], Array]]] = {}
     spreads: dict[tuple[str, int], list[Array]] = {}
+    frames: dict[str, FrameSums] = {}
     for block in found:
         fitted, held_out = fitted + block.fitted, held_out + block.held_out
         for part, (own_fitted, own_held_out) in block.parts.items():
             known_fitted, known_held_out = parts.get(part, (ErrorSums(), ErrorSums()))
             parts[part] = known_fitted + own_fitted, known_held_out + own_held_out
+        if block.frames is not None:
+            known = frames.get(block.camera)
+            frames[block.camera] = block.frames if known is None else known + block.frames
         for image, values in block.renders.items():
             pieces.setdefault(image, []).append((block.pixels, values))
             spreads.setdefault(image, []).append(block.spreads[image])
@@ -118,7 +158,7 @@ def evaluate(passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, s
         for image, some in pieces.items()
     }
     return Evaluation(
-        fitted, held_out, renders, parts, {image: np.concatenate(some) for image, some in spreads.items()}
+        fitted, held_out, renders, parts, {image: np.concatenate(some) for image, some in spreads.items()}, frames
     )
 
 
@@ -133,9 +173,13 @@ class BlockErrors:
     spreads: dict[tuple[str, int], Array]
     parts: dict[int, tuple[ErrorSums, ErrorSums]]
     trace: TraceRow
+    camera: str
+    frames: FrameSums | None = None
 
 
-def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown) -> BlockErrors:
+def evaluate_task(
+    host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown, by_frame: bool = False
+) -> BlockErrors:
     """Errors of one block, of renders as the instrument sees them."""
     start, block = time.time(), read_block(task.block)
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
@@ -163,4 +207,8 @@ def evaluate_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int], sho
     seen = [(name, light) for name, light in shown if name == camera]
     renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in seen}
     spreads = {(name, light): 0.5 * np.abs(first[light] - second[light]) for name, light in seen}
-    return BlockErrors(fitted, held_out, block.view.pixels, renders, spreads, parts, trace_row("evaluate", task, start))
+    valid = (block.fit_weight > 0) | block.held_out
+    # What the media make: gains that followed a wrong frame would hide it.
+    frames = frame_sums(stacks[0].mean, stacks[1].mean, block.reference, block.variance, valid) if by_frame else None
+    trace = trace_row("evaluate", task, start)
+    return BlockErrors(fitted, held_out, block.view.pixels, renders, spreads, parts, trace, camera, frames)

@@ -257,7 +257,8 @@ class Stages(ABC, Generic[Optics]):
             equations = NormalEquations.of(stored)
         problem, solution, known = self._close(problem, solution, equations, samples)
         self._see(problem.domain, solution.x)
-        evaluation = self._evaluate("final", problem.base, self.fewer(self.spec.max_samples_per_pixel), self.files.full)
+        samples_shown = self.fewer(self.spec.max_samples_per_pixel)
+        evaluation = self._evaluate("final", problem.base, samples_shown, self.files.full, by_frame=True)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
         return ChannelFit(
             problem.base,
@@ -311,9 +312,11 @@ class Stages(ABC, Generic[Optics]):
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
         return self._iterate(problem, self.in_similar_media(options), samples)
 
-    def _evaluate(self, label: str, tissue: Tissue | Mouth, samples: int, level: Level) -> Evaluation:
+    def _evaluate(
+        self, label: str, tissue: Tissue | Mouth, samples: int, level: Level, *, by_frame: bool = False
+    ) -> Evaluation:
         passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
-        return evaluate(passes, label, tissue, samples, self.shown)
+        return evaluate(passes, label, tissue, samples, self.shown, by_frame=by_frame)
 
     def _tell(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
         stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)

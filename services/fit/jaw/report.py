@@ -13,6 +13,7 @@ from services.core.results import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.alignment import offsets_told
 from services.fit.checks.evaluate import ErrorSums, Evaluation
+from services.fit.checks.frames import photographs_told
 from services.fit.checks.identifiability import told
 from services.fit.checks.thickness import thickness_map
 from services.fit.execution.attempt import judge, standard_errors, worst_error
@@ -62,7 +63,8 @@ def report(
         _views(fits),
         "the jaw's meshes",
     )
-    advice = misplaced + advice
+    wrong = photographs_told(_evaluations(fits), observations, _views(fits))
+    advice = wrong + misplaced + advice
     teeth = {
         str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
         for k, start in enumerate(first.starts)
@@ -70,7 +72,7 @@ def report(
     unexplained = [fdi for fdi, tooth in teeth.items() if tooth.state == "fitted" and tooth.sentence]
     advice += [tooth.sentence for tooth in teeth.values() if tooth.state != "tied" and tooth.sentence]
     return FitReport(
-        converged=converged and not unexplained and not misplaced,
+        converged=converged and not unexplained and not misplaced and not wrong,
         advice=" ".join(advice),
         parameters={
             c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()

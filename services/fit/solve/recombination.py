@@ -2,12 +2,13 @@
 
 A fit weighs the errors' prior against photographs whose noise alone it knows, by derivatives that are not the images' own. Held mean cosines, moves of
 scan and dome, and those derivatives leave an answer x (F,) with more error than that, so its errors e, the last K of x, may be worse than their prior was.
-The prior says e = m + n, n of covariance V. With B = dx / dm, the answer's response to the prior,
+The prior says e = m + n, n of covariance V. With B = dx / dm, the answer's response to the prior, and d = e - m,
 
-    d = e - m,   c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   x <- x - G d,   C <- C - c D^-1 c',   G = c D^-1
+    c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   x <- x - G d,   C <- C - c D^-1 c',   G = c D^-1
 
-is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and nothing changes; after it no ± of an
-error is larger than the prior's. The tissue goes along as far as its error goes with the instrument's.
+is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and nothing changes; after it no ± of
+an error is larger than the prior's. The tissue goes along as far as its error goes with the instrument's. An error that lies too far from its prior is
+freed of it.
 """
 
 from __future__ import annotations
@@ -25,41 +26,58 @@ SMALLEST_SHARE = 1e-9
 
 @dataclass(frozen=True)
 class Recombination:
-    """What the prior's second use changes."""
+    """An answer and its prior, to be combined once more."""
 
-    cross: Array
-    """c (F, K)."""
-    spread: Array
-    """D (K, K): covariance of the errors of the first answer about their prior, if neither is wrong."""
-    follows: Array
-    """B[e] (K, K): how far the first answer's errors follow their prior."""
+    covariance: Array
+    """C (F, F) of the answer."""
+    response: Array
+    """B (F, K)."""
     prior: Array
     """V (K, K)."""
 
-    def gain(self, without: tuple[int, ...] = ()) -> Array:
-        """G (F, K).
+    @property
+    def cross(self) -> Array:
+        """Covariance of x and d, c (F, K)."""
+        return np.asarray(self.covariance[:, self._first :] - self.response @ self.prior)
+
+    @property
+    def spread(self) -> Array:
+        """D (K, K): covariance of the errors of the answer about their prior, if neither is wrong."""
+        common = self.follows @ self.prior
+        return np.asarray(self.covariance[self._first :, self._first :] - common - common.T + self.prior)
+
+    @property
+    def follows(self) -> Array:
+        """B[e] (K, K): how far the answer's errors follow their prior."""
+        return self.response[self._first :]
+
+    @property
+    def _first(self) -> int:
+        return len(self.covariance) - len(self.prior)
+
+    def change(self, wrong: tuple[int, ...] = ()) -> Array:
+        """Q (F, K) of the best combination x + Q d, which is -G where every prior is believed.
 
         Args:
-            without: places of errors whose prior is not believed.
+            wrong: places of errors whose prior is not. The answer is freed of these: their prior's means go where the answer puts the errors.
         """
-        used, gain = [k for k in range(len(self.prior)) if k not in without], np.zeros_like(self.cross)
-        unit = np.sqrt(np.diag(self.prior))[used]
-        gain[:, used] = self.cross[:, used] @ _inverse(self.spread[np.ix_(used, used)], unit)
-        return gain
+        used = [k for k in range(len(self.prior)) if k not in wrong]
+        freed = np.zeros_like(self.response)
+        if wrong:
+            own, pulls = list(wrong), np.eye(len(self.prior)) - self.follows
+            freed[:, own] = self.response[:, own] @ np.linalg.inv(pulls[np.ix_(own, own)])
+        left = self.after(freed)
+        unit, change = np.sqrt(np.diag(self.prior))[used], np.zeros_like(freed)
+        change[:, used] = -left.cross[:, used] @ _inverse(left.spread[np.ix_(used, used)], unit)
+        through = np.eye(len(self.prior)) + freed[self._first :]
+        return np.asarray(freed + change @ through)
 
-
-def recombine(covariance: Array, response: Array, prior: Array) -> Recombination:
-    """Combine an answer with its prior once more.
-
-    Args:
-        covariance: C (F, F) of the answer.
-        response: B (F, K).
-        prior: V (K, K).
-    """
-    first = len(covariance) - len(prior)
-    common = response @ prior
-    spread = covariance[first:, first:] - common[first:] - common[first:].T + prior
-    return Recombination(covariance[:, first:] - common, spread, response[first:], prior)
+    def after(self, change: Array) -> Recombination:
+        """The answer x + Q d."""
+        both = change @ self.cross.T
+        covariance = self.covariance + both + both.T + change @ self.spread @ change.T
+        response = self.response + change @ (self.follows - np.eye(len(self.prior)))
+        return Recombination(covariance, response, self.prior)
 
 
 def _inverse(spread: Array, unit: Array) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.fit.instrument.errors import kind_of_error
 from services.fit.optics.domain import Domain
-from services.fit.solve.recombination import Fault, Recombination, faults, recombine
+from services.fit.solve.recombination import Fault, Recombination, faults
 
 Array = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ class Sandwich:
     """Factor s by which residuals exceed the measurements' noise."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """V (K, K) of the instrument's errors."""
-    unbelieved: tuple[int, ...] = ()
-    """Places of those whose prior is not used again."""
+    wrong: tuple[int, ...] = ()
+    """Places of those whose prior is not believed."""
 
     @property
     def covariance(self) -> Array:
@@ -39,8 +39,8 @@ class Sandwich:
         plain = self.plain(inverse, meat)
         if not len(self.prior):
             return plain
-        found = recombine(plain, self.response(inverse), self.prior)
-        return np.asarray(plain - found.gain(self.unbelieved) @ found.cross.T)
+        found = Recombination(plain, self.response(inverse), self.prior)
+        return found.after(found.change(self.wrong)).covariance
 
     def plain(self, inverse: Array, meat: Array) -> Array:
         """T M^-1 meat M^-T T', (F, F): before the prior is used again."""
@@ -77,24 +77,28 @@ def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Arr
     if not domain.errors.names:
         return Settled(x, whole, plain, sandwich, ())
     sandwich = replace(sandwich, prior=domain.errors.matrix)
-    response = sandwich.response(sandwich.inverse)
-    found = recombine(whole, response, sandwich.prior)
-    wrong = faults(x[count:], found)
-    unbelieved = tuple(fault.place for fault in wrong)
-    gain = found.gain(unbelieved)
-    low, high = domain.bounds
-    settled = np.clip(x - gain @ x[count:], low, high)
+    found = Recombination(whole, sandwich.response(sandwich.inverse), sandwich.prior)
+    told = faults(x[count:], found)
+    wrong = tuple(fault.place for fault in told)
+    change = found.change(wrong)
+    after = found.after(change)
 
-    # Every part but the prior's goes through 1 - G; the prior's columns are its own answer, and what its second use adds.
+    # Every part but the prior's goes through 1 + Q; the prior's columns are what the new answer makes of them.
     through = np.eye(len(x))
-    through[:, count:] -= gain
-    parts = {name: through @ part @ through.T for name, part in plain.items()}
-    parts |= _of_prior(domain, through @ response + gain, found)
-    return Settled(settled, whole - gain @ found.cross.T, parts, replace(sandwich, unbelieved=unbelieved), wrong)
+    through[:, count:] += change
+    parts = {name: through @ part @ through.T for name, part in plain.items()} | _of_prior(domain, after)
+    return Settled(_moved(domain, x, change @ x[count:]), after.covariance, parts, replace(sandwich, wrong=wrong), told)
 
 
-def _of_prior(domain: Domain, response: Array, found: Recombination) -> dict[str, Array]:
-    # dx / dn (F, K) of a prior's error n of covariance V = L L' by kind of error; what kinds that go together have in common counts for the first of them.
+def _moved(domain: Domain, x: Array, step: Array) -> Array:
+    # By the step, or as much of it as moves the tissue by one scale: what frees an error is not linear farther than that.
+    count, (low, high) = domain.tissue_count, domain.bounds
+    length = float(np.linalg.norm((step / domain.scale)[:count]))
+    return np.asarray(np.clip(x + step / max(1.0, length), low, high))
+
+
+def _of_prior(domain: Domain, found: Recombination) -> dict[str, Array]:
+    # What the prior's error, of covariance V = L L', makes of the answer by kind; what kinds that go together have in common counts for the first of them.
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
-    halves = response @ np.linalg.cholesky(found.prior)
+    halves = found.response @ np.linalg.cholesky(found.prior)
     return {kind: halves[:, kinds == kind] @ halves[:, kinds == kind].T for kind in dict.fromkeys(kinds.tolist())}

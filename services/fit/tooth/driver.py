@@ -16,6 +16,7 @@ from services.core.geometry import Camera, Tooth
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.fit.checks.alignment import offsets_told
+from services.fit.checks.frames import photographs_told
 from services.fit.checks.identifiability import NOTHING, correlation, told
 from services.fit.checks.next_calibration import calibration_advice
 from services.fit.checks.thickness import ThicknessMap, thickness_map
@@ -156,7 +157,8 @@ class FitDriver:
             views,
             f"the mesh of tooth {observations.teeth[0].fdi}",
         )
-        converged, advice = converged and not misplaced, misplaced + advice
+        wrong = photographs_told(evaluations, observations, views)
+        converged, advice = converged and not misplaced and not wrong, wrong + misplaced + advice
         correlations = {c: correlation(known[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
