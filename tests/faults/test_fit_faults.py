@@ -182,6 +182,7 @@ def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: P
     os.kill(int((tmp_path / "driver.pid").read_text()), signal.SIGKILL)
     future.result(timeout=PATIENCE_S)
     assert answer(tmp_path) == answer(undisturbed)
+    assert answer(undisturbed)["instrument"]["green"], "the instrument's errors are no coordinates"
     assert len(read_entries(tmp_path)) > entries
 
 
@@ -233,6 +234,7 @@ def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path
         assert (root / "fit.lease").read_text() == str(1 + len(kills))
         answers.append(answer(root))
     assert answers[0] == answers[1]
+    assert answers[0]["instrument"]["green"], "the instrument's errors are no coordinates"
 
 
 def test_renderers_end_with_their_worker(tmp_path: Path) -> None:

@@ -66,8 +66,9 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
         told |= {photo, light} if exchanged else {photo}
         yield WrongFrame(camera, lights[photo], float(own[photo]), lights[light], exchanged)
     limit = max(ODD, ODD_RATIO * float(np.median(shown)))
-    for photo in np.flatnonzero(np.isfinite(own) & (own > limit)) if len(shown) >= MIN_FRAMES else ():
-        if int(photo) not in told:
+    odd = np.flatnonzero(np.isfinite(own) & (own > limit)).tolist() if len(shown) >= MIN_FRAMES else []
+    for photo in odd:
+        if photo not in told:
             yield WrongFrame(camera, lights[photo], float(own[photo]))
 
 

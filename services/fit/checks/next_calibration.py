@@ -66,7 +66,10 @@ def covariance_if_known(known: Uncertainty, kind: str) -> Array:
     added = np.zeros_like(known.covariance)
     added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * np.linalg.inv(domain.errors.matrix[np.ix_(own, own)])
     whitened = known.sandwich.transform.T @ added @ known.sandwich.transform
-    return covariance_after(known, Addition(whitened, whitened))
+    count = domain.tissue_count
+    better = np.asarray(np.linalg.inv(domain.errors.precision + added[count:, count:]), dtype=np.float64)
+    with_prior = replace(known, sandwich=replace(known.sandwich, prior=better))
+    return covariance_after(with_prior, Addition(whitened, whitened))
 
 
 def _how_well(known: Uncertainty, kind: str) -> str:

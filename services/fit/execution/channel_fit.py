@@ -94,13 +94,6 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
     return np.zeros(len(x))
 
 
-def _settled(
-    problem: StackProblem[Optics], solution: Solution, known: Uncertainty
-) -> tuple[StackProblem[Optics], Solution]:
-    # Both where the last measurement puts the answer.
-    return replace(problem, base=problem.domain.tissue_at(known.x, problem.base)), replace(solution, x=known.x)
-
-
 @dataclass(frozen=True)
 class ChannelFit(Generic[Optics]):
     """A channel's result."""
@@ -283,7 +276,7 @@ class Stages(ABC, Generic[Optics]):
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             found = uncertainty(domain, x, equations)
             # Only errors of the instrument move x once more.
-            return (*_settled(problem, solution, found), found) if domain.errors.names else (problem, solution, found)
+            return self._settled(problem, solution, found) if domain.errors.names else (problem, solution, found)
         known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
@@ -303,7 +296,15 @@ class Stages(ABC, Generic[Optics]):
         measured = uncertainty(
             domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.body for m in moves]
         )
-        return *_settled(problem, solution, measured), measured
+        return self._settled(problem, solution, measured)
+
+    @staticmethod
+    def _settled(
+        problem: StackProblem[Optics], solution: Solution, known: Uncertainty
+    ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
+        # All of them where the last measurement puts the answer.
+        base = problem.domain.tissue_at(known.x, problem.base)
+        return replace(problem, base=base), replace(solution, x=known.x), known
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

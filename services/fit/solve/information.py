@@ -80,7 +80,7 @@ def covariance_with(known: Sandwich, added: Addition) -> Array:
     """Covariance (F, F) of x in a fit with the further measurements; negative information, which noise alone makes, counts as none."""
     own = added.left()
     information, meat = (positive_part(matrix) for matrix in (own.information, own.meat))
-    inverse = np.linalg.inv(np.linalg.inv(known.inverse) + information)
+    inverse = np.asarray(np.linalg.inv(np.linalg.inv(known.inverse) + information), dtype=np.float64)
     return known.covariance_of(inverse, known.meat + meat)
 
 
