@@ -28,7 +28,7 @@ from pydantic import ValidationError
 from services.core.errors import StoreError
 from services.core.geometry import Record
 from services.core.records import FrameRecord
-from services.core.store import StageWriter, create_array, write_atomic
+from services.core.store import StageWriter, create_array, image_pieces, write_atomic
 
 ARRAY = "capture.zarr"
 JOURNAL = "journal.jsonl"
@@ -53,7 +53,9 @@ class FrameStore:
             fingerprint: equal for two captures exactly when their frames may be mixed.
         """
         self._writer, self._folder = writer, writer.folder
-        self._header = json.dumps({"fingerprint": fingerprint, "shape": shape})
+        self._header = json.dumps(
+            {"fingerprint": fingerprint, "shape": shape, "pieces": image_pieces(shape[2], shape[3])}
+        )
         lines: list[Acknowledged] = []
         source = self._newest_leftover()
         if source is not None:
@@ -123,7 +125,9 @@ class FrameStore:
     def _start(self, shape: tuple[int, int, int, int, int]) -> None:
         shutil.rmtree(self._folder)
         self._folder.mkdir()
-        create_array(self._folder, ARRAY, shape, (1, 1, *shape[2:]), "uint16", DIMENSIONS)
+        chunk, shard = image_pieces(shape[2], shape[3])
+        pieces = (1, 1, *shard, shape[4]), "uint16", DIMENSIONS, (1, 1, *chunk, shape[4])
+        create_array(self._folder, ARRAY, shape, *pieces)
         _digest_durably(self._folder / ARRAY, "zarr.json")
         _fsync(self._writer.root)
 

@@ -53,6 +53,9 @@ from services.core.geometry import Record
 R = TypeVar("R", bound=Record)
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
+CHUNK_PX = 512
+"""Edge of the pieces of an image's file, which are read or left empty at once. Whole rows, or 256 or 1024 px, took
+longer to write a tooth's window; one piece for a whole image takes 1.6 times as long to read it from."""
 NOTHING_KNOWN: Mapping[str, tuple[int, str]] = MappingProxyType({})
 
 
@@ -276,6 +279,13 @@ def create_array(
         compressors=[BloscCodec(cname=codec, clevel=1, shuffle="bitshuffle"), Crc32cCodec()],
         dimension_names=dimensions,
     )
+
+
+def image_pieces(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Chunk and shard (rows, columns) of arrays of large images: one file an image, of which a window is read alone."""
+    chunk = min(CHUNK_PX, height), min(CHUNK_PX, width)
+    rows, columns = (-(-length // edge) * edge for length, edge in zip((height, width), chunk, strict=True))
+    return chunk, (rows, columns)
 
 
 class StoredArray:

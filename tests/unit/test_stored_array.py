@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.core.errors import CorruptStoreError
-from services.core.store import StoredArray, create_array
+from services.core.store import StoredArray, create_array, image_pieces
 
 SHAPE = (2, 8)
 
@@ -34,6 +34,22 @@ def test_a_damaged_shard_is_told_when_it_is_read_and_the_rest_stays_readable(pat
     np.testing.assert_array_equal(array[0], np.arange(8))
     with pytest.raises(CorruptStoreError, match=r"numbers\.zarr cannot be read"):
         array[1]
+
+
+def test_a_window_is_read_without_the_rest_of_its_image(tmp_path: Path) -> None:
+    image = np.random.default_rng(1).integers(0, 4096, (1000, 900)).astype(np.uint16)
+    chunk, shard = image_pieces(*image.shape)
+    assert (chunk, shard) == ((512, 512), (1024, 1024))
+    create_array(tmp_path, "image.zarr", image.shape, shard, "uint16", ("y", "x"), chunk)[:] = image
+    (file,) = (tmp_path / "image.zarr" / "c").rglob("*/*")
+    content = bytearray(file.read_bytes())
+    # The last piece lies before the index of 4 x 16 bytes and its checksum
+    content[-100] ^= 1
+    file.write_bytes(content)
+    array = StoredArray(tmp_path / "image.zarr")
+    np.testing.assert_array_equal(array[100:512, 10:500], image[100:512, 10:500])
+    with pytest.raises(CorruptStoreError):
+        array[600:, 600:]
 
 
 def test_an_index_beyond_the_end_is_not_called_damage(path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, teeth_folder
 from services.core.records import CaptureManifest, FolderCapture, FrameRecord
-from services.core.store import StageWriter, create_array
+from services.core.store import StageWriter, create_array, image_pieces
 
 DISTANCE_MM = 300.0
 HALF_AXES_MM = (4.5, 5.5, 3.5)
@@ -68,9 +68,9 @@ def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4
     )
     writer = StageWriter(root, "capture", 1)
     shape = (1, len(frames), height, width, 3)
-    array = create_array(
-        writer.folder, "capture.zarr", shape, (1, 1, *shape[2:]), "uint16", ("camera", "frame", "y", "x", "channel")
-    )
+    chunk, shard = image_pieces(height, width)
+    pieces = (1, 1, *shard, 3), "uint16", ("camera", "frame", "y", "x", "channel"), (1, 1, *chunk, 3)
+    array = create_array(writer.folder, "capture.zarr", shape, *pieces)
     rng = np.random.default_rng(seed)
     grain = rng.normal(scale=20, size=(height, width)).astype(np.float32)
     counts = np.empty((height, width, 3), dtype=np.uint16)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from services.core.errors import SettingsError
 from services.core.records import JobSpec
-from services.core.store import create_array
+from services.core.store import create_array, image_pieces
 from services.preprocess.masking.masks import HandMasks
 from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
@@ -16,8 +16,6 @@ FORMAT = 6
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
 INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
 """Options that change no pixel."""
-CHUNK_PX = 512
-"""Edge of the pieces of a shard, which are read or left empty at once: whole rows, or 256 or 1024 px, took longer to write a tooth's window."""
 
 
 def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
@@ -27,8 +25,7 @@ def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
     planes = (len(description.cameras), len(description.lights), height, width)
     channels = len(description.channels)
     stack = ("camera", "light", "y", "x")
-    chunk = min(CHUNK_PX, height), min(CHUNK_PX, width)
-    shard = tuple(-(-n // edge) * edge for n, edge in zip((height, width), chunk, strict=True))
+    chunk, shard = image_pieces(height, width)
     for name in ("radiance", "variance"):
         create_array(
             store,
