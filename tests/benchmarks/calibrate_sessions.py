@@ -22,7 +22,7 @@ from services.calibrate.cameras.start import first_lens, first_rig
 from services.calibrate.colour.transform import fit_colour
 from services.calibrate.lights.centres import OutlineView, fit_centres
 from services.calibrate.lights.intensity import WhitePhoto, WhiteSphere, fit_intensity, shading
-from services.calibrate.lights.mirror import Eye, highlight_points
+from services.calibrate.lights.mirror import Eye, highlight_points, nearest_point
 from services.calibrate.lights.positions import fit_lights
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.reweighted import solve_reweighted
@@ -34,10 +34,16 @@ Floats = NDArray[np.float64]
 NAMES = ["left", "middle", "right"]
 N_PLACES, N_LIGHTS = 20, 12
 MIRROR_MM, WHITE_MM = 28.0, 20.0
-PLACES_MM = np.array([[-62.0, -38, -30], [62, -38, 30], [-62, 38, 30], [62, 38, -30], [0, 0, 60], [0, 0, -60]])
-"""Of the spheres' centres about the teeth: as far apart as all three cameras see."""
+MIRROR_PLACES_MM = np.array(
+    [*([x, y, z] for x in (-62.0, 62.0) for y in (-38.0, 38.0) for z in (-50.0, 50.0)), [0, 0, 75], [0, 0, -80]]
+)
+"""Of the mirror sphere's centres about the point at which the cameras look: the corners of a box, one place nearer and one farther.
+What decides is how far apart they are, and how many; they are as far apart as the images hold spheres of this radius."""
+WHITE_PLACES_MM = np.array([[-32.0, -20, -20], [32, 20, -10], [0, 0, 30]])
 REFLECTANCE = np.array([0.92, 0.9, 0.88])
 SHOT, PATCH_ERROR = 0.01, 0.003
+MARGIN_PX = 5.0
+"""Between a whole sphere and the image's border, as the search for its edge needs."""
 
 
 def one_session(seed: int) -> dict[str, Any]:
@@ -64,8 +70,12 @@ def one_session(seed: int) -> dict[str, Any]:
     # The dome shines from the cameras' side of the teeth.
     away = np.mean([eye.centre_mm for eye in true], axis=0) - teeth
     lights = _turned(dome_lights(N_LIGHTS, random), away) + teeth
-    centres = _turned(PLACES_MM, away) + teeth + random.normal(0, 2, PLACES_MM.shape)
-    told |= _lights_and_intensity(random, true, found, covariance, lights, centres)
+    looked_at = nearest_point(np.array([eye.centre_mm for eye in true]), np.array([eye.rotation[2] for eye in true]))
+    mirror, white = (
+        _turned(places, away) + looked_at + random.normal(0, 2, places.shape)
+        for places in (MIRROR_PLACES_MM, WHITE_PLACES_MM)
+    )
+    told |= _lights_and_intensity(random, true, found, covariance, lights, mirror, white)
     told["delta_e"] = _colour(random)
     return told
 
@@ -76,45 +86,66 @@ def _lights_and_intensity(
     found: tuple[Eye, ...],
     covariance: Floats,
     lights: Floats,
-    centres: Floats,
+    mirror: Floats,
+    white: Floats,
 ) -> dict[str, Any]:
     shifts = random.uniform(-0.2, 0.2, 3)
-    views, white = [], []
-    for place, centre in enumerate(centres):
-        for camera, eye in enumerate(true):
-            for radius, into in ((MIRROR_MM, views), (WHITE_MM, white)):
-                edge, outward = outline_points(eye, centre, radius, 90)
-                edge = edge + outward * (shifts[camera] + random.normal(0, 0.1, (90, 1)))
-                if radius == WHITE_MM:
-                    into.append(OutlineView(camera, place, radius, edge))
-                    continue
-                points = highlight_points(eye.centre_mm, lights, centre, radius)
-                to_eye = (eye.centre_mm - points) / np.linalg.norm(eye.centre_mm - points, axis=1, keepdims=True)
-                seen = np.flatnonzero(((points - centre) / radius * to_eye).sum(axis=1) > STEEPEST)
-                pixels = eye.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
-                into.append(SphereView(camera, place, radius, edge, seen, pixels))
+    views = _mirror_views(random, true, shifts, lights, mirror)
     names = [f"L{n}" for n in range(N_LIGHTS)]
     fit = fit_lights(views, found, names, covariance)
     off = fit.positions_mm - lights[fit.lights]
     count = 3 * len(fit.lights)
-    told = {"lights_mm": float(np.sqrt((off**2).sum(axis=1).mean()))}
+    told = {"lights_mm": float(np.sqrt((off**2).sum(axis=1).mean())), "mirror_views": len(views)}
     told |= {"lights_se_mm": float(np.sqrt(np.trace(fit.covariance[:count, :count]) / len(fit.lights)))}
     scores = {"z_lights": _whitened(off.ravel(), fit.covariance[:count, :count])}
-    # White spheres in the first three places, seen through the cameras that boards and mirror spheres gave.
+    # White spheres are seen through the cameras that boards and mirror spheres gave.
     intensity = random.uniform(0.6, 1.4, (N_LIGHTS, 3))
     intensity /= intensity.mean(axis=0)
-    photos = [
-        _photo(random, eye, centres[place], camera, place, light, lights[light], intensity[light])
-        for place in range(3)
-        for camera, eye in enumerate(true)
-        for light in range(N_LIGHTS)
-    ]
-    believed = fit_centres([one for one in white if one.place < 3], fit.eyes)
-    spheres = [WhiteSphere(centre, WHITE_MM, REFLECTANCE) for centre in believed]
+    outlines, photos = [], []
+    for place, centre in enumerate(white):
+        for camera, eye in enumerate(true):
+            edge = _outline(random, eye, centre, WHITE_MM, shifts[camera])
+            if edge is None:
+                continue
+            outlines.append(OutlineView(camera, place, WHITE_MM, edge))
+            photos += [
+                _photo(random, eye, centre, camera, place, light, lights[light], intensity[light])
+                for light in range(N_LIGHTS)
+            ]
+    spheres = [WhiteSphere(centre, WHITE_MM, REFLECTANCE) for centre in fit_centres(outlines, fit.eyes)]
     answer = fit_intensity(photos, fit.eyes, spheres, fit.positions_mm, names, fit.covariance[:count, :count])
     logs = np.log(answer.intensity / intensity)
     scores["z_intensity"] = (logs.ravel() / np.sqrt(np.diag(answer.covariance))).tolist()
     return told | scores | {"intensity": float(np.sqrt(np.mean(logs**2)))}
+
+
+def _mirror_views(
+    random: np.random.Generator, eyes: tuple[Eye, ...], shifts: Floats, lights: Floats, centres: Floats
+) -> list[SphereView]:
+    """The mirror sphere where at least one camera holds it whole, and its highlights there."""
+    views: list[SphereView] = []
+    place = 0
+    for centre in centres:
+        here = []
+        for camera, eye in enumerate(eyes):
+            if (edge := _outline(random, eye, centre, MIRROR_MM, shifts[camera])) is None:
+                continue
+            points = highlight_points(eye.centre_mm, lights, centre, MIRROR_MM)
+            to_eye = (eye.centre_mm - points) / np.linalg.norm(eye.centre_mm - points, axis=1, keepdims=True)
+            seen = np.flatnonzero(((points - centre) / MIRROR_MM * to_eye).sum(axis=1) > STEEPEST)
+            pixels = eye.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
+            here.append(SphereView(camera, place, MIRROR_MM, edge, seen, pixels))
+        views += here
+        place += bool(here)
+    return views
+
+
+def _outline(random: np.random.Generator, eye: Eye, centre: Floats, radius: float, shift: float) -> Floats | None:
+    """Edge points of a sphere with their errors; None where the image does not hold it whole."""
+    edge, outward = outline_points(eye, centre, radius, 90)
+    if not ((edge > MARGIN_PX) & (edge < np.array(eye.lens.size) - MARGIN_PX)).all():
+        return None
+    return np.asarray(edge + outward * (shift + random.normal(0, 0.1, (90, 1))))
 
 
 def _photo(
@@ -177,7 +208,7 @@ def _whitened(error: Floats, covariance: Floats) -> list[float]:
 def summary(draws: list[dict[str, Any]]) -> dict[str, float]:
     """Rms over the draws, and rms of pooled scores."""
     told = {"draws": float(len(draws))}
-    for key in ("shift_mm", "turn_deg", "lights_mm", "lights_se_mm", "intensity", "delta_e"):
+    for key in ("shift_mm", "turn_deg", "lights_mm", "lights_se_mm", "mirror_views", "intensity", "delta_e"):
         told[f"rms_{key}"] = float(np.sqrt(np.mean([draw[key] ** 2 for draw in draws])))
     for key in ("z_cameras", "z_lights", "z_intensity"):
         told[f"rms_{key}"] = float(np.sqrt(np.mean(np.concatenate([draw[key] for draw in draws]) ** 2)))

@@ -31,6 +31,10 @@ STEP = 1e-4
 """Of a central difference, mm or px: a millionth of the distances, so its error is 1e-12 and rounding's 1e-9 of the derivative."""
 
 
+STEP_SIGMAS = 0.01
+"""Of a difference in a camera's value, in its own ±."""
+
+
 @dataclass(frozen=True)
 class Outlier:
     """A highlight that fits no position that the others allow: its camera, place and light, and how far off it is."""
@@ -101,28 +105,74 @@ class _Weighted:
 
     def by_own(self, values: Floats) -> Floats:
         """Derivative to lights, centres and shifts. No residual depends on two of a kind, so one axis of all is moved at once."""
-        problem = self.problem
-        index, n_lights = np.arange(problem.length), 3 * len(problem.lights)
-        is_centre = (index >= n_lights) & (index < n_lights + 3 * problem.n_places)
-        group_of = np.where(index < n_lights, index % 3, np.where(is_centre, 3 + (index - n_lights) % 3, 6))
-        pattern = problem.sparsity()
-        derivative = np.zeros((len(pattern) + len(values) - problem.length, problem.length))
-        for group in range(7):
-            chosen = np.flatnonzero(group_of == group)
+        problem, eyes = self.problem, self.moved_eyes(values)
+        n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
+        derivative = np.zeros((n_highlights + n_edges + len(values) - problem.first_shift, problem.length))
+        sides = np.arange(n_highlights).reshape(-1, 2)
+        edges = n_highlights + np.arange(n_edges)
+        weight = self.good[:, None] / self.sigmas[0]
+        for axis in range(3):
+            lights, centres = 3 * problem.row + axis, problem.first_centre + 3 * problem.place + axis
+            for columns in (lights, centres):
+                step = np.zeros(len(values))
+                step[columns] = STEP
+                slope = (problem.highlights(eyes, values + step) - problem.highlights(eyes, values - step)) / (2 * STEP)
+                derivative[sides, columns[:, None]] = slope * weight
+            edge_columns = problem.first_centre + 3 * problem.edge_place + axis
             step = np.zeros(len(values))
-            step[chosen] = STEP
-            slope = (self.residuals(values + step) - self.residuals(values - step)) / (2 * STEP)
-            derivative[: len(pattern), chosen] = pattern[:, chosen] * slope[: len(pattern), None]
+            step[edge_columns] = STEP
+            slope = (problem.outlines(eyes, values + step) - problem.outlines(eyes, values - step)) / (2 * STEP)
+            derivative[edges, edge_columns] = slope / self.sigmas[1]
+        derivative[edges, problem.first_shift + problem.edge_camera] = -1 / self.sigmas[1]
+        shifts = np.arange(problem.n_cameras)
+        derivative[n_highlights + n_edges + shifts, problem.first_shift + shifts] = 1 / EDGE_SHIFT_SE_PX
         return derivative
 
     def by_cameras(self, values: Floats) -> Floats:
-        """Derivative to z: differences over a hundredth of a σ."""
-        columns = []
-        for index in range(self.problem.length, len(values)):
-            step = np.zeros(len(values))
-            step[index] = 0.01
-            columns.append((self.residuals(values + step) - self.residuals(values - step)) / 0.02)
-        return np.stack(columns, axis=1) if columns else np.zeros((len(self.residuals(values)), 0))
+        """Derivative to z, through that to the cameras' own values: no residual depends on two cameras, so one value of all is moved at once."""
+        problem, eyes = self.problem, self.moved_eyes(values)
+        n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
+        count = self.spread.shape[1]
+        whole = np.zeros((n_highlights + n_edges + problem.n_cameras + count, count))
+        if count == 0:
+            return whole
+        own = np.zeros((n_highlights + n_edges, len(self.spread)))
+        se = np.sqrt((self.spread**2).sum(axis=1))
+        first = np.cumsum([0, *(_length(eye) for eye in eyes)])
+        cameras = np.concatenate([np.repeat(problem.camera, 2), problem.edge_camera])
+        for value in range(max(map(_length, eyes))):
+            having = [camera for camera, eye in enumerate(eyes) if value < _length(eye)]
+            steps = {camera: STEP_SIGMAS * se[first[camera] + value] for camera in having}
+            ahead, back = (
+                [_moved(eye, value, sign * steps.get(k, 0.0)) for k, eye in enumerate(eyes)] for sign in (1, -1)
+            )
+            slope = np.concatenate(
+                [
+                    (problem.highlights(ahead, values) - problem.highlights(back, values)).ravel()
+                    * np.repeat(self.good, 2)
+                    / self.sigmas[0],
+                    (problem.outlines(ahead, values) - problem.outlines(back, values)) / self.sigmas[1],
+                ]
+            )
+            for camera in having:
+                mine = np.flatnonzero(cameras == camera)
+                own[mine, first[camera] + value] = slope[mine] / (2 * steps[camera])
+        whole[: len(own)] = own @ self.spread
+        whole[len(own) + problem.n_cameras :] = np.eye(count)
+        return whole
+
+
+def _length(eye: Eye) -> int:
+    """Number of a camera's values: of its lens and its pose."""
+    return len(eye.lens.values) + 6
+
+
+def _moved(eye: Eye, value: int, step: float) -> Eye:
+    """The camera with one of its values changed."""
+    values = np.concatenate([eye.lens.values, eye.pose])
+    if step:
+        values[value] += step
+    return Eye(Lens(eye.lens.size, values[:-6]), values[-6:])
 
 
 def fit_lights(
@@ -159,7 +209,7 @@ def fit_lights(
 
 
 def _states(eyes: Sequence[Eye]) -> int:
-    return sum(len(eye.lens.values) + 6 for eye in eyes)
+    return sum(map(_length, eyes))
 
 
 def _square_root(covariance: Floats) -> Floats:

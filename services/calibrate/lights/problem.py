@@ -67,11 +67,21 @@ class Problem:
     @property
     def length(self) -> int:
         """Number of unknowns."""
-        return 3 * len(self.lights) + 3 * self.n_places + self.n_cameras
+        return self.first_shift + self.n_cameras
+
+    @property
+    def first_centre(self) -> int:
+        """Where the centres begin among the unknowns."""
+        return 3 * len(self.lights)
+
+    @property
+    def first_shift(self) -> int:
+        """Where the edge shifts begin."""
+        return self.first_centre + 3 * self.n_places
 
     def split(self, values: Floats) -> tuple[Floats, Floats, Floats]:
         """Lights (M, 3), centres (P, 3) and edge shifts (K,)."""
-        first, second = 3 * len(self.lights), 3 * len(self.lights) + 3 * self.n_places
+        first, second = self.first_centre, self.first_shift
         return values[:first].reshape(-1, 3), values[first:second].reshape(-1, 3), values[second : self.length]
 
     def start(self, eyes: Sequence[Eye]) -> Floats:
@@ -111,18 +121,3 @@ class Problem:
                 where = centres[self.edge_place[mine]]
                 off[mine] = outline_errors(eye, self._edges[mine], where, self._edge_radius[mine]) - shifts[camera]
         return off
-
-    def sparsity(self) -> NDArray[np.bool_]:
-        """Which residuals (2N + E + K: highlights, edges, edge shifts) depend on which unknowns."""
-        n_lights, count, edges = 3 * len(self.lights), 2 * len(self.row), len(self._edges)
-        shifts = n_lights + 3 * self.n_places
-        pattern = np.zeros((count + edges + self.n_cameras, self.length), dtype=bool)
-        highlight, edge = np.arange(len(self.row)), count + np.arange(edges)
-        for axis in range(3):
-            for side in range(2):
-                pattern[2 * highlight + side, 3 * self.row + axis] = True
-                pattern[2 * highlight + side, n_lights + 3 * self.place + axis] = True
-            pattern[edge, n_lights + 3 * self.edge_place + axis] = True
-        pattern[edge, shifts + self.edge_camera] = True
-        pattern[count + edges :, shifts:] = np.eye(self.n_cameras, dtype=bool)
-        return pattern
