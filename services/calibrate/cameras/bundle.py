@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import cross_matrix, left_jacobian, pose_matrix, rotation_matrix
 from services.calibrate.cameras.sightings import Corners, View, joined
+from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 HUBER_SIGMAS = 1.345
@@ -31,6 +32,11 @@ SETTLED_SCALE = 0.1
 STEP_PRECISION = 1e-10
 """Of the linear solver within a step: with less the steps are no Gauss–Newton steps and a hundred of them are needed."""
 MAD_TO_SIGMA = 1.4826
+MISPLACED_PX, MISPLACED_TIMES = 10.0, 10.0
+"""Median distance of a photograph's corners from where the first guess draws them, in px and over that of all photographs: first
+guesses are off by some pixels, and frames that were interchanged by hundreds."""
+MIN_INLIERS = 4
+"""Corners that fix a pose."""
 
 
 @dataclass(frozen=True)
@@ -186,12 +192,16 @@ def fit_bundle(
             It is not estimated here: in a joint fit the camera of the smallest residuals would draw all weight to itself.
         lenses_fixed: keep the guess's intrinsics.
         robust: look for outliers.
+
+    Raises:
+        CaptureInputError: photographs of a place or a camera fit no common pose.
     """
     corners, layout = joined(views), layout_of(start, lenses_fixed=lenses_fixed)
     weights = np.ones(len(start.lenses)) if sigma_px is None else np.maximum(sigma_px, SIGMA_FLOOR_PX)
     values, inliers = layout.pack(start), np.ones(len(corners.pixels), dtype=bool)
     if robust:
         values, inliers = _without_outliers(layout, start, corners, values, weights)
+        _require_inliers(views, corners, inliers)
     kept = corners.kept(inliers)
     values, converged = _solve(layout, start, kept, values, weights)
     rig = layout.unpack(values, start)
@@ -215,15 +225,48 @@ def _without_outliers(
     layout: Layout, start: Rig, corners: Corners, values: Floats, weights: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """A robust fit, and the corners that are no outliers of it."""
-    scale = 1.0
+    scale, kept = 1.0, corners.kept(~_misplaced(corners, draw(layout.unpack(values, start), corners)))
     for _ in range(ROBUST_ROUNDS):
-        off = np.abs(corners.pixels - draw(layout.unpack(values, start), corners)) / weights[corners.camera, None]
+        off = np.abs(kept.pixels - draw(layout.unpack(values, start), kept)) / weights[kept.camera, None]
         before, scale = scale, max(MAD_TO_SIGMA * float(np.median(off)), SIGMA_FLOOR_PX)
         if abs(scale - before) < SETTLED_SCALE * before:
             break
-        values, _ = _solve(layout, start, corners, values, scale * weights, huber=True)
+        values, _ = _solve(layout, start, kept, values, scale * weights, huber=True)
     off = np.abs(corners.pixels - draw(layout.unpack(values, start), corners)) / weights[corners.camera, None]
     return values, off.max(axis=1) <= OUTLIER_SIGMAS * scale
+
+
+def _misplaced(corners: Corners, drawn: Floats) -> NDArray[np.bool_]:
+    """Corners (N,) of photographs that the first guess draws elsewhere altogether, as frames that were interchanged.
+
+    Huber's loss bounds the pull of single corners, and a whole photograph of them still bends its place's and its camera's pose.
+    Of every camera and every place at least one photograph stays.
+    """
+    off = np.linalg.norm(corners.pixels - drawn, axis=1)
+    median = np.array([float(np.median(off[corners.view == view])) for view in range(corners.view.max() + 1)])
+    bad = median > max(MISPLACED_PX, MISPLACED_TIMES * float(np.median(median)))
+    for numbers in (corners.camera, corners.place):
+        for number in np.unique(numbers):
+            views = np.unique(corners.view[numbers == number])
+            bad[views[np.argmin(median[views])]] = False
+    return np.asarray(bad[corners.view])
+
+
+def _require_inliers(views: Sequence[View], corners: Corners, inliers: NDArray[np.bool_]) -> None:
+    """Refuse a session in which a camera or a place has no pose.
+
+    Raises:
+        CaptureInputError: too few corners of it fit.
+    """
+    for what, numbers in (("the board at one place", corners.place), ("one camera", corners.camera)):
+        for number in np.unique(numbers):
+            mine = numbers == number
+            if np.count_nonzero(inliers & mine) < MIN_INLIERS:
+                name = views[int(corners.view[mine][0])].name
+                raise CaptureInputError(
+                    f"The photographs of {what}, among them {name}, fit no common pose: the board or a camera moved there, or frames are "
+                    "interchanged; leave them out or take them again."
+                )
 
 
 def jacobian(layout: Layout, rig: Rig, corners: Corners, sigma_px: Floats) -> object:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.cameras.bundle import Rig
+from services.calibrate.cameras.bundle import Rig, pose_apply
 from services.calibrate.cameras.lens import HALF_PIXEL, MODELS, Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 from services.calibrate.cameras.sightings import View
@@ -16,6 +16,8 @@ from services.core.errors import CaptureInputError
 Floats = NDArray[np.float64]
 MIN_CORNERS = 6
 """Of a view: four fix a pose without any check, and six still outvote one bad corner."""
+VOTES = 2
+"""Rounds: the first mends what a single wrong photograph led astray, the second what hung on that."""
 MIN_VIEWS = 3
 """A plane's views fix five intrinsic values from three on (Zhang 2000)."""
 
@@ -98,6 +100,9 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
         else:
             places[view.place] = np.linalg.inv(cameras[view.camera]) @ camera_from_board
         waiting.remove(linked[0])
+    for _ in range(VOTES):
+        _vote_for_cameras(views, lenses, poses, cameras, places)
+        _vote_for_places(views, lenses, poses, cameras, places)
     if alone := next((name for number, name in enumerate(names) if number not in cameras), None):
         raise CaptureInputError(
             f"Camera {alone} sees no board together with the other cameras; photograph a board where both see it."
@@ -110,6 +115,55 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
         np.array([pose_vector(cameras[number]) for number in range(len(names))]),
         np.array([np.zeros(6), *(pose_vector(places[place]) for place in range(1, n_places))]),
     )
+
+
+def _vote_for_cameras(
+    views: Sequence[View],
+    lenses: Sequence[Lens],
+    poses: dict[int, Floats],
+    cameras: dict[int, Floats],
+    places: dict[int, Floats],
+) -> None:
+    """Give each camera the pose, of those that its photographs propose, that draws most of its corners where they are.
+
+    So a photograph that is not what its frame says does not lead the others astray.
+    """
+    for camera in cameras:
+        mine = [number for number in poses if views[number].camera == camera and views[number].place in places]
+        proposed = [poses[number] @ np.linalg.inv(places[views[number].place]) for number in mine]
+        drawn = [(views[n], lenses[camera], [pose @ places[views[n].place] for pose in proposed]) for n in mine]
+        if len(proposed) > 2:
+            cameras[camera] = proposed[_best(drawn)]
+
+
+def _vote_for_places(
+    views: Sequence[View],
+    lenses: Sequence[Lens],
+    poses: dict[int, Floats],
+    cameras: dict[int, Floats],
+    places: dict[int, Floats],
+) -> None:
+    """Give each place but the first the pose that draws most of its corners where they are."""
+    for place in list(places)[1:]:
+        mine = [number for number in poses if views[number].place == place and views[number].camera in cameras]
+        proposed = [np.linalg.inv(cameras[views[number].camera]) @ poses[number] for number in mine]
+        drawn = [
+            (views[n], lenses[views[n].camera], [cameras[views[n].camera] @ pose for pose in proposed]) for n in mine
+        ]
+        if len(proposed) > 2:
+            places[place] = proposed[_best(drawn)]
+
+
+def _best(drawn: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
+    """Which of the proposed poses camera_from_board, one list a view, has the least median distance over all corners."""
+    offs = [
+        [
+            np.linalg.norm(lens.project(pose_apply(pose_vector(pose), view.corners_mm)) - view.pixels, axis=1)
+            for pose in proposed
+        ]
+        for view, lens, proposed in drawn
+    ]
+    return int(np.argmin([np.median(np.concatenate(own)) for own in zip(*offs, strict=True)]))
 
 
 def _spans_a_plane(corners_mm: Floats) -> bool:

@@ -68,7 +68,8 @@ class IntensityFit:
             and the positions together (S · C, S · C).
         by_positions: derivative of those logarithms to the lights' positions (S · C, 3 L), for errors that are shared.
         sigma: scatter of one photograph's slope, relative, by channel (C,).
-        residuals: of the slopes' logarithms (photographs, C).
+        residuals: of the slopes' logarithms (photographs that were used, C).
+        used: numbers of those photographs.
     """
 
     intensity: Floats
@@ -79,6 +80,7 @@ class IntensityFit:
     by_positions: Floats
     sigma: Floats
     residuals: Floats
+    used: tuple[int, ...]
 
 
 def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -128,12 +130,13 @@ def fit_intensity(
         CaptureInputError: no photograph has enough pixels, or a light is dark.
     """
     found = [slope(one, eyes[one.camera], spheres[one.place], lights_mm[one.light]) for one in photos]
+    numbers = tuple(number for number, value in enumerate(found) if value is not None)
     kept = [(photo, value) for photo, value in zip(photos, found, strict=True) if value is not None]
     if not kept:
         raise CaptureInputError("No photograph of a white sphere shows enough of its lit side; photograph it larger.")
     if dark := next((photo for photo, value in kept if value.min() <= 0), None):
         raise CaptureInputError(
-            f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on."
+            f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on, or another in its place."
         )
     used = [photo for photo, _ in kept]
     logs = np.log(np.array([value for _, value in kept]))
@@ -155,7 +158,7 @@ def fit_intensity(
     by_positions = _by_positions(used, eyes, spheres, lights_mm)
     covariance, moved = _covariance(solver[: len(seen)], by_positions, sigma, relative, position_covariance)
     return IntensityFit(
-        intensity, 1 / (mean * np.exp(steps)), exponent, exponent_se, covariance, moved, sigma, residuals
+        intensity, 1 / (mean * np.exp(steps)), exponent, exponent_se, covariance, moved, sigma, residuals, numbers
     )
 
 

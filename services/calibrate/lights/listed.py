@@ -18,6 +18,8 @@ CAUCHY_SIGMAS = 3.0
 NOISE_FLOOR_MM = 0.5
 """Nobody measures a lamp's place better by hand."""
 OUTLIER_SIGMAS = 5.0
+MIRRORED_TIMES = 5.0
+"""Lights in one plane fit as well mirrored; a right-handed list never fits five times better so."""
 MAD_OF_DISTANCES = 1.538
 """Of the length of a vector with three normal coordinates: its median is 1.538 σ."""
 
@@ -31,12 +33,16 @@ class AlignedList:
         sigma_mm: scatter of one coordinate of the list about the lights that were found.
         off_mm: distance of listed and found, NaN where no highlight was found (L,).
         outliers: numbers of the lights that lie elsewhere than listed.
+        scale: how many times as far apart lights were found as listed.
+        is_mirrored: whether the list's mirror image fits far better, so that its frame is left-handed.
     """
 
     positions_mm: Floats
     sigma_mm: float
     off_mm: Floats
     outliers: tuple[int, ...]
+    scale: float
+    is_mirrored: bool
 
 
 def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
@@ -53,16 +59,38 @@ def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
     if np.count_nonzero(known) < MIN_LIGHTS:
         return None
     source, target = listed_mm[known], found_mm[known]
+    motion, off, sigma = _laid_over(source, target)
+    turned_over = source * [-1.0, 1.0, 1.0]
+    distances = np.full(len(listed_mm), np.nan)
+    distances[known] = off
+    bad = np.flatnonzero(np.nan_to_num(distances) > OUTLIER_SIGMAS * sigma)
+    return AlignedList(
+        positions_mm=_moved(motion, listed_mm),
+        sigma_mm=sigma,
+        off_mm=distances,
+        outliers=tuple(int(n) for n in bad),
+        scale=_scale(source, target),
+        is_mirrored=MIRRORED_TIMES * _laid_over(turned_over, target)[2] < sigma,
+    )
+
+
+def _laid_over(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
+    """The rigid motion (4, 4), distances that it leaves (N,), and the scatter of one coordinate."""
     weights = np.ones(len(source))
     for _ in range(ROUNDS):
         motion = _rigid(source, target, weights)
         off = np.linalg.norm(_moved(motion, source) - target, axis=1)
         sigma = max(float(np.median(off)) / MAD_OF_DISTANCES, NOISE_FLOOR_MM)
         weights = 1 / (1 + (off / (CAUCHY_SIGMAS * sigma)) ** 2)
-    distances = np.full(len(listed_mm), np.nan)
-    distances[known] = off
-    bad = np.flatnonzero(np.nan_to_num(distances) > OUTLIER_SIGMAS * sigma)
-    return AlignedList(_moved(motion, listed_mm), sigma, distances, tuple(int(n) for n in bad))
+    return motion, off, sigma
+
+
+def _scale(source: Floats, target: Floats) -> float:
+    """The median ratio of distances between pairs, which no motion and no few wrong lights change."""
+    one, two = np.triu_indices(len(source), 1)
+    listed, found = (np.linalg.norm(points[one] - points[two], axis=1) for points in (source, target))
+    apart = listed > NOISE_FLOOR_MM
+    return float(np.median(found[apart] / listed[apart])) if apart.any() else 1.0
 
 
 def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:

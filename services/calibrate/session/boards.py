@@ -14,6 +14,7 @@ from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, c
 from services.calibrate.cameras.sightings import View
 from services.calibrate.cameras.start import first_rig, usable
 from services.calibrate.lights.mirror import Eye
+from services.calibrate.session.missed import why_missed
 from services.calibrate.session.photos import Photos, for_finders
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFrame
@@ -30,14 +31,14 @@ class CamerasStep:
         fit: lenses, poses and covariance.
         choices: how each camera's distortion model was chosen.
         views: the boards that were found, in the order of the fit's corners.
-        missed: files in which no board was found.
+        missed: files in which no board was found, each with why.
     """
 
     names: tuple[str, ...]
     fit: BundleFit
     choices: dict[str, ModelChoice]
     views: tuple[View, ...]
-    missed: tuple[str, ...]
+    missed: tuple[tuple[str, str], ...]
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
@@ -78,7 +79,7 @@ def calibrate_cameras(photos: Photos) -> CamerasStep:
 
 
 def adjust_cameras(
-    views: Sequence[View], sizes: Mapping[str, tuple[int, int]], first: str, missed: tuple[str, ...] = ()
+    views: Sequence[View], sizes: Mapping[str, tuple[int, int]], first: str, missed: tuple[tuple[str, str], ...] = ()
 ) -> CamerasStep:
     """Choose each camera's distortion model, and adjust the rig to the boards that were found.
 
@@ -86,12 +87,15 @@ def adjust_cameras(
         views: boards in photographs; place 0 is to be the world's frame.
         sizes: of the images by the cameras' names, in the order of their numbers.
         first: what place 0 is called, for messages.
-        missed: files in which no board was found.
+        missed: files in which no board was found, each with why.
 
     Raises:
         CaptureInputError: too few boards, or cameras that share none.
     """
     names, good = tuple(sizes), usable(views)
+    if not good and missed:
+        file, why = missed[0]
+        raise CaptureInputError(f"No board is found in any frame; in {file} {why}.")
     if not any(view.place == 0 for view in good):
         raise CaptureInputError(
             f"No camera shows the board at {first}, the first of raw.toml, which is to be the world's frame; photograph it again, "
@@ -107,17 +111,21 @@ def adjust_cameras(
     return CamerasStep(names, fit, choices, tuple(good), missed)
 
 
-def _find(photos: Photos, frames: Sequence[RawFrame], names: Sequence[str]) -> tuple[list[View], tuple[str, ...]]:
+def _find(
+    photos: Photos, frames: Sequence[RawFrame], names: Sequence[str]
+) -> tuple[list[View], tuple[tuple[str, str], ...]]:
     boards = {board.name: board for board in photos.folder.board}
     places = list(dict.fromkeys(_place(frame) for frame in frames))
     views, missed = [], []
     for frame in frames:
-        found = detect(for_finders(photos.grey(frame)), boards[str(frame.board)])
-        if len(found.ids) == 0:
-            missed.append(frame.file)
-            continue
+        image, board = for_finders(photos.grey(frame)), boards[str(frame.board)]
+        found = detect(image, board)
         camera, place = names.index(frame.camera), places.index(_place(frame))
-        views.append(View(camera, place, found.corners_mm, found.pixels, found.ids, frame.file))
+        view = View(camera, place, found.corners_mm, found.pixels, found.ids, frame.file)
+        if usable([view]):
+            views.append(view)
+        else:
+            missed.append((frame.file, why_missed(image, board, found)))
     return views, tuple(missed)
 
 

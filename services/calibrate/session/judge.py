@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from services.calibrate.cameras.bundle import BundleFit
 from services.calibrate.cameras.projection import image_grid, projection_sigma
-from services.calibrate.lights.listed import swapped_names
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
+from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.calibrate.session.suspicions import suspicions
 from services.core.calibration.record import CalibrationLimit
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
 GRID = (8, 6)
-MAX_EDGE_SHIFT_PX = 1.0
-"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
 FEW_PLACES = 8
 MAX_EMPTY = 0.3
 """Share of an image's cells without a corner: a board in nine places leaves the corners alone empty."""
@@ -81,11 +80,13 @@ def judge(
     intensity: IntensityStep | None,
     colours: ColourStep | None,
     uncertainty: CalibrationUncertainty | None,
+    black: Mapping[str, Black] | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> Judgement:
     """Hold a calibration to its limits. They are those that keep a tooth's absorption within a few per cent."""
     limits = list(_limits(cameras, lights, uncertainty, colours))
-    suspicions = tuple(_suspicions(folder, cameras, lights))
-    return Judgement(tuple(limits), suspicions, _advice(folder, limits, cameras, lights, intensity, colours))
+    wrong = tuple(suspicions(folder, cameras, lights, intensity, colours, black, inputs))
+    return Judgement(tuple(limits), wrong, _advice(folder, limits, cameras, lights, intensity, colours))
 
 
 def _limits(
@@ -133,67 +134,6 @@ def covered_cells(fit: BundleFit, camera: int) -> NDArray[np.bool_]:
     covered = np.zeros(columns * rows, dtype=bool)
     covered[cell[:, 1] * columns + cell[:, 0]] = True
     return covered
-
-
-def _suspicions(folder: RawFolder, cameras: CamerasStep, lights: LightsStep | None) -> Iterator[str]:
-    if cameras.missed:
-        yield (
-            f"{len(cameras.missed)} frames show no board, among them {cameras.missed[0]}: check that the board of raw.toml is the one "
-            "that was photographed, not mirrored and in focus."
-        )
-    if not cameras.fit.converged:
-        yield (
-            "The adjustment of cameras and boards stopped before it settled, so its errors cannot be trusted: look for boards that moved "
-            "while the cameras took them, and photograph more places and tilts."
-        )
-    bad = ~cameras.fit.inliers
-    for number, view in enumerate(cameras.views):
-        share = bad[cameras.fit.corners.view == number].mean()
-        if share > 0.5:
-            yield f"Most corners of {view.name} fit no pose: the board or the camera moved, or frames are interchanged."
-    if lights is None:
-        return
-    fit, names = lights.fit, [light.name for light in folder.light]
-    for number, shift in enumerate(fit.edge_shifts_px):
-        if abs(shift) > MAX_EDGE_SHIFT_PX:
-            yield (
-                f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
-                "measure the sphere's radius_mm and the board's square_mm again."
-            )
-    for outlier in fit.outliers:
-        yield (
-            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is {outlier.off_px:.1f} px off: "
-            "something else may shine there, so it was left out."
-        )
-    if lights.no_highlight:
-        yield f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the light on?"
-    yield from _about_the_list(names, lights)
-    yield from _twins(names, lights)
-
-
-def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
-    if lights.aligned is None:
-        return
-    found = np.full((len(names), 3), np.nan)
-    found[lights.fit.lights] = lights.fit.positions_mm
-    swapped = dict(swapped_names(found, lights.aligned))
-    for number in lights.aligned.outliers:
-        if number in swapped:
-            yield f"Light {names[number]} shines where the list has {names[swapped[number]]}; their names are interchanged."
-        else:
-            off = lights.aligned.off_mm[number]
-            yield f"Light {names[number]} lies {off:.0f} mm from where the list has it; measure it again."
-
-
-def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
-    """Two lights at one place are one light listed twice."""
-    positions = lights.fit.positions_mm
-    for one in range(len(positions)):
-        for two in range(one):
-            apart = float(np.linalg.norm(positions[one] - positions[two]))
-            if apart < 1.0:
-                first, second = names[lights.fit.lights[two]], names[lights.fit.lights[one]]
-                yield f"Lights {first} and {second} lie {apart:.1f} mm apart: one light was photographed under two names."
 
 
 def _advice(

@@ -77,7 +77,7 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     inputs = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in used}
     made = datetime.now(UTC).isoformat(timespec="seconds")
     record = record_of(folder, photos.black, falls, cameras, lights, intensity, colours, made, valid_days, inputs)
-    judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty)
+    judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty, photos.black, inputs)
     record = record.model_copy(update={"limits": judgement.recorded})
     return Session(record, cameras, lights, intensity, colours, judgement)
 

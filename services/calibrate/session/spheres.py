@@ -28,6 +28,10 @@ WHITE_PIXELS_ACROSS = 60
 """A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit it."""
 
 
+MIN_UNSATURATED = 0.5
+"""Of a white sphere's pixels: a glint saturates a few, and too long an exposure the whole lit side."""
+
+
 @dataclass(frozen=True)
 class LightsStep:
     """Where lights are: the fit to highlights, and the list of ``raw.toml`` laid over it where there is one."""
@@ -201,5 +205,10 @@ def _sampled(photos: Photos, frame: RawFrame, outline: Outline) -> tuple[Floats,
     high = np.minimum(((middle + reach) / channels.pixel).astype(int) + 1, channels.values.shape[1::-1])
     columns, rows = (grid.ravel() for grid in np.meshgrid(*(np.arange(low[k], high[k], step) for k in (0, 1))))
     good = ~channels.saturated[rows, columns]
+    if good.mean() < MIN_UNSATURATED:
+        raise CaptureInputError(
+            f"Frame {frame.file} (camera {frame.camera}, light {frame.light}) is saturated on {1 - good.mean():.0%} of the white sphere; "
+            "expose it less."
+        )
     rows, columns = rows[good], columns[good]
     return channels.centres(rows, columns), channels.values[rows, columns].astype(np.float64)

@@ -1,0 +1,239 @@
+"""What in a calibration session looks wrong, each in a sentence with its remedy."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.calibrate.cameras.bundle import draw
+from services.calibrate.lights.listed import swapped_names
+from services.calibrate.lights.mirror import outline_errors
+from services.calibrate.session.boards import CamerasStep
+from services.calibrate.session.charts import ColourStep, better_order
+from services.calibrate.session.photos import Black
+from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.raw.records import RawFolder
+
+Floats = NDArray[np.float64]
+MAX_EDGE_SHIFT_PX = 1.0
+"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
+MAX_BAD_SHARE = 0.5
+"""Of a view's corners: single ones are hidden or glare, most of them are another pose."""
+MAX_FOCAL_SE = 0.01
+"""Relative: ten tilted boards leave a thousandth, boards that all face the camera leave several per cent."""
+MIN_APART_MM = 1.0
+"""Two lamps are wider than that."""
+MANY_SIGMAS = 6.0
+"""Of a photograph's robust scatter: a hundred photographs of three channels pass it by chance once in a million sessions."""
+MIN_OFF_SHARE = 0.03
+"""Paint, shadow and glare leave a per cent; another light or exposure is a step of more than three."""
+MIN_MOVE_PX = 1.0
+MOVED_TIMES = 4.0
+"""An outline's rms over that of all: where a sphere moved between photographs its outlines disagree by pixels."""
+MAX_BLACK_SHARE = 0.1
+"""Of the range: black levels are set to a few per cent of it."""
+MAX_SCALE_ERROR = 0.03
+"""A list measured by hand is right to 10 mm in a metre; 3 % are another unit or another board."""
+
+
+def suspicions(
+    folder: RawFolder,
+    cameras: CamerasStep,
+    lights: LightsStep | None,
+    intensity: IntensityStep | None = None,
+    colours: ColourStep | None = None,
+    black: Mapping[str, Black] | None = None,
+    inputs: Mapping[str, str] | None = None,
+) -> Iterator[str]:
+    """Sentences on what looks wrong; none of a good session.
+
+    Args:
+        folder: names.
+        cameras, lights, intensity, colours: what the steps found.
+        black: by camera.
+        inputs: SHA-256 of each file.
+    """
+    names = [light.name for light in folder.light]
+    yield from _about_files(folder, black or {}, inputs or {})
+    yield from _about_boards(cameras)
+    if lights is not None:
+        yield from _about_spheres(cameras, lights)
+        yield from _about_highlights(names, cameras, lights)
+        yield from _about_the_list(names, lights)
+        yield from _twins(names, lights)
+    if intensity is not None:
+        yield from _about_white(names, cameras, intensity)
+    for camera, (order, better, worse) in better_order(colours).items() if colours is not None else ():
+        yield (
+            f"The chart's patches in camera {camera} fit far better {order} (ΔE2000 {better:.1f} against {worse:.1f}): "
+            "give corners_px as the centres of patches 1, 6, 24 and 19 in this order."
+        )
+
+
+def _about_files(folder: RawFolder, black: Mapping[str, Black], inputs: Mapping[str, str]) -> Iterator[str]:
+    used = {frame.file for frame in folder.frame}
+    same = defaultdict(list)
+    for file, digest in inputs.items():
+        if file in used:
+            same[digest].append(file)
+    for first, second, *_ in (files for files in same.values() if files[1:]):
+        yield f"Files {first} and {second} hold the same photograph; export the second again, or list it once."
+    for name, level in black.items():
+        camera = folder.camera_named(name)
+        full = camera.full_counts
+        if full is not None and level.counts > MAX_BLACK_SHARE * full:
+            yield (
+                f"Black frames of camera {name} have {level.counts:.0f} counts of {full:.0f}: light fell in; "
+                "take them again with the lens covered."
+            )
+
+
+def _about_boards(cameras: CamerasStep) -> Iterator[str]:
+    fit = cameras.fit
+    missed = defaultdict(list)
+    for file, why in cameras.missed:
+        missed[why].append(file)
+    for why, files in missed.items():
+        many = f"{len(files)} frames show no board, among them {files[0]}"
+        yield f"{many if files[1:] else f'Frame {files[0]} shows no board'}: {why}."
+    if not fit.converged:
+        yield (
+            "The adjustment of cameras and boards stopped before it settled, so its errors cannot be trusted: look for boards that moved "
+            "while the cameras took them, and photograph more places and tilts."
+        )
+    for number, name in enumerate(cameras.names):
+        columns = fit.layout.lens_columns(number)[:2]
+        focal = fit.rig.lenses[number].values[0]
+        if len(columns) and np.sqrt(fit.covariance[columns[0], columns[0]]) > MAX_FOCAL_SE * focal:
+            yield (
+                f"Boards tell the focal length of camera {name} to {np.sqrt(fit.covariance[columns[0], columns[0]]) / focal:.1%} only: "
+                "they all face it alike; tilt them by 20° to 40° in several directions."
+            )
+    for number, view in enumerate(cameras.views):
+        mine = fit.corners.view == number
+        if (~fit.inliers[mine]).mean() > MAX_BAD_SHARE:
+            yield _of_a_bad_view(cameras, number, view.name)
+
+
+def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
+    """Whether another place or another camera draws a view's corners where they are, or else that something moved."""
+    fit = cameras.fit
+    corners = fit.corners.kept(fit.corners.view == number)
+    limit = 10 * float(fit.sigma_px.max())
+
+    def off(camera: int, place: int) -> float:
+        tried = type(corners)(np.full_like(corners.camera, camera), np.full_like(corners.place, place), *_rest(corners))
+        return float(np.median(np.abs(corners.pixels - draw(fit.rig, tried))))
+
+    camera, place = int(corners.camera[0]), int(corners.place[0])
+    for other in range(len(fit.rig.places)):
+        if other != place and off(camera, other) < limit:
+            there = next(view.name for view in cameras.views if view.place == other)
+            return f"Frame {name} shows the board as it lay for {there}; frames of two places are interchanged."
+    for other in range(len(cameras.names)):
+        if other != camera and off(other, place) < limit:
+            return (
+                f"Frame {name} is what camera {cameras.names[other]} sees and not {cameras.names[camera]}; "
+                "frames of two cameras are interchanged."
+            )
+    return f"Most corners of {name} fit no pose: the board or the camera moved there between photographs; leave the place out or take it again."
+
+
+def _rest(corners: object) -> tuple[NDArray[np.int64], Floats, Floats]:
+    return corners.view, corners.corners_mm, corners.pixels  # type: ignore[attr-defined]
+
+
+def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
+    fit = lights.fit
+    for number, shift in enumerate(fit.edge_shifts_px):
+        if abs(shift) > MAX_EDGE_SHIFT_PX:
+            yield (
+                f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
+                "measure the sphere's radius_mm and the board's square_mm again."
+            )
+    rms = np.array(
+        [
+            np.sqrt(
+                np.mean(
+                    (
+                        outline_errors(
+                            fit.eyes[view.camera], view.outline_px, fit.centres_mm[view.place], view.radius_mm
+                        )
+                        - fit.edge_shifts_px[view.camera]
+                    )
+                    ** 2
+                )
+            )
+            for view in lights.views
+        ]
+    )
+    moved = {
+        view.place: name
+        for view, name, one in zip(lights.views, lights.view_names, rms, strict=True)
+        if one > max(MIN_MOVE_PX, MOVED_TIMES * float(np.median(rms)))
+    }
+    for name in moved.values():
+        yield (
+            f"The sphere's outline in {name} does not fit those of the other cameras: it moved, or the place is another; "
+            "keep the sphere still until all lights and cameras are through."
+        )
+
+
+def _about_highlights(names: list[str], cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
+    for outlier in lights.fit.outliers:
+        yield (
+            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is {outlier.off_px:.1f} px off: "
+            "something else may shine there, so it was left out."
+        )
+    if lights.no_highlight:
+        yield f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the light on?"
+
+
+def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
+    aligned = lights.aligned
+    if aligned is None:
+        return
+    if abs(aligned.scale - 1) > MAX_SCALE_ERROR:
+        yield (
+            f"Lights are {aligned.scale:.3g} times as far apart as raw.toml lists them: check the unit of position_mm, "
+            "and the board's square_mm."
+        )
+        return
+    if aligned.is_mirrored:
+        yield "The lights' list is of a left-handed frame, as its mirror image fits; change the sign of one axis in position_mm."
+        return
+    found = np.full((len(names), 3), np.nan)
+    found[lights.fit.lights] = lights.fit.positions_mm
+    swapped = dict(swapped_names(found, aligned))
+    for number in aligned.outliers:
+        if number in swapped:
+            yield f"Light {names[number]} shines where the list has {names[swapped[number]]}; their names are interchanged."
+        else:
+            off = aligned.off_mm[number]
+            yield f"Light {names[number]} lies {off:.0f} mm from where the list has it; measure it again."
+
+
+def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
+    """Two lights at one place are one light listed twice."""
+    positions = lights.fit.positions_mm
+    for one in range(len(positions)):
+        for two in range(one):
+            apart = float(np.linalg.norm(positions[one] - positions[two]))
+            if apart < MIN_APART_MM:
+                first, second = names[lights.fit.lights[two]], names[lights.fit.lights[one]]
+                yield f"Lights {first} and {second} lie {apart:.1f} mm apart: one light was photographed under two names."
+
+
+def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensityStep) -> Iterator[str]:
+    """Photographs of white spheres that are brighter or darker than all others allow."""
+    off = intensity.fit.residuals.mean(axis=1)
+    scatter = 1.4826 * float(np.median(np.abs(off)))
+    for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
+        photo = intensity.photos[intensity.fit.used[number]]
+        yield (
+            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is {100 * off[number]:+.0f} % off: "
+            "another light was on, or its exposure, gain or level is not what raw.toml says."
+        )
