@@ -1,4 +1,4 @@
-"""The register stage: the scan of a raw folder in, teeth and gums where they stand in the rig out."""
+"""The doors of calibration: ``run`` registers the scan of a raw folder, ``calibrate`` is the whole of a job of kind calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from services.core.store import StageWriter
 if TYPE_CHECKING:
     from services.core.raw.registration import Registration
     from services.core.records import JobSpec
+    from services.core.results import AssetManifest
     from services.core.stage import StageContext
+
+STEPS = 4
+"""Cameras, lights, intensities, colours: what a calibration tells as it begins."""
 
 
 def run(spec: JobSpec, context: StageContext) -> Registration:
@@ -41,3 +45,45 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
     )
     context.report(StageEvent(stage="register", kind="finished", done=1.0, message=message))
     return record
+
+
+def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record and its report as the asset.
+
+    A calibration beyond its limits is published all the same, with what to photograph again; jobs that name it refuse it.
+
+    Raises:
+        CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy. JobCancelledError.
+    """
+    from services.calibrate.session.report import REPORT, write_report
+    from services.calibrate.session.run import CALIBRATION, RESIDUALS, write_session
+    from services.calibrate.session.run import calibrate as calibrate_folder
+    from services.core.results import AssetManifest
+
+    assert spec.capture is not None, "only a raw folder is calibrated"
+    steps = 0
+
+    def tell(step: str) -> None:
+        nonlocal steps
+        context.raise_if_cancelled()
+        context.report(StageEvent(stage="export", kind="progress", done=steps / STEPS, message=step))
+        steps += 1
+
+    context.report(StageEvent(stage="export", kind="started"))
+    session = calibrate_folder(spec.capture, tell)
+    for sentence in session.judgement.suspicions:
+        context.report(StageEvent(stage="export", kind="log", message=sentence))
+    writer = StageWriter(context.root, "asset", context.attempt)
+    write_session(session, writer.folder)
+    write_report(session, writer.folder)
+    broken = session.judgement.broken
+    manifest = AssetManifest(
+        files=(CALIBRATION, RESIDUALS, REPORT),
+        held_out_error=0.0,
+        converged=not broken,
+        advice=session.judgement.advice,
+    )
+    writer.publish(manifest)
+    told = f"{len(broken)} limits are not kept. " if broken else ""
+    context.report(StageEvent(stage="export", kind="finished", done=1.0, message=told + session.judgement.advice))
+    return manifest

@@ -66,7 +66,9 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
 
 
 def _errors(asset: AssetManifest) -> str:
-    if (verdict := asset.verdict) is None:  # exported by an earlier version
+    if (verdict := asset.verdict) is None:  # a calibration, or exported by an earlier version
+        if asset.advice:
+            return asset.advice
         return f"held-out error: {100 * asset.held_out_error:.2f} %"
     from services.core.verdict import percent
 

@@ -71,6 +71,12 @@ JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
             "all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW
         ),
         "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, SLAB_OPTIONS),
+        "calibration": JobKind(
+            "a rig's cameras, lights and colours, by boards, spheres and a chart",
+            ("export",),
+            {"export": "services.calibrate.stage:calibrate"},
+            frozenset(),
+        ),
     }
 )
 """The kinds of this package."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -21,12 +21,17 @@ from services.calibrate.session.record import uncertainty_of
 from services.calibrate.session.report import write_report
 from services.calibrate.session.run import Session, calibrate, write_session
 from services.calibrate.session.spheres import LightsStep, find_lights
+from services.calibrate.stage import calibrate as calibrate_job
 from services.cli.app import build_app
 from services.core.calibration.record import Calibration, require_consistent
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFolder
-from services.core.store import read_record
+from services.core.records import JobSpec
+from services.core.results import AssetManifest
+from services.core.stage import LocalContext, StageEvent
+from services.core.store import open_stage, read_record
+from services.pipeline.stages import run_job
 from tests.support.board_sessions import CHESSBOARD, charuco
 from tests.support.virtual_session import BOARD, XYZ_FROM_SENSOR, Truth, write_virtual_session
 
@@ -257,3 +262,29 @@ def test_black_frames_tell_their_noise_without_the_sensors_pattern() -> None:
     assert black.counts == pytest.approx(np.mean(frames), abs=1e-3)
     # One frame cannot tell pattern from noise, so both are told.
     assert black_of(iter(frames[:1])).noise == pytest.approx(104**0.5, rel=0.03)
+
+
+def test_a_job_publishes_the_record_and_its_report(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[StageEvent] = []
+
+    def found(root: Path, tell: Callable[[str], None]) -> Session:
+        tell("cameras: boards, lenses, poses")
+        return session
+
+    monkeypatch.setattr("services.calibrate.session.run.calibrate", found)
+    spec = JobSpec(kind="calibration", capture=tmp_path / "session")
+    calibrate_job(spec, LocalContext(tmp_path / "job", 1, told.append))
+    folder, manifest = open_stage(tmp_path / "job", "asset", AssetManifest)
+    assert manifest.files == ("calibration.json", "residuals.json", "report.html")
+    assert read_record(folder / "calibration.json", Calibration).limits == session.judgement.recorded
+    assert manifest.converged == (session.judgement.broken == ())
+    assert [event.kind for event in told] == ["started", "progress", "finished"]
+    assert session.judgement.advice in told[-1].message
+
+
+@pytest.mark.slow
+def test_a_job_of_kind_calibration_runs_as_any_other(made: tuple[Path, Truth], tmp_path: Path) -> None:
+    asset = run_job(JobSpec(kind="calibration", capture=made[0]), tmp_path / "job")
+    assert "report.html" in asset.files

@@ -90,10 +90,14 @@ export class JobView {
       this.refusal,
       this.actions.root,
       section("Stages", this.stages.root, this.remaining),
-      ...(this.isSlab
-        ? [section("Fit", this.slab.progress), section("Phase function", this.slab.phases)]
-        : [section("Fit", this.chart.root), section("Render and photograph", this.comparison.root)]),
-      section("Parameters", this.parameters.root, this.parameterTable),
+      ...(job.spec.kind === "calibration"
+        ? []
+        : [
+            ...(this.isSlab
+              ? [section("Fit", this.slab.progress), section("Phase function", this.slab.phases)]
+              : [section("Fit", this.chart.root), section("Render and photograph", this.comparison.root)]),
+            section("Parameters", this.parameters.root, this.parameterTable),
+          ]),
       section("Files", this.filesRefusal, this.files),
     );
     this.show(job);
