@@ -14,7 +14,7 @@ from services.calibrate.cameras.rotations import rotation_matrix
 Floats = NDArray[np.float64]
 ANGLE_PRECISION = 1e-14
 """Radians: a millionth of a nanometre on a sphere of 20 mm."""
-MOST_STEPS = 60
+MAX_STEPS = 60
 """Halving alone would need 48; Newton's steps end after five to eight."""
 
 
@@ -92,7 +92,7 @@ def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, rad
     second = np.where(aside[:, None] > 1e-9, second / np.maximum(aside, 1e-9)[:, None], 0.0)
     between = np.arctan2(aside, along)
     low, high, angle = np.zeros(len(to_light)), between, between / 2
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         to_the_eye, by_eye = _from_normal(angle, eye_distance, radii_mm)
         to_the_light, by_light = _from_normal(between - angle, light_distance, radii_mm)
         off = to_the_eye - to_the_light
