@@ -40,6 +40,22 @@ class Outline:
     rms_px: float
 
 
+@dataclass(frozen=True)
+class Logs:
+    """Logarithm of the light in a part of an image (h, w), where the part begins (2,) as column and row, and the whole image's size."""
+
+    values: Image
+    first_px: NDArray[np.int64]
+    size: tuple[int, int]
+
+
+def about_outline(outline_px: Floats, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of an image (H, W) that hold a sphere's outline, from even numbers on as a mosaic needs."""
+    low = np.maximum(np.floor(outline_px.min(axis=0)).astype(int) - 2, 0) // 2 * 2
+    high = np.minimum(np.ceil(outline_px.max(axis=0)).astype(int) + 4, shape[1::-1]) // 2 * 2
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+
 def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) -> Outline | None:
     """The outline of a sphere of known radius at about a distance, or None.
 
@@ -61,7 +77,13 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
     points = circle[:2] * shrink + circle[2] * shrink * _unit_circle()
     # Light is compared by its logarithm: an edge is as steep in the dark as in the bright.
     floor = 0.02 * top
-    logs = cv2.GaussianBlur(np.log(np.maximum(grey, 0) + floor).astype(np.float32), (0, 0), SMOOTHING_PX)
+    # Only about the circle: the widest band lies within.
+    reach = circle[2] * shrink * (1 + 2 * BANDS[0]) + 2 * MIN_BAND_PX
+    low = np.maximum(np.floor(circle[:2] * shrink - reach).astype(int), 0)
+    high = np.minimum(np.ceil(circle[:2] * shrink + reach).astype(int), [width, height])
+    part = np.maximum(grey[low[1] : high[1], low[0] : high[0]], 0)
+    near = cv2.GaussianBlur(np.log(part + np.float32(floor)).astype(np.float32), (0, 0), SMOOTHING_PX)
+    logs = Logs(near, low, (width, height))
     for band in BANDS:
         sphere = sphere_from_outline(eye, points, radius_mm)
         found = _edges(logs, eye, sphere, radius_mm, band)
@@ -129,7 +151,7 @@ def _circle(image: NDArray[np.uint8], expected_px: float) -> Floats | None:
     return None
 
 
-def _edges(logs: Image, eye: Eye, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
+def _edges(logs: Logs, eye: Eye, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
     """Points (E, 2) of steepest change across the outline of a sphere, within a band about it."""
     import cv2
 
@@ -146,8 +168,8 @@ def _edges(logs: Image, eye: Eye, sphere_mm: Floats, radius_mm: float, band: flo
     half = max(band * float(np.linalg.norm(edge - middle, axis=1).mean()), MIN_BAND_PX)
     offsets = np.arange(-half, half + 0.25, 0.25)
     places = edge[:, None] + offsets[None, :, None] * outward[:, None]
-    maps = (places - 0.5).astype(np.float32)
-    profile = cv2.remap(logs, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    maps = (places - 0.5 - logs.first_px).astype(np.float32)
+    profile = cv2.remap(logs.values, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     steep = np.abs(np.gradient(profile.astype(np.float64), axis=1))
     best = np.clip(steep.argmax(axis=1), 1, len(offsets) - 2)
     rows = np.arange(len(edge))
@@ -155,7 +177,7 @@ def _edges(logs: Image, eye: Eye, sphere_mm: Floats, radius_mm: float, band: flo
     bend = left - 2 * top + right
     shift = np.where(np.abs(bend) > 0, (left - right) / np.where(bend == 0, 1, 2 * bend), 0.0)
     found = edge + ((best + np.clip(shift, -1, 1)) * 0.25 - half)[:, None] * outward
-    height, width = logs.shape
+    width, height = logs.size
     inside = ((found > 2) & (found < np.array([width - 2, height - 2]))).all(axis=1)
     return np.asarray(found[inside & (top > 0)])
 

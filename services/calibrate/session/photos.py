@@ -14,6 +14,10 @@ from services.core.raw.mosaic import binned
 from services.core.raw.records import RawFolder, RawFrame
 
 Image = NDArray[np.float32]
+Part = tuple[slice, slice]
+WHOLE: Part = (slice(None), slice(None))
+FINDER_VALUES = 2_000_000
+"""Of a photograph: percentiles of every n-th are those of all, and sorting twenty million takes longer than reading them."""
 ROUNDING = 1 / 12
 """Variance of rounding to whole counts."""
 LOW_PERCENTILE, HIGH_PERCENTILE = 1.0, 99.5
@@ -36,15 +40,17 @@ class Channels:
         values: counts above black over exposure, gain and level, (h, w, C).
         pixel: edge of one value in pixels of the photograph: 1, or 2 of a mosaic.
         saturated: where some channel is full (h, w).
+        first_px: column and row of the photograph at which the values begin.
     """
 
     values: Image
     pixel: int
     saturated: NDArray[np.bool_]
+    first_px: tuple[int, int] = (0, 0)
 
     def centres(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Pixels (N, 2) of the photograph at the centres of values."""
-        return np.stack([columns + 0.5, rows + 0.5], axis=1) * self.pixel
+        return np.stack([columns + 0.5, rows + 0.5], axis=1) * self.pixel + np.array(self.first_px)
 
 
 class Photos:
@@ -54,11 +60,18 @@ class Photos:
         self.root, self.folder = root, folder
         self.black = {camera.name: self._black(camera.name) for camera in folder.camera}
 
-    def grey(self, frame: RawFrame) -> Image:
-        """Brightness (H, W) above black over exposure, gain and level; of a mosaic interpolated."""
-        counts = self._above_black(frame)
+    def grey(self, frame: RawFrame, part: Part = WHOLE) -> Image:
+        """Brightness (h, w) above black over exposure, gain and level, of a part of a photograph; of a mosaic interpolated.
+
+        Parts of a mosaic begin at even rows and columns.
+        """
+        counts = self._above_black(frame, read_counts(self.root, self.folder, frame)[part])
         if counts.ndim == 3:
-            return np.asarray(counts.mean(axis=2))
+            # Channel by channel: NumPy's mean over a short last axis takes five times as long.
+            total = counts[..., 0].copy()
+            for channel in range(1, counts.shape[2]):
+                total += counts[..., channel]
+            return np.asarray(total / np.float32(counts.shape[2]))
         import cv2
 
         mosaic = self.folder.camera_named(frame.camera).mosaic
@@ -67,16 +80,17 @@ class Photos:
         drawn = cv2.cvtColor((np.maximum(counts, 0) / top * 65535).astype(np.uint16), code)
         return np.asarray(drawn, dtype=np.float32) * np.float32(top / 65535)
 
-    def channels(self, frame: RawFrame) -> Channels:
-        """Light by channel; a mosaic at half its size, without interpolation."""
+    def channels(self, frame: RawFrame, part: Part = WHOLE) -> Channels:
+        """Light by channel of a part of a photograph; a mosaic at half its size, without interpolation."""
         camera = self.folder.camera_named(frame.camera)
-        counts = read_counts(self.root, self.folder, frame)
+        counts = read_counts(self.root, self.folder, frame)[part]
         is_full = np.asarray(counts >= (np.inf if camera.full_counts is None else camera.full_counts))
         values = self._above_black(frame, counts)
+        first = (part[1].start or 0, part[0].start or 0)
         if camera.mosaic == "none":
-            return Channels(values, 1, np.asarray(is_full.any(axis=2)))
+            return Channels(values, 1, np.asarray(is_full.any(axis=2)), first)
         full = binned(is_full.astype(np.float32), camera.mosaic) > 0
-        return Channels(binned(values, camera.mosaic), 2, np.asarray(full.any(axis=2)))
+        return Channels(binned(values, camera.mosaic), 2, np.asarray(full.any(axis=2)), first)
 
     def _above_black(self, frame: RawFrame, counts: NDArray[np.generic] | None = None) -> Image:
         if counts is None:
@@ -110,5 +124,7 @@ def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
 
 def for_finders(grey: Image) -> NDArray[np.uint8]:
     """A photograph (H, W) in 8 bits, stretched over its own range."""
-    low, high = np.percentile(grey, [LOW_PERCENTILE, HIGH_PERCENTILE])
-    return np.asarray(np.clip((grey - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8)
+    step = max(round((grey.size / FINDER_VALUES) ** 0.5), 1)
+    low, high = (float(one) for one in np.percentile(grey[::step, ::step], [LOW_PERCENTILE, HIGH_PERCENTILE]))
+    drawn = (grey - low) * (255 / max(high - low, 1e-12))
+    return np.asarray(np.clip(drawn, 0, 255, out=drawn).astype(np.uint8))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.lights.centres import OutlineView, fit_centres
-from services.calibrate.lights.images import Outline, find_highlight, find_outline
+from services.calibrate.lights.images import Outline, about_outline, find_highlight, find_outline
 from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity
 from services.calibrate.lights.listed import AlignedList, align_list
 from services.calibrate.lights.mirror import Eye
@@ -28,6 +28,8 @@ WHITE_PIXELS_ACROSS = 60
 """A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit it."""
 
 
+LIGHTS_OF_AN_OUTLINE = 12
+"""So many light a sphere from all sides; every further photograph costs its reading a second time."""
 MIN_UNSATURATED = 0.5
 """Of a white sphere's pixels: a glint saturates a few, and too long an exposure the whole lit side."""
 
@@ -78,12 +80,15 @@ def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distanc
         radius, eye = radii[str(frames[0].sphere)], eyes[cameras.index(camera)]
         outline = _outline(photos, frames, eye, radius, distance_mm)
         found = {}
+        width, height = folder.camera_named(camera).size
+        part = about_outline(outline.points_px, (height, width))
+        first = np.array([part[1].start, part[0].start])
         for frame in frames:
-            where = find_highlight(photos.grey(frame), outline.points_px)
+            where = find_highlight(photos.grey(frame, part), outline.points_px - first)
             if where is None:
                 missed.append(frame.file)
             else:
-                found[lights.index(str(frame.light))] = where
+                found[lights.index(str(frame.light))] = where + first
         numbers = np.array(sorted(found), dtype=np.int64)
         pixels = np.array([found[number] for number in numbers]).reshape(-1, 2)
         views.append(SphereView(cameras.index(camera), places.index(place), radius, outline.points_px, numbers, pixels))
@@ -183,9 +188,12 @@ def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFr
 
 
 def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: float, distance_mm: float) -> Outline:
-    """The outline in the mean of all lights, as each alone leaves a part of it dark."""
-    total = sum(photos.grey(frame).astype(np.float64) for frame in frames)
-    outline = find_outline(np.asarray(total / len(frames), dtype=np.float32), eye, radius_mm, distance_mm)
+    """The outline in the mean of some lights from all around, as each alone leaves a part of it dark."""
+    chosen = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, LIGHTS_OF_AN_OUTLINE).astype(int))]
+    total = photos.grey(chosen[0]).copy()
+    for frame in chosen[1:]:
+        total += photos.grey(frame)
+    outline = find_outline(total / np.float32(len(chosen)), eye, radius_mm, distance_mm)
     if outline is None:
         first = frames[0]
         raise CaptureInputError(
@@ -197,9 +205,11 @@ def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: fl
 
 def _sampled(photos: Photos, frame: RawFrame, outline: Outline) -> tuple[Floats, Floats]:
     """Pixels (N, 2) and light by channel (N, C) on a grid over a sphere, saturated values left out."""
-    channels = photos.channels(frame)
-    middle = outline.points_px.mean(axis=0)
-    reach = float(np.linalg.norm(outline.points_px - middle, axis=1).mean())
+    width, height = photos.folder.camera_named(frame.camera).size
+    channels = photos.channels(frame, about_outline(outline.points_px, (height, width)))
+    points = outline.points_px - np.array(channels.first_px)
+    middle = points.mean(axis=0)
+    reach = float(np.linalg.norm(points - middle, axis=1).mean())
     step = max(int(2 * reach / channels.pixel / WHITE_PIXELS_ACROSS), 1)
     low = np.maximum(((middle - reach) / channels.pixel).astype(int), 0)
     high = np.minimum(((middle + reach) / channels.pixel).astype(int) + 1, channels.values.shape[1::-1])
