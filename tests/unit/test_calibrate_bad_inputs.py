@@ -50,7 +50,7 @@ def test_a_good_session_is_accused_of_nothing(
 @pytest.mark.slow
 def test_twenty_good_sessions_are_accused_of_nothing() -> None:
     """Other seeds than any that a threshold was chosen by."""
-    for seed in range(100, 120):
+    for seed in range(200, 220):
         session = array_session(seed)
         cameras = session.cameras()
         lights = session.lights(cameras)
@@ -237,7 +237,10 @@ def test_a_white_sphere_of_a_wrong_exposure(good: ArraySession, cameras: Cameras
     white = (*good.white[:7], replace(good.white[7], values=good.white[7].values * 2), *good.white[8:])
     spoiled = replace(good, white=white)
     told = told_of(spoiled, cameras, lights, spoiled.intensity(lights))
-    assert any("under light L1 in camera middle is" in one for one in told)
+    assert [one.partition(":")[0] for one in told] == ["The white sphere under light L1 in camera middle is +100 % off"]
+    # The wrong photograph is left out, so it does no harm: lights are as without it to their own ± of 0.06 %.
+    found, without = (np.log(one.intensity(lights).fit.intensity) for one in (spoiled, good))
+    assert np.abs(found - without).max() < 6e-4
 
 
 # Charts, black frames and files.

@@ -28,6 +28,13 @@ MIN_PLACES_FOR_A_LOBE = 3
 LOBE_SIGMAS = 4.0
 """An exponent that is not this far from 0 is taken to be 0."""
 SIGMA_FLOOR = 1e-6
+MAD_TO_SIGMA = 1.4826
+WRONG_SIGMAS, MIN_WRONG = 8.0, 0.05
+"""A photograph that the others put off by more, robustly, and by 5 %: another light, exposure or level than raw.toml says."""
+MAX_WRONG_SHARE = 0.1
+"""Of the photographs: with more of them wrong the list as a whole is not to be trusted."""
+MIN_FREEDOM = 0.2
+"""Of a photograph, 1 minus its leverage."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +75,7 @@ class IntensityFit:
             and the positions together (S · C, S · C).
         by_positions: derivative of those logarithms to the lights' positions (S · C, 3 L), for errors that are shared.
         sigma: scatter of one photograph's slope, relative, by channel (C,).
-        residuals: of the slopes' logarithms (photographs that were used, C).
+        residuals: of the slopes' logarithms (photographs that could be used, C), also of those that fit no other and were left out.
         used: numbers of those photographs.
     """
 
@@ -143,13 +150,16 @@ def fit_intensity(
     seen = np.unique([photo.light for photo in used])
     cosines = _log_cosines(used, spheres, lights_mm)
     design = _design(used, seen, len(eyes))
-    exponent, exponent_se = _common_exponent(design, logs.mean(axis=1), cosines, len({photo.place for photo in used}))
+    good = _without_wrong_photographs(design, logs)
+    places = {photo.place for photo, is_good in zip(used, good, strict=True) if is_good}
+    exponent, exponent_se = _common_exponent(design[good], logs[good].mean(axis=1), cosines[good], len(places))
     logs = logs - exponent * cosines[:, None]
-    solver = np.asarray(np.linalg.pinv(design), dtype=np.float64)
+    solver = np.zeros((design.shape[1], len(used)))
+    solver[:, good] = np.linalg.pinv(design[good])
     answer = solver @ logs
     residuals = logs - design @ answer
-    freedom = max(len(used) - np.linalg.matrix_rank(design), 1)
-    sigma = np.maximum(np.sqrt((residuals**2).sum(axis=0) / freedom), SIGMA_FLOOR)
+    freedom = max(np.count_nonzero(good) - np.linalg.matrix_rank(design[good]), 1)
+    sigma = np.maximum(np.sqrt((residuals[good] ** 2).sum(axis=0) / freedom), SIGMA_FLOOR)
     relative = np.exp(answer[: len(seen)])
     mean = relative.mean(axis=0)
     intensity = np.full((len(lights_mm), relative.shape[1]), np.nan)
@@ -160,6 +170,29 @@ def fit_intensity(
     return IntensityFit(
         intensity, 1 / (mean * np.exp(steps)), exponent, exponent_se, covariance, moved, sigma, residuals, numbers
     )
+
+
+def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_]:
+    """Which photographs (R,) agree with the others; the one that is furthest off leaves first, as it draws its light's others with it.
+
+    Args:
+        design: which light and camera each shows (R, P).
+        logs: logarithms of the slopes (R, C).
+    """
+    brightness, good = logs.mean(axis=1), np.ones(len(logs), dtype=bool)
+    for _ in range(int(MAX_WRONG_SHARE * len(logs))):
+        hat = design[good] @ np.linalg.pinv(design[good])
+        # By the others' fit: a photograph whose leverage is near 1 tells its light alone, and nothing contradicts it.
+        left = 1 - np.diag(hat)
+        off = np.where(
+            left > MIN_FREEDOM, (brightness[good] - hat @ brightness[good]) / np.maximum(left, MIN_FREEDOM), 0.0
+        )
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(off)))
+        worst = int(np.argmax(np.abs(off)))
+        if abs(off[worst]) <= max(WRONG_SIGMAS * scatter, MIN_WRONG):
+            break
+        good[np.flatnonzero(good)[worst]] = False
+    return good
 
 
 def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: int) -> Floats:

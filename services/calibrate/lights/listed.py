@@ -20,6 +20,8 @@ NOISE_FLOOR_MM = 0.5
 OUTLIER_SIGMAS = 5.0
 MIRRORED_TIMES = 5.0
 """Lights in one plane fit as well mirrored; a right-handed list never fits five times better so."""
+MIN_OUTLIER_MM = 20.0
+"""Of a list measured by hand coordinates are off by some 4 mm, so nearer lights lie where they are listed, however well few lights fit."""
 MAD_OF_DISTANCES = 1.538
 """Of the length of a vector with three normal coordinates: its median is 1.538 σ."""
 
@@ -63,7 +65,7 @@ def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
     turned_over = source * [-1.0, 1.0, 1.0]
     distances = np.full(len(listed_mm), np.nan)
     distances[known] = off
-    bad = np.flatnonzero(np.nan_to_num(distances) > OUTLIER_SIGMAS * sigma)
+    bad = np.flatnonzero(np.nan_to_num(distances) > max(OUTLIER_SIGMAS * sigma, MIN_OUTLIER_MM))
     return AlignedList(
         positions_mm=_moved(motion, listed_mm),
         sigma_mm=sigma,
@@ -95,7 +97,7 @@ def _scale(source: Floats, target: Floats) -> float:
 
 def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:
     """Pairs (a, b) of outliers where light a was found where the list has b, within the list's own scatter."""
-    limit = OUTLIER_SIGMAS * aligned.sigma_mm
+    limit = max(OUTLIER_SIGMAS * aligned.sigma_mm, MIN_OUTLIER_MM)
     pairs = []
     for one in aligned.outliers:
         off = np.linalg.norm(aligned.positions_mm - found_mm[one], axis=1)

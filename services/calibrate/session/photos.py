@@ -50,7 +50,7 @@ class Channels:
 
     def centres(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Pixels (N, 2) of the photograph at the centres of values."""
-        return np.stack([columns + 0.5, rows + 0.5], axis=1) * self.pixel + np.array(self.first_px)
+        return np.asarray(np.stack([columns + 0.5, rows + 0.5], axis=1) * self.pixel + np.array(self.first_px))
 
 
 class Photos:

@@ -234,6 +234,6 @@ def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensitySte
     for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
         photo = intensity.photos[intensity.fit.used[number]]
         yield (
-            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is {100 * off[number]:+.0f} % off: "
+            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is {100 * np.expm1(off[number]):+.0f} % off: "
             "another light was on, or its exposure, gain or level is not what raw.toml says."
         )
