@@ -32,37 +32,47 @@ def altered(mouth: RawMouth, root: Path, change: Tree) -> Path:
     return root
 
 
-def errors(record: Registration, mouth: RawMouth) -> tuple[float, float]:
-    # Degrees and millimetres about the teeth's centre.
+def twist_to_truth(record: Registration, mouth: RawMouth) -> np.ndarray:
+    # About the teeth's centre.
     pose = np.array(record.rig_from_scan)
-    twist = RigidPose(pose[:3, :3], pose[:3, 3]).twist_to(mouth.rig_from_scan, np.array(record.centre_mm))
-    return float(np.degrees(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
+    return RigidPose(pose[:3, :3], pose[:3, 3]).twist_to(mouth.rig_from_scan, np.array(record.centre_mm))
+
+
+def require_near(record: Registration, mouth: RawMouth) -> None:
+    # Six front teeth beside others that the scan does not have: the design's target of 0.05 mm. Few teeth leave the tilt open by more
+    # than its 0.1 degrees, which the record has to say: all six parts within 22.5, what one draw in a thousand exceeds (chi squared).
+    twist = twist_to_truth(record, mouth)
+    assert np.linalg.norm(twist[3:]) < 0.05
+    assert twist @ np.linalg.solve(record.uncertainty.matrix, twist) < 22.5
+    # A record that says that nothing is known would pass the last line.
+    assert np.sqrt(np.diag(record.uncertainty.matrix)[3:]).max() < 0.05
+    assert np.degrees(np.sqrt(np.diag(record.uncertainty.matrix)[:3])).max() < 0.3
 
 
 @pytest.mark.slow
 def test_a_whole_arch_meets_the_target(tmp_path: Path) -> None:
     mouth = write_raw_mouth(tmp_path, places=7)
     record = register_folder(tmp_path)
-    turn_deg, move_mm = errors(record, mouth)
+    twist = twist_to_truth(record, mouth)
     # The target of the design.
-    assert move_mm < 0.05
-    assert turn_deg < 0.1
+    assert np.linalg.norm(twist[3:]) < 0.05
+    assert np.degrees(np.linalg.norm(twist[:3])) < 0.1
     assert record.misfit_mm < 0.1
 
 
 @pytest.mark.slow
-def test_another_persons_scan_is_refused_and_ones_own_is_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", range(20))
+def test_another_persons_scan_is_refused_and_ones_own_is_not(tmp_path: Path, seed: int) -> None:
     # Subjects that no threshold was looked at with; the operator clicks the same points of the wrong person's teeth.
-    for seed in range(20):
-        own = write_raw_mouth(_made(tmp_path / f"own{seed}"), 300 + seed, seed, places=7)
-        other = write_raw_mouth(_made(tmp_path / f"other{seed}"), 400 + seed, 50 + seed, places=7)
-        register_folder(own.root)
-        points = {(one["tooth"], one["point"]): one["xyz_mm"] for one in other.tree["landmark"]}
-        exchanged = [one | {"xyz_mm": points[one["tooth"], one["point"]]} for one in own.tree["landmark"]]
-        shutil.copy(other.root / "scan.ply", own.root / "scan.ply")
-        root = altered(own, tmp_path / f"wrong{seed}", {"landmark": exchanged})
-        with pytest.raises(CaptureInputError, match=r"refused_c0\.png"):
-            register_folder(root)
+    own = write_raw_mouth(_made(tmp_path / "own"), 300 + seed, seed, places=7)
+    other = write_raw_mouth(_made(tmp_path / "other"), 400 + seed, 50 + seed, places=7)
+    register_folder(own.root)
+    points = {(one["tooth"], one["point"]): one["xyz_mm"] for one in other.tree["landmark"]}
+    exchanged = [one | {"xyz_mm": points[one["tooth"], one["point"]]} for one in own.tree["landmark"]]
+    shutil.copy(other.root / "scan.ply", own.root / "scan.ply")
+    root = altered(own, tmp_path / "wrong", {"landmark": exchanged})
+    with pytest.raises(CaptureInputError, match=r"refused_c0\.png"):
+        register_folder(root)
 
 
 def _made(folder: Path) -> Path:
@@ -83,10 +93,7 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     assert all((out / name).is_file() for name in record.pictures)
     assert len(record.pictures) == 3
 
-    # Six front teeth beside others that the scan does not have: 0.10 mm were measured, twice the target, which whole arches meet.
-    turn_deg, move_mm = errors(record, mouth)
-    assert move_mm < 0.2
-    assert turn_deg < 0.2
+    require_near(record, mouth)
     # In the rig's frame, where single precision holds 4e-6 mm.
     vertices = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(out)])
     np.testing.assert_allclose(vertices.mean(axis=0), record.centre_mm, atol=1e-3)
@@ -99,9 +106,7 @@ def test_a_scan_without_labels_is_parted_by_its_landmarks(tmp_path: Path) -> Non
     assert record.teeth == (11, 12, 13, 21, 22, 23)
     assert record.repairs.startswith("Teeth parted along creases about landmarks of 6 teeth.")
     # As with labels: the parts differ at necks and contacts alone.
-    turn_deg, move_mm = errors(record, bare)
-    assert move_mm < 0.2
-    assert turn_deg < 0.2
+    require_near(record, bare)
 
     write_toml(tmp_path, bare.tree | {"landmark": [one for one in bare.tree["landmark"] if one["tooth"] == 11]})
     shutil.rmtree(tmp_path / "teeth")

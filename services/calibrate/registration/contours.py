@@ -32,6 +32,8 @@ class Contour:
     """(N,) number of the tooth."""
     between: NDArray[np.bool_]
     """(N,) whether another tooth is on the other side."""
+    gums: NDArray[np.bool_]
+    """(N,) whether an occluder, which gums are, is there."""
 
 
 def tooth_contours(
@@ -44,7 +46,7 @@ def tooth_contours(
     label, depth = seen_surfaces(camera, [*teeth, *occluders])
     teeth_alone = np.where(label < len(teeth), label, NOTHING).astype(np.int16)
     parts = [_steps(label, depth, teeth_alone, axis) for axis in (0, 1)]
-    x, y, nearer, tooth, between = (np.concatenate([part[k] for part in parts]) for k in range(5))
+    x, y, nearer, tooth, between, gums = (np.concatenate([part[k] for part in parts]) for k in range(6))
     outward = np.zeros((len(x), 2))
     for number in np.unique(tooth):
         own = tooth == number
@@ -54,13 +56,15 @@ def tooth_contours(
     along = direction @ np.asarray(camera.camera_from_world)[2, :3]
     points = origin + direction * (nearer / along)[:, None]
     good = np.isfinite(outward).all(axis=1)
-    contour = Contour(points[good], np.stack([x, y], axis=1)[good], outward[good], tooth[good], between[good])
+    contour = Contour(
+        points[good], np.stack([x, y], axis=1)[good], outward[good], tooth[good], between[good], gums[good]
+    )
     return contour, teeth_alone
 
 
 def _steps(
     label: NDArray[np.int16], depth: Floats, teeth: NDArray[np.int16], axis: int
-) -> tuple[Floats, Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]:
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
     # Pairs of neighbouring pixels of which one or both see a tooth, and not the same thing.
     low = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
     high = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
@@ -73,7 +77,8 @@ def _steps(
     x = column + (0.5 if axis == 0 else 1.0)
     y = row + (1.0 if axis == 0 else 0.5)
     nearer = np.minimum(depth_one, depth_two).astype(np.float64)
-    return x.astype(np.float64), y.astype(np.float64), nearer, own.astype(np.int64), between
+    gums = np.maximum(label[low][row, column], label[high][row, column]) > teeth.max()
+    return x.astype(np.float64), y.astype(np.float64), nearer, own.astype(np.int64), between, gums
 
 
 def _outward(mask: NDArray[np.bool_], x: Floats, y: Floats) -> Floats:

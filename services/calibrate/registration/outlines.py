@@ -37,6 +37,9 @@ MIN_FOUND = 0.3
 """Share of the outlines' points that must find an edge; lips and retractor hide some."""
 SECTORS = 6
 """Parts of a tooth's outline whose errors are taken to be of one piece, for the covariance."""
+SHIFT_PX = 0.15
+"""Standard error of what all outlines beside the same thing, gums or nothing or another tooth, are shifted by in all photographs: a pixel
+that shows both is liker to one. On phantoms at their true pose medians were 0.01 px beside gums and 0.14 px beside nothing, as rms."""
 
 
 @dataclass(frozen=True)
@@ -222,20 +225,24 @@ def _sandwich(
     views: Sequence[View], found: Sequence[Found], centre_mm: Floats, normal: Floats, prior: Floats
 ) -> Floats:
     # Errors along one part of an outline go together, so scores are summed over it before they are squared (cluster-robust).
-    middle, count = prior.copy(), 0
+    middle, count, shifts = prior.copy(), 0, np.zeros((3, 6))
     for view, one in zip(views, found, strict=True):
         jacobian, residual, weight, _ = _equations(view.camera, one, centre_mm)
         angle = np.arctan2(one.contour.outward[:, 1], one.contour.outward[:, 0])
         cluster = (
             one.contour.tooth * SECTORS + np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
         )
+        beside = np.where(one.contour.between, 2, one.contour.gums.astype(np.int64))
+        for kind in range(len(shifts)):
+            shifts[kind] += SHIFT_PX * weight[beside == kind] @ jacobian[beside == kind]
         for number in np.unique(cluster):
             own = cluster == number
             score = (weight[own] * residual[own]) @ jacobian[own]
             middle += np.outer(score, score)
             count += 1
     inverse = np.linalg.inv(normal)
-    return np.asarray(max(count, 7) / (max(count, 7) - 6) * inverse @ middle @ inverse)
+    scattered = max(count, 7) / (max(count, 7) - 6) * middle
+    return np.asarray(inverse @ (scattered + shifts.T @ shifts) @ inverse)
 
 
 def _require_edges(found: Sequence[Found]) -> None:

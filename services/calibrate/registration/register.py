@@ -32,7 +32,7 @@ FARTHEST_LANDMARK_MM = 2.0
 REACH_MM = 1.5
 """How far outlines are looked for at first: clicks leave a pose open by less."""
 MAX_MISFIT_MM = 0.10
-"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.06 mm in a
+"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.05 mm in a
 calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
 
 
