@@ -166,7 +166,9 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
 
 
 def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
-    truth, options = (1.0, 0.0, 1.0), {"dentin": "fit", "max_steps": 5, "search_candidates": 400}
+    truth: tuple[float, ...] = (1.0, 0.0, 1.0)
+    # This engine's renders are so noisy that they drown what the instrument's errors leave to tell of a shape; test_jaw_instrument.py fits those.
+    options: dict[str, Any] = {"dentin": "fit", "max_steps": 5, "search_candidates": 400, "instrument": "off"}
     write_prepared_jaw(tmp_path, FAKE, (11, 12, 21), hidden=(21,), shape=truth, noise=0.003, samples=20_000)
     report = fit(tmp_path, **options)
     for fdi in ("11", "12"):
