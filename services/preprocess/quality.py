@@ -14,6 +14,10 @@ from services.core.records import MaskBit
 from services.preprocess.source import Image
 
 PICTURE_PX = 480
+STOPS = 10
+"""Factors of two below an image's brightest pixel that are told apart: a sensor of 12 bits resolves the tenth."""
+SHOWN_PIXELS = 200_000
+"""Of an image, for medians."""
 # Blue, green, red: highlights red, saturated yellow, moved violet, not finite cyan, shadow blue, unlit grey, by hand green
 COLOURS = {
     MaskBit.HIGHLIGHT: (60, 60, 230),
@@ -38,6 +42,10 @@ class ImageQuality(Record):
     valid_pixels: int
     valid_by_tooth: dict[int, int] = Field(default={}, description="FDI number -> valid pixels that show the tooth")
     masked: dict[str, float] = Field(description="mask bit -> fraction of the tooth pixels")
+    levels: tuple[int, ...] = Field(description="tooth pixels with a value in each stop below the brightest of them")
+    noise: tuple[float | None, ...] = Field(
+        description="median standard deviation of a pixel, relative to it, in each stop; null where there is none"
+    )
 
 
 class QualityReport(Record):
@@ -53,8 +61,13 @@ def assess(
     covered: NDArray[np.bool_],
     motion_px: float | None,
     motion_error_px: float | None = None,
+    stops: tuple[tuple[int, ...], tuple[float | None, ...]] = ((0,) * STOPS, (None,) * STOPS),
 ) -> ImageQuality:
-    """Count what was masked among the tooth's pixels."""
+    """Count what was masked among the tooth's pixels.
+
+    Args:
+        stops: of ``by_stop``.
+    """
     pixels = int(np.count_nonzero(covered))
     # How many pixels have each combination of bits
     counts = np.bincount(bits[covered], minlength=1)
@@ -71,8 +84,32 @@ def assess(
         motion_error_px=motion_error_px,
         tooth_pixels=pixels,
         valid_pixels=int(np.count_nonzero(bits == 0)),
+        levels=stops[0],
+        noise=stops[1],
         masked={name: share for name, share in masked.items() if share > 0},
     )
+
+
+def by_stop(
+    radiance: Image, variance: Image, chosen: NDArray[np.bool_]
+) -> tuple[tuple[int, ...], tuple[float | None, ...]]:
+    """How many pixels lie in each stop below the brightest, and their median relative noise; by means of channels.
+
+    Args:
+        radiance, variance: (H, W, C). chosen: (H, W) pixels that have a value.
+    """
+    step = max(1, int(np.sqrt(chosen.size / SHOWN_PIXELS)))
+    few = chosen[::step, ::step]
+    value = radiance[::step, ::step][few].mean(axis=-1, dtype=np.float64)
+    noise = np.sqrt(variance[::step, ::step][few].sum(axis=-1, dtype=np.float64)) / radiance.shape[-1]
+    lit = value > 0
+    if not lit.any():
+        return (0,) * STOPS, (None,) * STOPS
+    value, noise = value[lit], noise[lit]
+    stop = np.minimum(np.log2(value.max() / value).astype(int), STOPS - 1)
+    counts = np.bincount(stop, minlength=STOPS) * step**2
+    medians = [float(np.median((noise / value)[stop == k])) if counts[k] else None for k in range(STOPS)]
+    return tuple(counts.tolist()), tuple(medians)
 
 
 def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:

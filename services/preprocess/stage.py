@@ -10,7 +10,7 @@ from services.core.records import JobSpec, PreparedManifest
 from services.core.stage import StageContext
 from services.core.store import StageWriter
 
-PACKAGES = ("cv2", "imagecodecs", "rtree", "tifffile")
+PACKAGES = ("cv2", "imagecodecs", "jinja2", "rtree", "tifffile")
 """What the extra ``preprocess`` brings, by the names under which it is imported."""
 
 

@@ -130,7 +130,15 @@ def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: 
     write_picture(picture, _read(workshop, view, "radiance", light), bits)
     covered, error_px = view.footprint.covered, quality.motion_error_px
     changed = {
-        "quality": assess(quality.camera, quality.light, bits, covered, quality.motion_px, error_px),
+        "quality": assess(
+            quality.camera,
+            quality.light,
+            bits,
+            covered,
+            quality.motion_px,
+            error_px,
+            (quality.levels, quality.noise),
+        ),
         "tooth_pixels": tuple(subject.pixels_of_teeth(view.footprint, bits).tolist()),
         "files": workshop.files_of(camera, light, picture),
         "shaded": True,

@@ -23,13 +23,15 @@ from services.preprocess.masking.masks import HandMasks
 from services.preprocess.masking.shade import shade
 from services.preprocess.masking.valid import require_seen, valid_bits
 from services.preprocess.opening import open_source
-from services.preprocess.quality import assess, write_picture
+from services.preprocess.quality import assess, by_stop, write_picture
 from services.preprocess.source import Bits, LightImage, Source, View
 from services.preprocess.stabilisation.motion import stored_step
 from services.preprocess.subject import NOTHING, Subject, read_subject
 from services.preprocess.tasks.records import FrameMotion, ImageDone
 from services.preprocess.tasks.workshop import Workshop
 
+NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
+"""Pixels that tell nothing of an image's levels and noise."""
 Step = Literal["look", "match", "develop", "shade"]
 BLOCKS_PER_THREAD = 4
 """So many blocks for each thread leave none without work for long at the end."""
@@ -144,8 +146,11 @@ class Desk:
         self.store_masked(light, image, bits)
         picture = self.workshop.folder / "quality" / f"{camera.name}_{lamp.name}.png"
         write_picture(picture, image.radiance, bits)
+        valued = footprint.covered & (bits & NO_VALUE == 0)
+        stops = by_stop(image.radiance, image.variance, valued)
+        moved = image.motion_px, image.motion_error_px
         return ImageDone(
-            quality=assess(camera.name, lamp.name, bits, footprint.covered, image.motion_px, image.motion_error_px),
+            quality=assess(camera.name, lamp.name, bits, footprint.covered, *moved, stops),
             tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
             light=shown,
             colour=image.colour,

@@ -15,6 +15,7 @@ from services.core.store import write_record
 from services.preprocess.brightness import Brightness
 from services.preprocess.colours import require_like_colours
 from services.preprocess.quality import QualityReport, unusable_note
+from services.preprocess.quality_page import write_page
 from services.preprocess.source import Source
 from services.preprocess.subject import Subject
 from services.preprocess.tasks.records import ImageDone
@@ -70,6 +71,7 @@ def summarise(
         for done in images
     )
     write_record(workshop.folder / "quality.json", QualityReport(images=covered))
+    write_page(workshop.folder, covered, notes)
     _copy_meshes(source.root, workshop.folder, fdi)
     # What a kill has left of a file that was being written
     for partial in workshop.folder.rglob("*.partial"):

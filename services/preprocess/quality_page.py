@@ -1,0 +1,81 @@
+"""A page about a prepared capture: motion, coverage, levels, noise and every image with what is masked in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from services.core.page import page_template
+from services.core.store import write_atomic
+from services.preprocess.quality import STOPS, ImageQuality
+
+TEMPLATE = Path(__file__).parent / "quality.html.j2"
+WIDTH, HEIGHT = 320, 120
+"""Of a chart, in pixels."""
+
+
+@dataclass(frozen=True)
+class CameraPage:
+    """What the page says of one camera.
+
+    Attributes:
+        motion: by image the motion in pixels that was taken out, and how wrong it may be; None where nothing tells.
+        coverage: by tooth its FDI number and by image the share of its valid pixels in the image that shows most of it.
+        levels: by stop below each image's brightest pixel the share of all teeth's pixels, and the bar's height.
+        noise: SVG points of relative noise by stop, and the largest, per cent.
+    """
+
+    name: str
+    images: tuple[ImageQuality, ...]
+    motion: tuple[tuple[str, float | None, float | None], ...]
+    coverage: tuple[tuple[int, tuple[float, ...]], ...]
+    levels: tuple[tuple[float, float], ...]
+    noise: str
+    most_noise: float
+
+
+def write_page(folder: Path, images: Sequence[ImageQuality], notes: Sequence[str]) -> None:
+    """Write ``quality/index.html`` beside the pictures.
+
+    Args:
+        folder: of the stage.
+        notes: sentences the operator should read first.
+    """
+    cameras = [_page_of(name, images) for name in dict.fromkeys(image.camera for image in images)]
+    text = page_template(TEMPLATE).render(cameras=cameras, notes=notes, width=WIDTH, height=HEIGHT, stops=STOPS)
+    write_atomic(folder / "quality" / "index.html", text.encode())
+
+
+def _page_of(name: str, images: Sequence[ImageQuality]) -> CameraPage:
+    own = tuple(image for image in images if image.camera == name)
+    levels = np.sum([image.levels for image in own], axis=0, dtype=float)
+    share = levels / max(levels.sum(), 1)
+    noise = [_median([image.noise[stop] for image in own]) for stop in range(STOPS)]
+    most = max((value for value in noise if value is not None), default=0.0)
+    points = " ".join(
+        f"{(stop + 0.5) * WIDTH / STOPS:.1f},{HEIGHT * (1 - value / most):.1f}"
+        for stop, value in enumerate(noise)
+        if value is not None and most > 0
+    )
+    return CameraPage(
+        name=name,
+        images=own,
+        motion=tuple((image.light, image.motion_px, image.motion_error_px) for image in own),
+        coverage=tuple((fdi, _coverage(own, fdi)) for fdi in own[0].valid_by_tooth),
+        levels=tuple((float(one), float(HEIGHT * one / max(share.max(), 1e-9))) for one in share),
+        noise=points,
+        most_noise=100 * most,
+    )
+
+
+def _coverage(images: Sequence[ImageQuality], fdi: int) -> tuple[float, ...]:
+    counts = [image.valid_by_tooth[fdi] for image in images]
+    return tuple(count / max(*counts, 1) for count in counts)
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
