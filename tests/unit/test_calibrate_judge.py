@@ -31,7 +31,7 @@ def cameras() -> CamerasStep:
 
 
 def folder(*channels: str) -> RawFolder:
-    return cast("RawFolder", SimpleNamespace(channels=channels, light=()))
+    return cast("RawFolder", SimpleNamespace(channels=channels, light=(), frame=()))
 
 
 def lights() -> LightsStep:
@@ -39,10 +39,10 @@ def lights() -> LightsStep:
     fit = SimpleNamespace(
         lights=np.array([0]), covariance=0.01 * np.eye(3), positions_mm=np.zeros((1, 3)), edge_shifts_px=(), outliers=()
     )
-    return cast("LightsStep", SimpleNamespace(fit=fit, no_highlight=(), aligned=None))
+    return cast("LightsStep", SimpleNamespace(fit=fit, views=(), view_names=(), no_highlight=(), aligned=None))
 
 
-INTENSITY = cast("IntensityStep", object())
+INTENSITY = cast("IntensityStep", SimpleNamespace(fit=SimpleNamespace(residuals=np.zeros((4, 1)), used=range(4))))
 
 
 def test_a_chart_is_advised_for_three_channels_alone(cameras: CamerasStep) -> None:
