@@ -112,14 +112,14 @@ def manifest(lights: int) -> PreparedManifest:
 def test_a_jaw_under_many_lights_knows_their_common_gain_alone_and_says_so() -> None:
     spec = JobSpec.model_validate({"kind": "jaw", "capture": "c"})
     for count, told in ((MAX_JAW_LIGHTS, False), (MAX_JAW_LIGHTS + 1, True)):
-        instrument = instrument_of(manifest(count), spec)
+        instrument = instrument_of(manifest(count), spec, np.zeros(3))
         assert instrument is not None
         errors = instrument.errors("green", ("c0",), np.ones(count, dtype=bool))
         assert ("light_gain.l0" in errors.names) is not told
         assert {"gain.green", "flare.c0.green"} <= set(errors.names)
         said = " ".join(instrument_sentences(spec, {"green": errors}, {}, ()))
         assert ("single lights for as bright" in said) is told
-    tooth = instrument_of(manifest(count), spec.model_copy(update={"kind": "tooth"}))
+    tooth = instrument_of(manifest(count), spec.model_copy(update={"kind": "tooth"}), np.zeros(3))
     assert tooth is not None
     assert len(tooth.errors("green", ("c0",), np.ones(count, dtype=bool)).names) == count + 2
-    assert instrument_of(manifest(2), spec.model_copy(update={"instrument": "off"})) is None
+    assert instrument_of(manifest(2), spec.model_copy(update={"instrument": "off"}), np.zeros(3)) is None

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from services.bench.lab import run
 from services.bench.lab.comparison import QUANTITIES, Measured, Outcome, outcome, step_errors, verdict
 from services.bench.lab.known import VARIANTS, session_from_scan, true_calibration, write_variant
+from services.bench.lab.report import lines, write_summary
 from services.core.calibration.record import Calibration
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.files.meshes import read_teeth, write_mesh
 from services.core.geometry import teeth_folder
 from services.core.raw.registration import Registration
+from services.core.records import JobSpec
 from services.core.store import read_record, write_record
 from services.phantom.files import medium_truth
 from services.phantom.lab.make import LabRecord
@@ -154,3 +157,41 @@ def test_what_is_asked_is_judged_figure_by_figure() -> None:
     assert sum(kept.values()) == 8
     assert asked["enamel.sigma_a: distance from the truth in ±"][0] == pytest.approx(2.5)
     assert asked["dentin.sigma_a: ± over that with perfect calibration and pose"][0] == pytest.approx(2.0)
+
+
+def test_what_is_done_is_kept_and_all_jobs_end_in_one_page(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_found(lab)
+    ran: list[tuple[JobSpec, Path]] = []
+
+    def fake_job(spec: JobSpec, out: Path, _view: object, _workers: int | None) -> None:
+        ran.append((spec, out))
+        out.mkdir(parents=True, exist_ok=True)
+        table = {name: {"value": 1.0, "se": 0.5} for name in QUANTITIES}
+        (out / "parameters.json").write_text(json.dumps({"green": table}))
+        error = 0.05 if spec.instrument == "on" else 0.04
+        errors = {
+            "held_out_error": {"green": error},
+            "fit_error": {"green": error},
+            "converged": spec.instrument == "on",
+        }
+        (out / "errors.json").write_text(json.dumps(errors))
+
+    monkeypatch.setattr(run, "run_job", fake_job)
+    told = run.measured(lab, 0.13, ["perfect", "true pose"], None, print)
+    write_summary(lab, told)
+    assert "cameras: boards" not in capsys.readouterr().out
+    specs = [spec for spec, _ in ran]
+    assert [spec.capture for spec in specs] == [
+        lab / "mouth", lab / "comparison" / "perfect" / "mouth", lab / "comparison" / "true-pose" / "mouth"
+    ]  # fmt: skip
+    assert [spec.instrument for spec in specs] == ["on", "off", "on"]
+    assert {(spec.fdi, spec.pixel_step, spec.dentin) for spec in specs} == {(11, 4, "fit")}
+    asked = told["asked"]["held-out error over that with perfect calibration and pose"]
+    assert asked["value"] == pytest.approx(1.25)
+    assert asked["kept"]
+    page = (lab / "summary.html").read_text()
+    assert "perfect, not converged" in page
+    assert page.count("<tr>") == 1 + 3 + 1 + 9 + 6
+    assert any("off the truth: teeth, mm 0.05" in line for line in lines(told))

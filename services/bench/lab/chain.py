@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from services.calibrate.registration.register import register_folder
+from services.calibrate.registration.register import MAX_MISFIT_MM, register_folder
 from services.calibrate.session.report import write_report
 from services.calibrate.session.run import CALIBRATION as CALIBRATION_FILE
 from services.calibrate.session.run import calibrate, write_session
@@ -30,7 +30,6 @@ COARSE: Mapping[str, Any] = MappingProxyType(
         "max_samples_per_pixel": 64,
         "max_steps": 3,
         "search_candidates": 2000,
-        "accept_calibration": True,
     }
 )
 """Options of a first look."""
@@ -44,21 +43,23 @@ def calibrated(root: Path, tell: Callable[[str], None]) -> None:
     if (out / CALIBRATION_FILE).is_file():
         return
     session = calibrate(root / SESSION, tell)
+    out.mkdir(parents=True, exist_ok=True)
+    # The record is written last: where it is, all is.
     write_report(session, out)
     write_session(session, out)
     for limit in session.judgement.broken:
         tell(f"{limit.what}: {limit.value:.3g} {limit.unit} is beyond its limit of {limit.limit:g}")
 
 
-def registered(root: Path, tell: Callable[[str], None]) -> Registration:
-    """Find where the scan's teeth stand, unless that is done."""
+def registered(root: Path, pixel_mm: float, tell: Callable[[str], None]) -> Registration:
+    """Find where the scan's teeth stand, unless that is done; outlines of coarse pixels may lie as far off as one of them."""
     folder = root / MOUTH
     if (folder / REGISTRATION).is_file():
         return read_record(folder / REGISTRATION, Registration)
     # Teeth without a record are those of an attempt that was ended.
     shutil.rmtree(folder / "teeth", ignore_errors=True)
     tell("registration: landmarks, outlines")
-    return register_folder(folder)
+    return register_folder(folder, max_misfit_mm=max(MAX_MISFIT_MM, pixel_mm))
 
 
 def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpec:
@@ -77,6 +78,8 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         "channels": ("green",),
         "pixel_step": max(round(PIXELS_MM / pixel_mm), 1),
         "advise": False,
+        # So small a rig's images leave the lights' distances open to a centimetre, which their light at the teeth hardly shows.
+        "accept_calibration": True,
     }
     return JobSpec.model_validate(told | dict(options))
 

@@ -37,7 +37,7 @@ def measured(
     """
     options = COARSE if coarse else {}
     calibrated(root, tell)
-    registered(root, tell)
+    registered(root, pixel_mm, tell)
     tell("job: preparation and fit")
     _run(job_of(root / MOUTH, pixel_mm, options), root / JOB, workers)
     jobs = {}

@@ -19,7 +19,7 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.raw.frames import read_counts
 from services.core.raw.mosaic import binned
-from services.core.raw.records import RawFolder, RawFrame
+from services.core.raw.records import RawCamera, RawFolder, RawFrame
 
 WIDEST_PX = 2400
 """Photographs are made smaller than this before anything else: a pixel is then some 0.05 mm at the teeth."""
@@ -52,14 +52,14 @@ def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict
     return views
 
 
-def clicks_of(folder: RawFolder, calibration: Calibration) -> list[Click]:
-    """Landmarks of a raw folder, their pixels as a lens without distortion would have them."""
+def clicks_of(folder: RawFolder, calibration: Calibration, views: Mapping[str, View]) -> list[Click]:
+    """Landmarks of a raw folder, their pixels in the views: without distortion, and as small as these were made."""
     clicks = []
     for landmark in folder.landmark:
         for seen in landmark.pixels:
             camera = _calibrated(calibration, seen.camera, folder.camera_named(seen.camera).size)
             direction = _lens(camera).undistort(np.array([seen.xy_px], dtype=np.float64))
-            pixel = direction @ np.asarray(camera.K).T
+            pixel = direction @ np.asarray(views[seen.camera].camera.K).T
             name = f"{landmark.tooth} {landmark.point}"
             clicks.append(Click(name, seen.camera, np.array(landmark.xyz_mm), pixel[0, :2] / pixel[0, 2]))
     return clicks
@@ -145,15 +145,24 @@ def _black_counts(root: Path, folder: RawFolder, name: str, camera: CalibratedCa
 
 def _image(root: Path, folder: RawFolder, frame: RawFrame, black: float) -> NDArray[np.float32]:
     counts: NDArray[Any] = read_counts(root, folder, frame)
-    mosaic = folder.camera_named(frame.camera).mosaic
-    image = binned(counts, mosaic) if mosaic != "none" else counts.astype(np.float32)
+    camera = folder.camera_named(frame.camera)
+    image = counts.astype(np.float32) if camera.mosaic == "none" else _colours(counts, camera)
     return np.asarray((_with_channels(image) - black) / (frame.exposure_s * frame.gain), dtype=np.float32)
+
+
+def _colours(counts: NDArray[Any], camera: RawCamera) -> NDArray[np.float32]:
+    """A mosaic's image (H, W, 3), interpolated; of half the size where that leaves as many pixels as are looked at."""
+    import cv2
+
+    if camera.size[0] >= 2 * WIDEST_PX:
+        return binned(counts, camera.mosaic)
+    return np.asarray(cv2.cvtColor(counts, getattr(cv2, f"COLOR_Bayer{camera.mosaic}2RGB")), dtype=np.float32)
 
 
 def _undistorted(image: NDArray[np.float32], camera: CalibratedCamera) -> View:
     import cv2
 
-    # Made small first, which for a mosaic it is already by half.
+    # Made small first.
     scale = min(image.shape[1], WIDEST_PX) / image.shape[1]
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     small = image if scale == 1 else _with_channels(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

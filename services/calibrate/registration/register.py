@@ -79,7 +79,8 @@ def register_folder(
         )
     calibration_path, calibration = _calibration(root, folder, calibration_file)
     scanned = scanned_teeth(root, folder)
-    views, clicks = photographs(root, folder, calibration), clicks_of(folder, calibration)
+    views = photographs(root, folder, calibration)
+    clicks = clicks_of(folder, calibration, views)
     require_on_their_teeth(clicks, scanned)
     steps, cut, misfit_mm = _registered(views, clicks, scanned, refused or out / PICTURES, max_misfit_mm)
 

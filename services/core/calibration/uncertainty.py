@@ -12,8 +12,9 @@ light.LIGHT.x, .y, .z          one light moved                                  
 =============================  ===========================================================  ==================
 
 AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), in the world's axes; teeth turn about the mean of their vertices,
-the dome about the mean of its lights. Moves of single cameras and lights are read and checked, and no fit uses them yet. The
-brightest pixel of a camera is the greatest radiance among its valid pixels in that channel, over all its photographs.
+the dome about the mean of its lights. Moves of single cameras are read and checked, and no fit uses them yet; of single lights'
+moves a tooth's fit uses, with light_gain, what they do to the light's irradiance at the teeth. The brightest pixel of a camera is
+the greatest radiance among its valid pixels in that channel, over all its photographs.
 """
 
 from __future__ import annotations

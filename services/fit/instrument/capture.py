@@ -13,6 +13,7 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec, PreparedManifest
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
+from services.fit.instrument.irradiance import at_the_teeth
 from services.fit.instrument.moves import Move, move_covariance, write_moves
 from services.fit.transport.scene.recipe import SceneRecipe
 
@@ -57,11 +58,18 @@ class Instrument:
         return [name for name, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
 
 
-def instrument_of(manifest: PreparedManifest, spec: JobSpec) -> Instrument | None:
-    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not know it."""
+def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64]) -> Instrument | None:
+    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not know it.
+
+    Args:
+        manifest: of what was prepared.
+        spec: the job.
+        teeth_mm: centre of the teeth (3,).
+    """
     if spec.instrument == "off" or spec.solver == "adam":
         return None
     positions = np.array([light.position_mm for light in manifest.lights])
     names = tuple(light.name for light in manifest.lights)
     most = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
-    return Instrument(names, manifest.uncertainty, tuple(positions.mean(axis=0).tolist()), most)
+    stated = at_the_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
+    return Instrument(names, stated, tuple(positions.mean(axis=0).tolist()), most)

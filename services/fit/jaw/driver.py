@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
@@ -73,7 +75,8 @@ class JawDriver:
                 attempt.log(
                     f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh."
                 )
-        channels, instrument = [], instrument_of(observations.manifest, spec)
+        centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
+        channels, instrument = [], instrument_of(observations.manifest, spec, centre_mm)
         for name in spec.channels or observations.manifest.channels:
             views = label_views(read_channel(observations, name, spec), observations)
             channels.append(

@@ -70,7 +70,7 @@ class FitDriver:
             )
             for channel in channels
         }
-        instrument = instrument_of(observations.manifest, spec)
+        instrument = instrument_of(observations.manifest, spec, tooth.outer.vertices_mm.mean(axis=0))
         files = {
             channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss, instrument)
             for channel in channels

@@ -1,0 +1,78 @@
+"""What is wrong with the lights' brightness where the teeth are, of intensities and distances that err together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.geometry import Light
+from services.fit.instrument.irradiance import DRIFT, at_the_teeth
+
+CHANNELS = ("red",)
+LIGHTS = tuple(
+    Light(name=name, position_mm=place, intensity=(intensity,))
+    for name, place, intensity in (
+        ("a", (0.0, 1000.0, 0.0), 1.2),
+        ("b", (600.0, 800.0, 0.0), 0.8),
+        ("c", (-300.0, 700.0, 500.0), 1.0),
+    )
+)
+PLACES_MM = np.array([light.position_mm for light in LIGHTS])
+INTENSITY = np.array([light.intensity[0] for light in LIGHTS])
+TEETH_MM = np.zeros(3)
+MEASURED = 0.003
+"""Scatter of one light on the white sphere, relative."""
+NAMES = ("gain.red", *(f"light_gain.{light.name}.red" for light in LIGHTS))
+NAMES += tuple(f"light.{light.name}.{axis}" for light in LIGHTS for axis in "xyz")
+
+
+def calibrated(rng: np.random.Generator, off_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """One calibration by a white sphere where the teeth are: errors of NAMES (10,), and relative ones of photographs over renders (3,).
+
+    Lights are taken to be beside where they are, most along the line of sight; what the sphere shows is kept by intensities
+    and by the radiance per count, whose gauge is that the mean intensity is 1.
+    """
+    away = PLACES_MM / np.linalg.norm(PLACES_MM, axis=1, keepdims=True)
+    # All lights err alike in part, as where the spheres stood is one thing for all of them.
+    off = off_mm * (rng.normal(size=(3, 1)) + rng.normal()) * away + rng.normal(0, 2, (3, 3))
+    seen = INTENSITY / (PLACES_MM**2).sum(axis=1) * np.exp(rng.normal(0, MEASURED, 3))
+    relative = seen * ((PLACES_MM + off) ** 2).sum(axis=1)
+    found, radiance = relative / relative.mean(), 1 / relative.mean()
+    modelled = found / ((PLACES_MM + off) ** 2).sum(axis=1)
+    photographed = radiance * INTENSITY / (PLACES_MM**2).sum(axis=1)
+    errors = np.concatenate([[rng.normal(0, 0.01)], np.log(found / INTENSITY), off.ravel()])
+    return errors, np.log(photographed / modelled)
+
+
+def drawn(off_mm: float) -> tuple[CalibrationUncertainty, np.ndarray]:
+    rng = np.random.default_rng(1)
+    pairs = [calibrated(rng, off_mm) for _ in range(8000)]
+    covariance = np.cov(np.array([errors for errors, _ in pairs]).T) + 1e-12 * np.eye(len(NAMES))
+    stated = CalibrationUncertainty(names=NAMES, covariance=tuple(map(tuple, covariance.tolist())))
+    return stated, np.array([photographs for _, photographs in pairs])
+
+
+@pytest.mark.parametrize("off_mm", [2.0, 15.0])
+def test_gains_are_those_of_photographs_over_renders(off_mm: float) -> None:
+    stated, photographs = drawn(off_mm)
+    found = at_the_teeth(stated, LIGHTS, CHANNELS, TEETH_MM)
+    assert found is not None
+    # What all lights share is the gain's, not a light's; here, by no derivative but whole calibrations, it is the sphere's own scatter.
+    apart = photographs - photographs @ (INTENSITY / INTENSITY.sum())[:, None]
+    expected = np.cov(apart.T) + DRIFT**2 * np.eye(3)
+    # Squares of 1.5 % of a distance are left out, and 8,000 draws tell a variance to 1.6 %.
+    np.testing.assert_allclose(np.diag(found.matrix)[1:4], np.diag(expected), rtol=0.12)
+    assert np.sqrt(np.diag(found.matrix)[1:4]).max() < 1.3 * MEASURED
+    if off_mm > 10:
+        assert np.sqrt(np.diag(stated.matrix)[1:4]).min() > 5 * MEASURED
+    others = np.r_[0, 4:13]
+    np.testing.assert_allclose(found.matrix[np.ix_(others, others)], stated.matrix[np.ix_(others, others)], rtol=1e-12)
+
+
+def test_without_every_lights_place_all_stays_as_it_is() -> None:
+    stated, _ = drawn(5.0)
+    assert at_the_teeth(stated, LIGHTS[:2], CHANNELS, TEETH_MM) == stated
+    short = CalibrationUncertainty(names=NAMES[:4], covariance=tuple(map(tuple, stated.matrix[:4, :4].tolist())))
+    assert at_the_teeth(short, LIGHTS, CHANNELS, TEETH_MM) == short
+    assert at_the_teeth(None, LIGHTS, CHANNELS, TEETH_MM) is None
