@@ -19,6 +19,7 @@ _BENCHMARKS = MappingProxyType(
         "slab": "services.bench.slab.forward:run",
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",
+        "slab-solvers": "services.bench.slab.solvers:run",
         "slab-surface": "services.bench.slab.surface:run",
         "stability": "services.bench.stability.run:run",
         "tooth": "services.bench.fits.tooth:run",
