@@ -107,22 +107,23 @@ class Fault:
 def faults(off: Array, found: Recombination) -> tuple[Fault, ...]:
     """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the clearest first.
 
-    One by one: each is freed of its prior before the others are judged, as a wrong one draws others along (Baarda 1968). An error of the prior by f
-    moves d by (1 - B) f.
+    A prior that is off by f moves d by f h, h = (1 - B[e])'s own column, so f = h'D^-1 d / h'D^-1 h is what all errors together say of it. One by one: each
+    fault is taken out before the others are judged, as a wrong one draws others along (Baarda 1968).
 
     Args:
         off: d (K,), errors of the first answer less their prior's mean.
     """
-    off, spread, moves = off.copy(), found.spread.copy(), np.eye(len(off)) - found.follows
+    moves, weight = np.eye(len(off)) - found.follows, _inverse(found.spread, np.sqrt(np.diag(found.prior)))
     left, told = set(range(len(off))), list[Fault]()
     while left:
-        z = {k: float(off[k] / np.sqrt(max(spread[k, k], 1e-300))) for k in left}
-        worst = max(z, key=lambda k: abs(z[k]))
-        if abs(z[worst]) <= FAULT_Z:
+        seen = {k: float(moves[:, k] @ weight @ moves[:, k]) for k in left}
+        sizes = {k: float(moves[:, k] @ weight @ off) / max(seen[k], 1e-300) for k in left}
+        worst = max(left, key=lambda k: abs(sizes[k]) * np.sqrt(seen[k]))
+        z = sizes[worst] * float(np.sqrt(seen[worst]))
+        if abs(z) <= FAULT_Z:
             break
-        told.append(Fault(worst, float(off[worst] / max(moves[worst, worst], SMALLEST_SHARE)), z[worst]))
-        along = spread[:, worst] / spread[worst, worst]
-        off, moves = off - along * off[worst], moves - np.outer(along, moves[worst])
-        spread = spread - np.outer(along, spread[worst])
+        told.append(Fault(worst, sizes[worst], z))
+        along = weight @ moves[:, worst]
+        weight = weight - np.outer(along, along) / seen[worst]
         left.remove(worst)
     return tuple(told)
