@@ -29,7 +29,7 @@ from services.calibrate.registration.photographs import cut_out
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.calibrate.registration.register import REACH_MM
 from services.core.geometry import Mesh
-from tests.support.phantom_scan import scan_of
+from services.phantom.lab.scan import scan_of
 from tests.support.photographed_mouth import Mouth, clicks_on, photographed_mouth
 
 FIRST_SUBJECT = 2000

@@ -11,12 +11,10 @@ import pytest
 
 from services.core.errors import CaptureInputError
 from services.core.events import JobEvent
-from services.core.files.meshes import fdi_numbers
 from services.core.raw.registration import REGISTERED, Registration, lacks_pose
-from services.core.records import JobSpec
-from services.core.store import read_record
+from services.core.records import JobSpec, PreparedManifest
+from services.core.store import open_stage, read_record
 from services.pipeline.stages import run_job, stages_of
-from services.preprocess.opening import open_source
 from tests.support.raw_folders import write_toml
 from tests.support.raw_mouth import RawMouth, write_raw_mouth
 from tests.support.toy_stages import DOORS
@@ -31,7 +29,7 @@ def mouth(tmp_path_factory: pytest.TempPathFactory) -> RawMouth:
 
 def test_a_scan_without_a_pose_is_registered_first(mouth: RawMouth, tmp_path: Path) -> None:
     spec, seen = JobSpec(capture=mouth.root, workers=1), list[JobEvent]()
-    run_job(spec, tmp_path, seen.append, doors=DOORS)
+    run_job(spec, tmp_path, seen.append, doors=DOORS | {"prepare": "services.preprocess.stage:run"})
     assert [event.stage for event in seen if event.kind == "started"] == ["register", "prepare", "fit", "export"]
     assert stages_of(spec, {event.stage for event in seen}) == ("register", "prepare", "fit", "export")
     assert any(event.message.startswith("6 teeth stand in the rig, 0.0") for event in seen)
@@ -39,12 +37,12 @@ def test_a_scan_without_a_pose_is_registered_first(mouth: RawMouth, tmp_path: Pa
 
     # What is prepared are the job's teeth in the raw folder's photographs, with the pose's covariance.
     record = read_record(tmp_path / REGISTERED / "registration.json", Registration)
-    source = open_source(spec, tmp_path)
-    assert fdi_numbers(source.root) == (11, 12, 13, 21, 22, 23)
-    uncertainty = source.description.uncertainty
-    assert uncertainty is not None
-    assert uncertainty.names == NAMES
-    np.testing.assert_array_equal(uncertainty.matrix, record.uncertainty.matrix)
+    prepared = open_stage(tmp_path, "prepared", PreparedManifest)[1]
+    assert prepared.fdi == (11, 12, 13, 21, 22, 23)
+    assert min(prepared.tooth_pixels) > 1000
+    assert prepared.uncertainty is not None
+    assert prepared.uncertainty.names == NAMES
+    np.testing.assert_array_equal(prepared.uncertainty.matrix, record.uncertainty.matrix)
     assert (tmp_path / REGISTERED / "registration.html").is_file()
 
 

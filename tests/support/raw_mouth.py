@@ -21,6 +21,8 @@ from tests.support.raw_folders import Tree, write_toml
 
 BLACK, FULL_SCALE = 64, 3000
 BITS = 12
+INTENSITY = 3e7
+"""Of the light, at which teeth are about half as bright as a white surface in their place."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def write_raw_mouth(
             frames.append({"camera": name, "file": f"{name}_{kind}.npy", "kind": kind, "exposure_s": 0.1} | lit)
     known = {"black_counts": BLACK, "radiance_per_count": (1 / FULL_SCALE,) * 3}
     calibrated = tuple(CalibratedCamera(**camera.model_dump(), **known) for camera in mouth.cameras.values())
-    lights = (CalibratedLight(name="l0", position_mm=(0.0, 900.0, 0.0), intensity=(1.0, 1.0, 1.0)),)
+    lights = (CalibratedLight(name="l0", position_mm=(0.0, 900.0, 0.0), intensity=(INTENSITY,) * 3),)
     channels = ("red", "green", "blue")
     write_record(
         root / "calibration.json", Calibration(units="mm", channels=channels, cameras=calibrated, lights=lights)
