@@ -19,7 +19,7 @@ from services.core.geometry import Camera, Light, Tooth
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.fit.export.asset import tissue_of, write_asset
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
+from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict, with_square_pixels
 from services.fit.inputs.stain_uv import ToothStains, stain_layout
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.fit.transport.engine import Engine
@@ -206,6 +206,18 @@ def test_rectangular_pixels_are_refused(rig: Rig) -> None:
     camera = rig.cameras[0].model_copy(update={"K": ((900.0, 0.0, 5.0), (0.0, 910.0, 5.0), (0.0, 0.0, 1.0))})
     with pytest.raises(CaptureInputError, match="unequal focal lengths"):
         sensor_dict(camera)
+
+
+def test_a_calibrated_cameras_pixels_are_drawn_square_where_they_nearly_are(rig: Rig) -> None:
+    camera = rig.cameras[0].model_copy(update={"K": ((3850.0, 0.0, 200.0), (0.0, 3853.0, 150.0), (0.0, 0.0, 1.0))})
+    drawn = with_square_pixels(camera)
+    sensor_dict(drawn)
+    # At a hundred pixels from the principal point a focal length that is off by 0.04 % moves a picture by 0.04 px.
+    points = np.random.default_rng(0).uniform(-10, 10, (100, 3))
+    near = np.abs(camera.project(points)[0] - [200.0, 150.0]).max(axis=1) < 100
+    assert np.abs(drawn.project(points)[0] - camera.project(points)[0])[near].max(initial=0.0) < 0.05
+    uneven = camera.model_copy(update={"K": ((3850.0, 0.0, 200.0), (0.0, 3950.0, 150.0), (0.0, 0.0, 1.0))})
+    assert with_square_pixels(uneven) == uneven
 
 
 def test_a_tooth_without_dentin_needs_one_medium(rig: Rig, tmp_path: Path) -> None:

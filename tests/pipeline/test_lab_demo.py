@@ -19,10 +19,11 @@ def test_a_tooth_is_measured_from_raw_frames(tmp_path: Path) -> None:
     outcome = CliRunner().invoke(build_app(), arguments, catch_exceptions=False)
     assert outcome.exit_code == 0
     told = json.loads(outcome.stdout)
-    # Twice the target of a registration, in pixels of 0.16 mm.
+    # Half a pixel of 0.19 mm, and a turn that moves a tooth's edge by as much against its neck, 8 mm away.
     assert told["steps"]["teeth_mm"] < 0.1
-    assert told["steps"]["teeth_deg"] < 0.2
-    assert told["chain"]["held_out_error"] < 1.3 * told["variants"]["perfect"]["held_out_error"]
+    assert told["steps"]["teeth_deg"] < 0.7
+    asked = told["asked"]["held-out error over that with perfect calibration and pose"]
+    assert asked["value"] < asked["limit"]
     assert (tmp_path / "summary.html").is_file()
     # What is there and whole is kept.
     before = (tmp_path / TRUTH / LAB_RECORD).stat().st_mtime_ns

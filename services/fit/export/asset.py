@@ -26,7 +26,7 @@ from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.export.mitsuba_scene import nested_scene
+from services.fit.export.mitsuba_scene import nested_scene, with_square_pixels
 from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.fit.export.scene_xml import SceneParameter, write_scene
 from services.fit.export.stains import write_textures
@@ -88,7 +88,7 @@ def write_asset(
             for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()
         }
 
-    first = lights[0]
+    first, shown = lights[0], tuple(with_square_pixels(camera) for camera in cameras)
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
@@ -96,13 +96,13 @@ def write_asset(
         if report.teeth:
             numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
             scene = mouth_scene(
-                surfaces, numbers, mouth, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples
+                surfaces, numbers, mouth, shown, position, intensity, boundary=boundary, ior=ior, samples=samples
             )
         else:
             tissue = tissue_of(report.parameters[channel])
             stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
             scene = nested_scene(
-                files, tissue, cameras, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
+                files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
             )
         write_scene(folder / f"scene_{channel}.xml", scene)
 

@@ -18,6 +18,8 @@ from services.fit.optics.parameters import Medium, Tissue
 MAX_DEPTH = 5000
 ROULETTE_DEPTH = 100
 """Russian roulette starts here: paths in enamel scatter hundreds of times, and an earlier start costs more variance than it saves."""
+MAX_UNEVEN = 0.01
+"""Of a camera's focal lengths along x and y: calibrations of square pixels leave a thousandth between them."""
 
 SceneDict = dict[str, Any]
 
@@ -37,6 +39,18 @@ def medium_dict(medium: Medium) -> SceneDict:
         else {"type": "blendphase", "weight": float(1 - medium.beta), "first": first, "second": second}
     )
     return {"type": "homogeneous", "sigma_t": float(medium.sigma), "albedo": float(medium.alpha), "phase": phase}
+
+
+def with_square_pixels(camera: Camera) -> Camera:
+    """A calibrated camera with its mean focal length in both directions; one whose focal lengths differ by more stays as it is.
+
+    Scenes are drawn with it: at a hundred pixels from its principal point a picture moves by some hundredths of a pixel.
+    """
+    (fx, skew, cx), (zero, fy, cy), last = camera.K
+    if abs(fx / fy - 1) > MAX_UNEVEN:
+        return camera
+    mean = float(np.sqrt(fx * fy))
+    return camera.model_copy(update={"K": ((mean, skew, cx), (zero, mean, cy), last)})
 
 
 def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:

@@ -49,7 +49,7 @@ class LabSize:
 
 DEMO_SIZE = LabSize(RigSize((720, 520), 0.13, 3, 9), boards=10, mirror=5, white=2, samples=256)
 """Of ``make lab-demo``: rendered once in some minutes on two cores."""
-COARSE_SIZE = LabSize(RigSize((480, 352), 0.19, 3, 6), boards=7, mirror=4, white=1, samples=32)
+COARSE_SIZE = LabSize(RigSize((480, 352), 0.19, 3, 6), boards=7, mirror=4, white=1, samples=128)
 """Shows that the steps fit together, and no more."""
 
 
