@@ -1,8 +1,10 @@
-"""For all tests: the device on which paths are traced, and how long a slow one may take."""
+"""For all tests: the device on which paths are traced, how long a slow one may take, and that databases are closed."""
 
 from __future__ import annotations
 
 import pytest
+
+from tests.support.unclosed_databases import watch_databases
 
 SLOW_TIMEOUT_S = 3600
 
@@ -13,6 +15,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         choices=("llvm", "cuda"),
         help="trace paths there in this process's tests; a CUDA device must be present for cuda",
     )
+
+
+def pytest_configure() -> None:
+    watch_databases()
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -37,7 +37,8 @@ class Hanging:
 def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging]:
     with simulated_dome(6, WATCHDOG_S) as (host, port), closing(DomeObserver(host, port)) as observer:
         settings = ServerSettings(data=tmp_path, dome=DomeSettings(address=f"{host}:{port}", watchdog_s=WATCHDOG_S))
-        dome = Dome(settings.dome, Jobs(settings, lambda *_: None))
+        jobs = Jobs(settings, lambda *_: None)
+        dome = Dome(settings.dome, jobs)
         dome.light(LightRequest(light=3, on_s=30.0))
         process = next(child for child in psutil.Process().children() if "services.capture.console" in child.cmdline())
         process.suspend()
@@ -51,6 +52,7 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging
             with suppress(psutil.NoSuchProcess):
                 process.kill()
             dome.close()
+            jobs.repository.close()
 
 
 def ask(dome: Dome) -> None:
