@@ -363,7 +363,7 @@ def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> Non
         ({"kind": "slab", "dictionary": "mie"}, "dictionary = mie needs particle_index"),
         ({"kind": "jaw", "dictionary": "hg"}, "a job of kind jaw has no option 'dictionary'"),
         ({"kind": "slab", "rig": {"mouth": "demo"}, "capture": None}, "a job of kind slab has no option 'rig'"),
-        ({"kind": "jaw", "effort": 2.0}, "a job of kind jaw has no option 'effort'; it has adam_rate"),
+        ({"kind": "jaw", "effort": 2.0}, "a job of kind jaw has no option 'effort'; it has accept_calibration"),
         ({"kind": "slab", "effort": 0}, "greater than or equal to 0.01"),
     ],
 )

@@ -15,11 +15,16 @@ from typing import Any
 class WatchedConnection(sqlite3.Connection):
     """A connection that warns where it is collected before it was closed."""
 
+    opened_in: str | None = None
+    """The test that opened it; None where it could not be opened."""
+
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.opened_in = os.environ.get("PYTEST_CURRENT_TEST", "no test")
 
     def __del__(self) -> None:
+        if self.opened_in is None:
+            return
         try:
             self.total_changes  # noqa: B018
         except sqlite3.ProgrammingError as problem:
