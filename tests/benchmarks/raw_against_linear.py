@@ -24,9 +24,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
 from services.core.records import FolderCapture, JobSpec, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, is_published, open_stage, read_record, write_atomic, write_record
+from services.fit.checks.evaluate import ErrorSums
 from services.phantom.tooth import write_phantom
 from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor
@@ -42,6 +44,8 @@ SENSOR = Sensor(bits=12, read_counts=2.0, counts_per_electron=0.5, mosaic="RGGB"
 """8,000 electrons at full scale: half of a small-pixel camera's, and 1.1 % of noise there."""
 CHEAP = MappingProxyType({"image_tolerance": 0.01, "max_samples_per_pixel": 256})
 """Of the images' noise of 3 %, more is not seen."""
+JUDGE_PASS = 1024
+"""Paths per pixel of one pass of the judge."""
 CHANNEL, HELD_OUT = "green", ["l3", "l7"]
 
 
@@ -51,6 +55,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="kept, and gone on with")
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--samples", type=int, default=8192, help="paths per pixel of the tooth's images")
+    parser.add_argument("--judge-samples", type=int, default=4096, help="paths per pixel that judge a fit, twice")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--images-only", action="store_true", help="prepare both, and fit none")
     options = parser.parse_args()
@@ -68,7 +73,9 @@ def main() -> None:
         _prepare(spec, jobs[name])
     told: dict[str, Any] = {"images": _images_error(jobs)}
     if not options.images_only:
-        told |= _judged({name: _fitted(spec, jobs[name]) for name, spec in specs.items()}, mouth, jobs["linear"])
+        rows = {name: _fitted(spec, jobs[name]) for name, spec in specs.items()}
+        rows = {name: row | _errors(specs[name], jobs[name], row, options.judge_samples) for name, row in rows.items()}
+        told |= _judged(rows, mouth, jobs["linear"])
     write_atomic(options.json, json.dumps(told, indent=1).encode())
     print(json.dumps(told, indent=1))
 
@@ -81,7 +88,7 @@ def _judged(rows: dict[str, dict[str, Any]], truth: Path, job: Path) -> dict[str
     return {
         **rows,
         "scene_noise": noise,
-        "ratio": errors["raw"] / errors["linear"],
+        "ratio": errors["raw"] / errors["linear"] if errors["linear"] else None,
         "without_scene_noise": without,
         "ratio_without": without["raw"] / without["linear"] if without["linear"] else None,
     }
@@ -182,6 +189,20 @@ def _fitted(spec: JobSpec, job: Path) -> dict[str, Any]:
     }
     write_atomic(kept, json.dumps(row).encode())
     return row
+
+
+def _errors(spec: JobSpec, job: Path, row: dict[str, Any], samples: int) -> dict[str, float]:
+    """A fit's errors by more paths than it had itself, the same ones for both captures."""
+    tissue = tissue_of({name: one["value"] for name, one in row["parameters"].items()})
+    tooth, fitted, held_out = prepared_tooth(job, spec), ErrorSums(), ErrorSums()
+    for seed in range(1, max(samples // JUDGE_PASS, 1) + 1):
+        own, kept = tooth.errors(tissue, samples=min(samples, JUDGE_PASS), seed=seed)
+        fitted, held_out = fitted + own, held_out + kept
+    assert held_out.error is not None
+    assert held_out.error_se is not None
+    assert fitted.error is not None
+    told = {"held_out_error": held_out.error, "held_out_error_se": held_out.error_se, "fit_error": fitted.error}
+    return {**{f"fit's own {name}": row[name] for name in told}, **told}
 
 
 def _scene_noise(mouth: Path, job: Path) -> float:
