@@ -55,6 +55,16 @@ def test_exchanged_photographs_are_named_once() -> None:
         assert (frame.light, frame.other, frame.exchanged) == ("l1", "l4", True)
 
 
+def test_exchanged_photographs_are_named_by_a_fit_that_was_bent_towards_them() -> None:
+    for seed in range(20):
+        render, photos = scene(seed)
+        photos[[1, 4]] = photos[[4, 1]]
+        bent = render.copy()
+        bent[[1, 4]] = 0.65 * render[[1, 4]] + 0.35 * render[[4, 1]]
+        (frame,) = named(sums_of(bent, photos, seed))
+        assert (frame.light, frame.other, frame.exchanged) == ("l1", "l4", True)
+
+
 def test_a_photograph_of_another_light_is_named() -> None:
     render, photos = scene(3)
     photos[0] = 1.01 * photos[5]

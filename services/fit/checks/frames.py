@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ LOOKED_AT = 0.1
 """Relative error of a photograph above which other lights are tried: below it a neighbour's light is hardly another picture."""
 BETTER = 0.5
 """Another light's error has to be at most this part of its own light's. Lights 10 degrees apart differ by more than lights that are off by 10 mm."""
+EXCHANGED = 0.75
+"""Two photographs are exchanged where each is better explained by the other's light, and both together have at most this part of their error. A fit bends
+its media towards them, so less is asked than of a single one; by chance two do not explain each other at all."""
 ODD = 0.3
 """Relative error of a photograph that is told where no other light explains it either."""
 ODD_RATIO = 5.0
@@ -54,6 +58,11 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
     shown = own[np.isfinite(own)]
     if not len(shown):
         return
+    for first, second in combinations(range(len(lights)), 2):
+        if {first, second} & told or not _are_exchanged(errors, first, second):
+            continue
+        told |= {first, second}
+        yield WrongFrame(camera, lights[first], float(own[first]), lights[second], exchanged=True)
     looks_like = {
         photo: int(errors[:, photo].argmin())
         for photo in range(len(lights))
@@ -62,14 +71,20 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
     for photo, light in looks_like.items():
         if photo in told:
             continue
-        exchanged = looks_like.get(light) == photo
-        told |= {photo, light} if exchanged else {photo}
-        yield WrongFrame(camera, lights[photo], float(own[photo]), lights[light], exchanged)
+        told.add(photo)
+        yield WrongFrame(camera, lights[photo], float(own[photo]), lights[light])
     limit = max(ODD, ODD_RATIO * float(np.median(shown)))
     odd = np.flatnonzero(np.isfinite(own) & (own > limit)).tolist() if len(shown) >= MIN_FRAMES else []
     for photo in odd:
         if photo not in told:
             yield WrongFrame(camera, lights[photo], float(own[photo]))
+
+
+def _are_exchanged(errors: Array, first: int, second: int) -> bool:
+    own, others = (errors[first, first], errors[second, second]), (errors[second, first], errors[first, second])
+    if not np.isfinite([*own, *others]).all() or np.hypot(*own) <= np.sqrt(2) * LOOKED_AT:
+        return False
+    return bool(others[0] < own[0] and others[1] < own[1] and np.hypot(*others) <= EXCHANGED * np.hypot(*own))
 
 
 def photographs_told(
