@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,31 +10,45 @@ import pytest
 
 from services.fit.slab.model.dictionary import Material, henyey_greenstein
 from services.fit.slab.solve.mixture import Mixture
-from services.fit.slab.solve.standing import FILE, Standing, StandingFile
+from services.fit.slab.solve.normal import DerivativeSums
+from services.fit.slab.solve.standing import FILE, Joined, Standing, StandingFile
 
 
-def standing(material: Material) -> Standing:
+def standing(material: Material, joined: Joined | None = None) -> Standing:
     noise = tuple(np.random.default_rng(k).random((4, 2, 2)) for k in range(11))
-    return Standing(material, 1, 2, 7, True, 12, 345_678, noise)
+    return Standing(material, 1, 2, 7, True, 12, 345_678, noise, joined)
+
+
+def parts(one: object) -> list[np.ndarray]:
+    """Every number of a record, down through the records in it."""
+    if is_dataclass(one):
+        return [part for field in fields(one) for part in parts(getattr(one, field.name))]
+    if isinstance(one, tuple):
+        return [part for each in one for part in parts(each)]
+    return [] if one is None else [np.asarray(one)]
 
 
 def same(one: Standing, other: Standing) -> bool:
-    pairs = [(getattr(one, field.name), getattr(other, field.name)) for field in fields(Standing)[1:]]
-    pairs += [
-        (getattr(one.material, field.name), getattr(other.material, field.name)) for field in fields(one.material)
-    ]
-    return type(one.material) is type(other.material) and all(
-        np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs
-    )
+    pairs = zip(parts(one), parts(other), strict=True)
+    return type(one.material) is type(other.material) and all(np.array_equal(a, b) for a, b in pairs)
 
 
 MEDIUM = henyey_greenstein(1.2, 0.6, 0.05)
 
 
+JOINED = Joined(
+    DerivativeSums(
+        np.random.default_rng(3).random((2, 8, 201)), np.random.default_rng(4).random((2, 201, 201)), (4, 5)
+    ),
+    (np.arange(4.0), np.arange(3.0)),
+)
+
+
+@pytest.mark.parametrize("joined", [None, JOINED])
 @pytest.mark.parametrize("material", [MEDIUM, Mixture(MEDIUM.scattering, 0.05, np.array([0.1, 1.1]))])
-def test_a_standing_is_read_as_it_was_written(material: Material, tmp_path: Path) -> None:
+def test_a_standing_is_read_as_it_was_written(material: Material, joined: Joined | None, tmp_path: Path) -> None:
     told: list[Standing] = []
-    file, written = StandingFile(tmp_path / "532", "mark", told.append), standing(material)
+    file, written = StandingFile(tmp_path / "532", "mark", told.append), standing(material, joined)
     assert file.read() is None
     file.write(written)
     read = file.read()

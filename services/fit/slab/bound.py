@@ -18,7 +18,7 @@ from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import Quadratic, flag_scales, precision, scales_for
+from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, precision
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 from services.fit.slab.solve.weights import independent_weights
 
@@ -65,12 +65,12 @@ def bound_of(
     Args:
         noise: standard deviation of a pixel that has its image's mean, as a share of it.
         variances: of the measurement beside its shot noise (images, values), such as a reference's own.
-        scale: of the smoothness prior, per rad2; the loosest for this optical thickness where it is not given.
+        scale: of the smoothness prior, per rad2; the loosest that a fit may choose where it is not given.
     """
     quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
     x = Knots().unknowns(material)
     if scale is None:
-        scale = max(scales_for(material.extinction_per_mm * rig.width_mm))
+        scale = max(SCALES)
     chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
     uncertainty = Uncertainty(chosen, alone, (chosen, alone))
     return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
 from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import RIDGE, Quadratic, flag_scales, precision, scales_for
+from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales, precision
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class Coordinates(Protocol):
     def chain(self, material: Material) -> Array | None:
         """Derivatives of ln f and sigma_a by the unknowns (UNKNOWNS, U); None where they are the unknowns themselves."""
 
-    def scale(self, material: Material, width_mm: float, quadratic: Quadratic) -> float:
+    def scale(self, material: Material, quadratic: Quadratic) -> float:
         """Scale of the prior, near a medium and as its images suggest."""
 
     def precision(self, scale: float) -> Array:
@@ -81,10 +81,9 @@ class Knots:
     def chain(self, material: Material) -> None:
         """None: these are what the forward model derives by."""
 
-    def scale(self, material: Material, width_mm: float, quadratic: Quadratic) -> float:
-        """The curvature of ln f of most evidence among those for this optical thickness."""
-        candidates = scales_for(material.extinction_per_mm * width_mm)
-        return max(candidates, key=lambda scale: self.log_evidence(quadratic, scale))
+    def scale(self, material: Material, quadratic: Quadratic) -> float:  # noqa: ARG002 - as ln f needs no size
+        """The curvature of ln f of most evidence."""
+        return max(SCALES, key=lambda scale: self.log_evidence(quadratic, scale))
 
     def precision(self, scale: float) -> Array:
         """Of a smooth ln f; nothing is assumed of the absorption."""

@@ -22,7 +22,7 @@ from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.normal import NormalEquations, normal_equations
 from services.fit.slab.solve.prior import THICK, Quadratic
 from services.fit.slab.solve.seen import broad_step, step_matrix
-from services.fit.slab.solve.standing import Standing, StandingFile
+from services.fit.slab.solve.standing import Joined, Standing, StandingFile
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
@@ -116,6 +116,8 @@ class GaussNewton:
     paths: int = 0
     path_noise: tuple[Array, ...] | None = None
     """Monte Carlo covariance of one path by light (pixels, C, C), a running mean over the renders before."""
+    joined: Joined | None = None
+    """Renders of this stage that later ones join, in a thick cell."""
     kept: StandingFile | None = None
     """Where to go on from, and where to keep how far the fit has come; None for neither."""
 
@@ -125,6 +127,7 @@ class GaussNewton:
         if standing is None:
             return self.finish(self.search(guess()))
         self.renders, self.paths, self.path_noise = standing.renders, standing.paths, standing.path_noise
+        self.joined = standing.joined
         return self.finish(standing)
 
     def search(self, material: Material) -> Standing:
@@ -136,7 +139,7 @@ class GaussNewton:
             state, converged = self.step(state)
             steps += 1
         assert self.path_noise is not None
-        return Standing(state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise)
+        return Standing(state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise, None)
 
     def init(self, material: Material) -> State:
         """The first point."""
@@ -147,7 +150,7 @@ class GaussNewton:
         """One step, and whether the search has come as far as its paths can tell."""
         x = self.coordinates.unknowns(state.material)
         quadratic = quadratic_at(x, state.equations)
-        prior = self.coordinates.precision(self.coordinates.scale(state.material, self.rig.width_mm, quadratic))
+        prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic))
         change = self.change(quadratic, prior, state.material, state.damping)
         promise = promised(quadratic, prior, x, change)
         noise = noise_of_promise(quadratic, prior, state.equations.gradient_noise)
@@ -173,10 +176,10 @@ class GaussNewton:
             if self.kept is not None:
                 self.kept.write(standing)
             material, (paths, batches) = standing.material, self.budget.last[standing.stage]
-            equations = self.linearised(material, paths, batches)
+            equations = self.linearised(material, paths, batches, join=self.is_thick(material))
             x = self.coordinates.unknowns(material)
             quadratic = quadratic_at(x, equations)
-            scale = self.coordinates.scale(material, self.rig.width_mm, quadratic)
+            scale = self.coordinates.scale(material, quadratic)
             prior = self.coordinates.precision(scale)
             change = self.change(quadratic, prior, material, DAMPING)
             moved = self.coordinates.material_at(x + change)
@@ -203,6 +206,8 @@ class GaussNewton:
         )
         is_over = worth < enough or standing.step + 1 >= most
         assert self.path_noise is not None
+        if is_over:
+            self.joined = None  # the next stage has batches of another size
         return replace(
             standing,
             material=moved,
@@ -211,6 +216,7 @@ class GaussNewton:
             renders=self.renders,
             paths=self.paths,
             path_noise=self.path_noise,
+            joined=self.joined,
         )
 
     def is_thick(self, material: Material) -> bool:
@@ -236,8 +242,12 @@ class GaussNewton:
             second = first + broad_step(quadratic, prior, broad[:, :-1], first)
         return self.coordinates.held_back(second - x, around)
 
-    def linearised(self, material: Material, paths: int, batches: int) -> NormalEquations:
-        """Normal equations of fresh batches."""
+    def linearised(self, material: Material, paths: int, batches: int, *, join: bool = False) -> NormalEquations:
+        """Normal equations of fresh batches.
+
+        Args:
+            join: whether derivatives of the stage's renders before join. Weights then stay as the first of them had them.
+        """
         self.renders += 1
         self.paths += paths * batches * len(self.rig.lights)
         estimates = render(
@@ -254,15 +264,20 @@ class GaussNewton:
         own = tuple(smoothed_covariance(estimates.images[:, some], shape) * batches * paths for some in seen)
         # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and weights that
         # share them with the residuals bent sigma_s' up by several per cent.
-        known = own if self.path_noise is None else self.path_noise
+        recent = own if self.path_noise is None else self.path_noise
+        earlier = self.joined if join else None
+        known = recent if earlier is None else earlier.path_noise
         variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
         noise = [one / (batches * paths) for one in known]
         if not self.is_thick(material):
             # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would only add noise.
             noise = [one * np.eye(one.shape[1]) for one in noise]
         weights = weights_of(seen, variances, noise)
-        self.path_noise = tuple((first + second) / 2 for first, second in zip(own, known, strict=True))
-        equations = normal_equations(estimates, material, self.measured.values, weights)
+        self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))
+        equations = normal_equations(
+            estimates, material, self.measured.values, weights, None if earlier is None else earlier.derivatives
+        )
+        self.joined = Joined(equations.derivatives, known) if join else None
         return equations.chained(self.coordinates.chain(material))
 
 

@@ -77,7 +77,7 @@ class Mixtures:
         matrix[KNOTS, -1] = 1
         return matrix
 
-    def scale(self, material: Material, width_mm: float, quadratic: Quadratic) -> float:  # noqa: ARG002 - they say nothing of it
+    def scale(self, material: Material, quadratic: Quadratic) -> float:  # noqa: ARG002 - they say nothing of it
         """Standard deviation of a weight, per mm."""
         return SHARE * material.scattering_per_mm
 

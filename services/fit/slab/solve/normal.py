@@ -6,6 +6,10 @@ different batches give unbiased
     misfit   sum_ab (C_a - y) W (C_b - y),   gradient   sum_ab J_a^T W (C_b - y),   normal matrix   sum_ab J_a^T W J_b
 
 each over a != b and divided by B (B - 1). One batch alone would add the power of its own noise to all three.
+
+Derivatives of E batches rendered before, with the same weights, may join: then J_a and J_b of the matrix run over all, and J_a of the
+gradient does, with the divisor B (B + E - 1). Their noise is independent of the present images whatever medium they were taken at, so
+the gradient is still zero where images fit. In a thick cell most of its noise is that of J times the residuals, and falls with E.
 """
 
 from __future__ import annotations
@@ -23,6 +27,42 @@ Array = NDArray[np.float64]
 
 UNKNOWNS = KNOTS + 1
 """What the forward model derives by: ln f at the knots, and sigma_a in per mm."""
+
+
+@dataclass(frozen=True)
+class DerivativeSums:
+    """Sums over batches of whitened derivatives, in either half of the batches."""
+
+    halves: Array
+    """Of the derivatives (2, images * pixels, UNKNOWNS)."""
+    own: Array
+    """Of each batch's J^T W J (2, UNKNOWNS, UNKNOWNS)."""
+    counts: tuple[int, int]
+
+    def __add__(self, other: DerivativeSums) -> DerivativeSums:
+        """Of both sets of batches."""
+        first, second = (a + b for a, b in zip(self.counts, other.counts, strict=True))
+        return DerivativeSums(self.halves + other.halves, self.own + other.own, (first, second))
+
+    @property
+    def count(self) -> int:
+        """Number of batches."""
+        return sum(self.counts)
+
+    def matrix(self) -> Array:
+        """The normal matrix, without the power of the derivatives' noise."""
+        whole = self.halves.sum(axis=0)
+        return _over_pairs(whole, self.own[0] + self.own[1], self.count)
+
+    def matrix_error(self) -> Array:
+        """See ``NormalEquations``."""
+        first, second = (_over_pairs(*of) for of in zip(self.halves, self.own, self.counts, strict=True))
+        return np.asarray((first - second) / 2)
+
+
+def _over_pairs(summed: Array, own: Array, count: int) -> Array:
+    """Mean of J_a^T W J_b over pairs of different batches."""
+    return np.asarray((summed.T @ summed - own) / max(count * (count - 1), 1))
 
 
 @dataclass(frozen=True)
@@ -46,6 +86,8 @@ class NormalEquations:
     """Covariance of the gradient's noise by the measurements (U, U)."""
     used: int
     """Number of pixels."""
+    derivatives: DerivativeSums
+    """By ln f and sigma_a whatever the unknowns are: what later equations of the same weights may join."""
 
     def chained(self, chain: Array | None) -> NormalEquations:
         """The same in other unknowns, by the derivatives (UNKNOWNS, U) of these; None leaves them as they are."""
@@ -69,8 +111,15 @@ def derivative_rows(rows: Array, material: Material) -> Array:
     return np.concatenate([rows[..., :KNOTS] - ways * (material.scattering * tent_solid_angles()), -ways], axis=-1)
 
 
-def normal_equations(batches: Batches, material: Material, values: Array, weights: Weights) -> NormalEquations:
-    """Sums over all pixels that weigh; ``values`` (images, pixels)."""
+def normal_equations(
+    batches: Batches, material: Material, values: Array, weights: Weights, earlier: DerivativeSums | None = None
+) -> NormalEquations:
+    """Sums over all pixels that weigh.
+
+    Args:
+        values: measurements (images, pixels).
+        earlier: derivatives of batches before, whitened by the same weights.
+    """
     residuals = weights.whitened(batches.images - values).reshape(len(batches.images), -1)
     count = len(residuals)
     pairs = count * (count - 1)
@@ -81,34 +130,36 @@ def normal_equations(batches: Batches, material: Material, values: Array, weight
     # One pass sums the derivatives over each half of the batches, the second pairs each batch with the others.
     jacobians = [weights.whitened(derivative_rows(rows, material)[None])[0] for rows in batches.rows]
     middle = count // 2
-    halves = [np.sum(half, axis=0).reshape(-1, UNKNOWNS) for half in (jacobians[:middle], jacobians[middle:])]
-    summed = halves[0] + halves[1]
-    whole = summed.T @ summed
-    own = [np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))]
+    halves = np.stack([np.sum(half, axis=0).reshape(-1, UNKNOWNS) for half in (jacobians[:middle], jacobians[middle:])])
+    before = np.zeros_like(halves[0]) if earlier is None else earlier.halves.sum(axis=0)
+    others = count - 1 + (0 if earlier is None else earlier.count)
+    whole = halves.sum(axis=0) + before
+    own = np.zeros((2, UNKNOWNS, UNKNOWNS))
     own_data = np.zeros((UNKNOWNS, UNKNOWNS))
     terms = np.zeros((count, UNKNOWNS))
     for number, (term, residual, whitened) in enumerate(zip(terms, residuals, jacobians, strict=True)):
         jacobian = whitened.reshape(-1, UNKNOWNS)
-        own[number >= middle] += jacobian.T @ jacobian
+        own[int(number >= middle)] += jacobian.T @ jacobian
         scattered = weights.of_measurements(whitened[None])[0].reshape(-1, UNKNOWNS)
         own_data += scattered.T @ scattered
-        term[:] = (jacobian.T @ (total - residual) + (summed - jacobian).T @ residual) / (count - 1)
-    matrix = (whole - own[0] - own[1]) / pairs
-    first, second = (
-        (half.T @ half - alone) / max(size * (size - 1), 1)
-        for half, alone, size in zip(halves, own, (middle, count - middle), strict=True)
-    )
-    gradient = terms.mean(axis=0) / 2
+        term[:] = (jacobian.T @ (total - residual) + (whole - jacobian).T @ residual) / others
+    present = DerivativeSums(halves, own, (middle, count - middle))
+    every = present if earlier is None else earlier + present
+    matrix = every.matrix()
+    # Pairs of two present batches stand in the terms twice, those with an earlier one once.
+    gradient = terms.mean(axis=0) / 2 + before.T @ total / (2 * count * others)
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
     parts = terms - terms.mean(axis=0)
     gradient_noise = parts.T @ parts / pairs
-    scattered = weights.of_measurements(sum(jacobians[1:], jacobians[0])[None])[0].reshape(-1, UNKNOWNS)
+    # The noise of earlier derivatives meets that of the measurements alike in all batches, where no spread shows it: so it counts here.
+    scattered = weights.of_measurements(whole.reshape(jacobians[0].shape)[None])[0].reshape(-1, UNKNOWNS)
+    mean = whole / every.count
 
     # Noise of the misfit: that of the mean residual, and of the residuals' own products.
     variance = residuals.var(axis=0, ddof=1) / count
     misfit_se = float(np.sqrt((variance * (np.maximum(products, 0) + variance / 2)).sum()))
     return NormalEquations(
-        misfit, misfit_se, gradient, matrix, gradient_noise, noise=whole / count**2 - matrix,
-        noise_gradient=summed.T @ total / count**2 - gradient, used=int(weights.used.sum()), matrix_error=(first - second) / 2,
-        data_noise=(scattered.T @ scattered - own_data) / pairs,
+        misfit, misfit_se, gradient, matrix, gradient_noise, noise=mean.T @ mean - matrix,
+        noise_gradient=mean.T @ total / count - gradient, used=int(weights.used.sum()), matrix_error=every.matrix_error(),
+        data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count), derivatives=every,
     )  # fmt: skip

@@ -15,10 +15,20 @@ from numpy.typing import NDArray
 from services.core.store import write_atomic
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.solve.mixture import Mixture
+from services.fit.slab.solve.normal import DerivativeSums
 
 Array = NDArray[np.float64]
 
 FILE = "steps.npz"
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Renders of one stage whose derivatives go together."""
+
+    derivatives: DerivativeSums
+    path_noise: tuple[Array, ...]
+    """That their weights were made from; see ``GaussNewton.path_noise``."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +46,7 @@ class Standing:
     paths: int
     path_noise: tuple[Array, ...]
     """See ``GaussNewton``."""
+    joined: Joined | None
 
 
 @dataclass(frozen=True)
@@ -51,7 +62,14 @@ class StandingFile:
     def write(self, standing: Standing) -> None:
         """Keep it in place of the one before."""
         arrays: dict[str, Any] = {name: np.array(getattr(standing, name)) for name in _NUMBERS}
-        arrays |= {f"path_noise_{k}": one for k, one in enumerate(standing.path_noise)}
+        arrays |= _numbered("path_noise", standing.path_noise)
+        if (joined := standing.joined) is not None:
+            arrays |= _numbered("joined_noise", joined.path_noise)
+            arrays |= {
+                "halves": joined.derivatives.halves,
+                "own": joined.derivatives.own,
+                "counts": np.array(joined.derivatives.counts),
+            }
         for field in fields(standing.material):
             arrays[f"material_{field.name}"] = np.asarray(getattr(standing.material, field.name))
         stream = io.BytesIO()
@@ -70,8 +88,8 @@ class StandingFile:
         if str(arrays.pop("of", "")) != self.of:
             return None
         numbers: dict[str, Any] = {name: arrays[name].item() for name in _NUMBERS}
-        noise = tuple(arrays[f"path_noise_{k}"] for k in range(sum(name.startswith("path_noise_") for name in arrays)))
-        return Standing(_material(arrays), path_noise=noise, **numbers)
+        noise = _of_numbered("path_noise", arrays)
+        return Standing(_material(arrays), path_noise=noise, joined=_joined(arrays), **numbers)
 
     def remove(self) -> None:
         """The fit is done."""
@@ -86,3 +104,19 @@ def _material(arrays: dict[str, Array]) -> Material:
     if "material_atom_weights" in arrays:
         return Mixture(scattering, absorption, arrays["material_atom_weights"])
     return Material(scattering, absorption)
+
+
+def _joined(arrays: dict[str, Array]) -> Joined | None:
+    if "counts" not in arrays:
+        return None
+    first, second = (int(count) for count in arrays["counts"])
+    sums = DerivativeSums(arrays["halves"], arrays["own"], (first, second))
+    return Joined(sums, _of_numbered("joined_noise", arrays))
+
+
+def _numbered(name: str, values: tuple[Array, ...]) -> dict[str, Array]:
+    return {f"{name}_{k}": one for k, one in enumerate(values)}
+
+
+def _of_numbered(name: str, arrays: dict[str, Array]) -> tuple[Array, ...]:
+    return tuple(arrays[f"{name}_{k}"] for k in range(sum(one.startswith(f"{name}_") for one in arrays)))
