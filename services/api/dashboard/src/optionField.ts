@@ -92,7 +92,7 @@ export class OptionField {
     if (this.input instanceof HTMLInputElement && this.input.type === "checkbox") return this.input.checked;
     const text = this.input.value.trim();
     if (this.schema.type === "object") return table(text);
-    if (!text) return null;
+    if (!text) return Array.isArray(this.schema.default) ? [] : null;
     if (this.schema.type === "array") return text.split(",").map((part) => part.trim()).filter((part) => part);
     if (this.schema.enum?.some((one) => typeof one === "number")) return Number(text);
     return this.schema.type === "number" || this.schema.type === "integer" ? Number(text) : text;
