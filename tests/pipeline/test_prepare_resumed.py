@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import psutil
 import pytest
@@ -160,6 +161,8 @@ def test_on_workers(undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path) ->
     """Blocks of a stage that runs as a Dask task are tasks of the same cluster; the store is the same."""
     capture, expected = undisturbed
     with (
+        # As if no test before had opened workers in this process, whose settings are for processes of their own.
+        dask.config.set({"distributed.worker.preload": []}),
         LocalCluster(
             n_workers=1,
             threads_per_worker=2,

@@ -15,7 +15,7 @@ from services.core.errors import CaptureInputError, JobCancelledError
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import StageContext, StageEvent, StageName
-from services.core.store import StageWriter, require_intact
+from services.core.store import StageWriter, require_intact, write_atomic
 
 DOORS: dict[StageName, str] = {
     stage: f"tests.support.toy_stages:{stage}" for stage in ("phantom", "capture", "prepare", "fit", "export")
@@ -43,7 +43,7 @@ def _publish(stage: StageName, folder: str, spec: JobSpec, context: StageContext
 def _reach(spec: JobSpec, context: StageContext, stage: StageName, point: str) -> None:
     # Says where it is and in which process, and waits there as long as it is told to.
     steering = _steering(spec, context)
-    (steering / f"at-{stage}-{point}").write_text(str(os.getpid()))
+    write_atomic(steering / f"at-{stage}-{point}", str(os.getpid()).encode())
     while (steering / f"hold-{stage}-{point}").exists():
         context.raise_if_cancelled()
         time.sleep(0.02)
