@@ -27,6 +27,7 @@ def mouth(tmp_path_factory: pytest.TempPathFactory) -> RawMouth:
     return write_raw_mouth(tmp_path_factory.mktemp("raw"))
 
 
+@pytest.mark.slow
 def test_a_scan_without_a_pose_is_registered_first(mouth: RawMouth, tmp_path: Path) -> None:
     spec, seen = JobSpec(capture=mouth.root, workers=1), list[JobEvent]()
     run_job(spec, tmp_path, seen.append, doors=DOORS | {"prepare": "services.preprocess.stage:run"})

@@ -85,6 +85,7 @@ def test_the_gradients_noise_is_what_it_is_said_to_be() -> None:
     np.testing.assert_allclose(np.mean([np.diag(one.data_noise)[:SEEN] for one in found], axis=0), of_data, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_earlier_derivatives_lower_the_noise_of_the_gradient() -> None:
     with_them, without = (
         np.std([one.gradient[:SEEN] for one in drawn(anew=True, kept=kept)], axis=0) for kept in (True, False)
