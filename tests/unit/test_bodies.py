@@ -12,6 +12,7 @@ from services.api.app import create_app
 from services.api.http.bodies import MAX_MEMBERS, MAX_VALUES, BodyRoute, parse
 from services.core.errors import SettingsError
 from services.core.settings import ServerSettings, UploadLimits
+from tests.support.live_server import serving
 
 
 def manifest_of(files: int, path: str = "images/camera-1/light-{:05d}.png") -> bytes:
@@ -44,11 +45,11 @@ def test_a_manifest_of_as_many_files_as_the_settings_allow_is_parsed(files: int,
 
 def test_every_route_with_a_body_in_json_bounds_it(tmp_path: Path) -> None:
     app = create_app(ServerSettings(data=tmp_path), lambda *_: None)
-    contexts = iter_route_contexts(app.routes)
-    found = [
-        context.original_route
-        for context in contexts
-        if getattr(context.original_route, "body_field", None) is not None
-    ]
+    with serving(app):
+        found = [
+            context.original_route
+            for context in iter_route_contexts(app.routes)
+            if getattr(context.original_route, "body_field", None) is not None
+        ]
     assert len(found) == 10
     assert [route for route in found if not isinstance(route, BodyRoute)] == []

@@ -56,18 +56,20 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
 
 @pytest.mark.attack("routes × scopes", "a route that declares no scope")
 def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
-    declared = {
-        f"{method} {template}": scope
-        for method, template, scope in operations(create_app(ServerSettings(data=tmp_path)))
-    }
+    app = create_app(ServerSettings(data=tmp_path))
+    # Served and ended, as an application closes what it opened when it ends.
+    with serving(app):
+        declared = {f"{method} {template}": scope for method, template, scope in operations(app)}
     assert len(declared) > len(KNOWN_SCOPES)
     assert {name: declared.get(name) for name in KNOWN_SCOPES} == KNOWN_SCOPES
 
 
 def test_the_walk_sees_every_route_that_is_described(tmp_path: Path) -> None:
     app = create_app(ServerSettings(data=tmp_path))
+    with serving(app):
+        walked = {f"{method} {template}" for method, template, _ in operations(app)}
     described = {f"{method.upper()} {path}" for path, methods in app.openapi()["paths"].items() for method in methods}
-    assert {f"{method} {template}" for method, template, _ in operations(app)} == described - {
+    assert walked == described - {
         f"GET {LIVENESS}",
         f"POST {SETUP}",
     } | {"GET /v1/openapi.json"}
