@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from services.calibrate.lights.mirror import highlight_points
 from services.core.geometry import Camera
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.frames import read_counts
-from services.phantom.lab.folder import RawWriter, written
+from services.phantom.lab.folder import RawWriter
 from services.phantom.lab.mouth import FITTED, SCAN_NOISE_MM, LabMouth, landmarks_mm, true_mouth
 from services.phantom.lab.rig import CAMERA_MM, Lens, RigSize, true_rig
 from services.phantom.lab.sensor import Sensor
@@ -59,15 +58,6 @@ def test_a_sensors_noise_is_as_said() -> None:
         assert part.mean() - sensor.black == pytest.approx(expected, abs=5 * np.sqrt(variance / part.size))
         assert (part - other).var() / 2 == pytest.approx(variance, rel=5 * np.sqrt(2 / part.size))
     assert sensor.photograph(camera, 100 * even, 0.02, np.random.default_rng(1)).max() == 4095
-
-
-def test_a_description_is_read_back(tmp_path: Path) -> None:
-    tree = {
-        "units": "mm",
-        "scan": {"file": 'a "scan".ply', "units": "mm"},
-        "landmark": [{"tooth": 11, "xyz_mm": [0.5, 1e-7, -2.0], "pixels": [{"camera": "c0", "xy_px": [1.0, 2.5]}]}],
-    }
-    assert tomllib.loads(written(tree).decode()) == tree
 
 
 def test_a_session_is_a_raw_folder_and_its_highlights_obey_the_law_of_reflection(tmp_path: Path) -> None:

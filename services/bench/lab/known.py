@@ -19,8 +19,8 @@ from services.core.files.meshes import read_mesh, read_teeth, write_mesh
 from services.core.geometry import Mesh, teeth_folder
 from services.core.raw.folder import DESCRIPTION
 from services.core.raw.registration import REGISTRATION, Registration
+from services.core.raw.toml_writing import description_toml
 from services.core.store import read_record, write_atomic, write_record
-from services.phantom.lab.folder import written
 from services.phantom.lab.make import CALIBRATION, CALIBRATION_FILE, LAB_RECORD, MOUTH, TRUTH, LabRecord
 
 Floats = NDArray[np.float64]
@@ -110,7 +110,7 @@ def write_variant(root: Path, out: Path, known: Known) -> Path:
     tree = {key: value for key, value in tree.items() if key not in {"scan", "landmark"}}
     tree["calibration"] = {"file": CALIBRATION_FILE}
     write_record(out / CALIBRATION_FILE, _mixed(found, true, known))
-    write_atomic(out / DESCRIPTION, written(tree))
+    write_atomic(out / DESCRIPTION, description_toml(tree))
     return out
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from services.core.errors import CaptureInputError
 from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import THING_OF, RawFolder
+from services.core.raw.toml_writing import description_toml, toml_value
 from services.core.store import write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
@@ -98,7 +98,7 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         raise CaptureInputError(
             f"File {silent.file} does not say its exposure; rename it, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
         )
-    content = _written(_tree(root, frames, exposure_s, mosaic, calibration)) + _to_complete(frames, exposure_s)
+    content = description_toml(_tree(root, frames, exposure_s, mosaic, calibration)) + _to_complete(frames, exposure_s)
     folder = parse_raw_folder(content, str(root / DESCRIPTION))
     write_atomic(root / DESCRIPTION, content)
     things = sorted({THING_OF[one.kind] for one in frames if one.kind in THING_OF})
@@ -196,17 +196,6 @@ def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
         yield "There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks."
 
 
-def _written(tree: Mapping[str, Any]) -> bytes:
-    """TOML of a description: plain values, then tables, then lists of tables."""
-    lines = [f"{key} = {_value(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
-    for key, value in tree.items():
-        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
-        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
-        for head, table in tables:
-            lines += ["", head, *(f"{name} = {_value(one)}" for name, one in table.items())]
-    return ("\n".join(lines) + "\n").encode()
-
-
 def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
     """Comments: things that frames show, with measures to fill in, and those frames."""
     shown = [one for one in frames if one.kind in THING_OF]
@@ -214,10 +203,5 @@ def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> byte
     lines = [line for template in templates.values() for line in ("", *template)]
     for one in shown:
         entry = _frame(one, exposure_s) | {THING_OF[one.kind]: one.kind}
-        lines += ["", "[[frame]]", *(f"{name} = {_value(value)}" for name, value in entry.items())]
+        lines += ["", "[[frame]]", *(f"{name} = {toml_value(value)}" for name, value in entry.items())]
     return "".join(f"# {line}\n" if line else "\n" for line in lines).encode()
-
-
-def _value(value: Any) -> str:
-    # A string or a list of JSON is one of TOML as well, but for DEL, which no name holds.
-    return json.dumps(value, ensure_ascii=False)

@@ -70,6 +70,6 @@ def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[n
         return None
     positions = np.array([light.position_mm for light in manifest.lights])
     names = tuple(light.name for light in manifest.lights)
-    most = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
+    max_gains = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
     stated = at_the_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
-    return Instrument(names, stated, tuple(positions.mean(axis=0).tolist()), most)
+    return Instrument(names, stated, tuple(positions.mean(axis=0).tolist()), max_gains)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.core.calibration.record import Calibration
 from services.core.raw.folder import DESCRIPTION
+from services.core.raw.toml_writing import description_toml
 from services.core.store import write_atomic
 from services.phantom.lab.sensor import Sensor
 
@@ -57,27 +58,4 @@ class RawWriter:
         ]
         lights = [{"name": one.name} for one in self.rig.lights]
         tree = {"units": "mm", "camera": cameras, "light": lights, "frame": self._frames, **others}
-        write_atomic(self.root / DESCRIPTION, written(tree))
-
-
-def written(tree: Mapping[str, Any]) -> bytes:
-    """TOML of a description: plain values, then tables, then lists of tables with values in one line."""
-    lines = [f"{key} = {_inline(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
-    for key, value in tree.items():
-        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
-        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
-        for head, table in tables:
-            lines += ["", head, *(f"{name} = {_inline(one)}" for name, one in table.items() if one is not None)]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _inline(value: object) -> str:
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_inline(one)}" for key, one in value.items()) + "}"
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(map(_inline, value)) + "]"
-    return repr(value)
+        write_atomic(self.root / DESCRIPTION, description_toml(tree))

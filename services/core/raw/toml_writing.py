@@ -1,0 +1,28 @@
+"""A raw folder's description as text: TOML with plain values first, then tables, then lists of tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def description_toml(tree: Mapping[str, Any]) -> bytes:
+    """Text of ``raw.toml``: values below the second level stand in one line, and those that are None are left out."""
+    lines = [f"{key} = {toml_value(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
+    for key, value in tree.items():
+        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
+        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
+        for head, table in tables:
+            lines += ["", head, *(f"{name} = {toml_value(one)}" for name, one in table.items() if one is not None)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def toml_value(value: Any) -> str:
+    """A value in one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    # A string, a number or a truth value of JSON is one of TOML as well, but for DEL, which no name holds.
+    return json.dumps(value, ensure_ascii=False)
