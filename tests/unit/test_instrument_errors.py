@@ -302,5 +302,8 @@ def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     stated = CalibrationUncertainty(names=("camera.c0.rx", "light.a.x"), covariance=((1e-6, 0.0), (0.0, 1.0)))
     told = instrument_sentences(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, {}, (), stated)
     assert told == (
-        "The calibration states how wrong camera.c0.rx and 1 more may be, which the ± do not know: no fit moves single cameras and lights.",
+        (
+            "The calibration states how wrong camera.c0.rx and 1 more may be. No fit moves single cameras and lights: "
+            "of these errors the ± know at most the lights' distances, which count in their gains."
+        ),
     )

@@ -92,8 +92,8 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
     if unused:
         rest = f" and {len(unused) - 1} more" if unused[1:] else ""
         yield (
-            f"The calibration states how wrong {unused[0]}{rest} may be, which the ± do not know: "
-            "no fit moves single cameras and lights."
+            f"The calibration states how wrong {unused[0]}{rest} may be. No fit moves single cameras and lights: "
+            "of these errors the ± know at most the lights' distances, which count in their gains."
         )
 
 
