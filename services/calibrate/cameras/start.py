@@ -101,8 +101,7 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
             places[view.place] = np.linalg.inv(cameras[view.camera]) @ camera_from_board
         waiting.remove(linked[0])
     for _ in range(VOTES):
-        _vote_for_cameras(views, lenses, poses, cameras, places)
-        _vote_for_places(views, lenses, poses, cameras, places)
+        _vote(views, lenses, poses, cameras, places)
     if alone := next((name for number, name in enumerate(names) if number not in cameras), None):
         raise CaptureInputError(
             f"Camera {alone} sees no board together with the other cameras; photograph a board where both see it."
@@ -117,35 +116,26 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
     )
 
 
-def _vote_for_cameras(
+def _vote(
     views: Sequence[View],
     lenses: Sequence[Lens],
     poses: dict[int, Floats],
     cameras: dict[int, Floats],
     places: dict[int, Floats],
 ) -> None:
-    """Give each camera the pose, of those that its photographs propose, that draws most of its corners where they are.
+    """Give each camera, then each place but the first, the pose that draws most of its corners where they are.
 
-    So a photograph that is not what its frame says does not lead the others astray.
+    The poses are those that its own photographs propose, so a photograph that is not what its frame says does not lead the others astray.
     """
+    linked = [number for number in poses if views[number].camera in cameras and views[number].place in places]
     for camera in cameras:
-        mine = [number for number in poses if views[number].camera == camera and views[number].place in places]
+        mine = [number for number in linked if views[number].camera == camera]
         proposed = [poses[number] @ np.linalg.inv(places[views[number].place]) for number in mine]
         drawn = [(views[n], lenses[camera], [pose @ places[views[n].place] for pose in proposed]) for n in mine]
         if len(proposed) > 2:
             cameras[camera] = proposed[_best(drawn)]
-
-
-def _vote_for_places(
-    views: Sequence[View],
-    lenses: Sequence[Lens],
-    poses: dict[int, Floats],
-    cameras: dict[int, Floats],
-    places: dict[int, Floats],
-) -> None:
-    """Give each place but the first the pose that draws most of its corners where they are."""
     for place in list(places)[1:]:
-        mine = [number for number in poses if views[number].place == place and views[number].camera in cameras]
+        mine = [number for number in linked if views[number].place == place]
         proposed = [np.linalg.inv(cameras[views[number].camera]) @ poses[number] for number in mine]
         drawn = [
             (views[n], lenses[views[n].camera], [cameras[views[n].camera] @ pose for pose in proposed]) for n in mine
