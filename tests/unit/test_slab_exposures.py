@@ -93,6 +93,16 @@ def test_without_noise_that_frames_tell_it_is_assumed(tmp_path: Path) -> None:
     assert read_images(root, read_folder(root), WAVELENGTH_NM).assumed_noise
 
 
+def test_a_beam_on_a_few_pixels_is_light(tmp_path: Path) -> None:
+    """Nine pixels of 2,304: the spread over the image is then that of the light and not of the noise."""
+    root, rng, lit = write_stack(tmp_path), np.random.default_rng(8), np.zeros((EDGE, EDGE, 1))
+    lit[23:26, 23:26] = 3000
+    for number, time_s in enumerate(TIMES_S):
+        np.save(root / f"f0_l0_{number}.npy", SENSOR.counts(lit, time_s, rng)[..., 0])
+    measured = read_images(root, read_folder(root), WAVELENGTH_NM)
+    assert measured.values[0].max() == pytest.approx(3000 / POWER, rel=0.1)
+
+
 def test_a_result_is_of_all_frames_it_was_made_from(tmp_path: Path) -> None:
     root = write_stack(tmp_path)
     before = fingerprint(root, WAVELENGTH_NM, SlabOptions())

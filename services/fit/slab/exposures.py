@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.raw.frames import read_counts
 from services.core.raw.merge import Exposure, merge
-from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
+from services.core.raw.noise import ROUNDING, LitPair, NoiseModel, read_noise, shot_noise
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.slab.exposures import SlabExposure
 from services.core.slab.folder import SlabFolder, SlabImage
@@ -29,6 +29,8 @@ ASSUMED = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
 """By which exposures are weighed where no frames tell the noise; variances are then assumed as for images that come without."""
 ABOVE_BLACK = 5.0
 """Standard errors of its mean by which a frame must be brighter than black, or it was taken with the beam off."""
+SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation of a normal distribution in units of its median distance from the median."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,7 @@ class _Stack:
         found = []
         for frame in (one for one in self.frames if one.light == image.light):
             exposure = self.exposure(frame, noise)
-            spread = float(np.std(exposure.signal)) / np.sqrt(exposure.signal.size)
-            if float(np.mean(exposure.signal)) <= ABOVE_BLACK * spread:
+            if float(np.mean(exposure.signal)) <= ABOVE_BLACK * _error_of_mean(exposure.signal):
                 raise CaptureInputError(
                     f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than the camera's black "
                     "frames; expose it for longer, or leave it out."
@@ -147,6 +148,12 @@ class _Stack:
         """NaN where full."""
         exposure = self.exposure(frame, NoiseModel(0.0, 0.0))
         return np.where(exposure.headroom > 0, exposure.signal, np.float32(np.nan)).astype(np.float32)
+
+
+def _error_of_mean(signal: Counts) -> float:
+    """Standard error of a frame's mean by its noise; by medians, as a narrow beam on a few pixels is no noise."""
+    spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(signal - np.median(signal))))
+    return float(np.sqrt((spread**2 + ROUNDING) / signal.size))
 
 
 def _setting(frame: SlabExposure) -> tuple[float, float]:
