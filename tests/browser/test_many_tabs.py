@@ -145,6 +145,7 @@ def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: 
     job = submit(page)
     page.goto(f"/#/{job}")
     until(page, lambda: len(bench.streams) == 1)
+    expect(page.locator(".job .badge")).to_have_text("running")  # or the page's first look at the job might come late
     page.evaluate(HIDE, arg=True)
     until(page, lambda: not bench.streams)
     bench.job.steps.release(STEPS)
