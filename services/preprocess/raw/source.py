@@ -18,7 +18,7 @@ from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView
 from services.preprocess.rig import MIN_TRACKING
 from services.preprocess.source import LightImage, Motions, View
-from services.preprocess.stabilisation.motion import ViewMotion, frames_to_match, jaws
+from services.preprocess.stabilisation.motion import ViewMotion, exposures_together, frames_to_match, jaws
 
 
 class RawSource:
@@ -84,7 +84,12 @@ class RawSource:
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """See ``Source``."""
         raw, taken = self._raw_view(view), self._of(view.whole.name)
-        return raw.motion.measure(frames, lambda row: raw.brightness(taken[row.index]))
+        together = {own[0].index: own for own in exposures_together(self._table(view.whole.name)) if own[0].light}
+
+        def picture(row: FrameRecord) -> NDArray[np.float32]:
+            return raw.brightness([taken[one.index] for one in together.get(row.index, (row,))])
+
+        return raw.motion.measure(frames, picture)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``: the exposures of one light at a time, merged."""

@@ -76,22 +76,30 @@ class RawView:
             None if camera.crosstalk is None else np.linalg.inv(np.array(camera.crosstalk)).astype(np.float32)
         )
 
-    def brightness(self, frame: RawFrame) -> Image:
-        """Mean of the channels of one frame in ``motion.window`` (H, W), undistorted; its unit does not matter."""
-        counts = self._frames.counts(frame, self._sampler.region)
-        means = self._means([self._sparse(frame, counts)])
+    def brightness(self, frames: Sequence[RawFrame]) -> Image:
+        """Mean of the channels of one frame, or of one light's exposures, in ``motion.window`` (H, W), undistorted; its unit does not matter."""
+        taken = [self._frames.counts(frame, self._sampler.region) for frame in frames]
+        means = self._means([self._sparse(frame, counts) for frame, counts in zip(frames, taken, strict=True)])
         height, width = self.motion.window.shape
         image = np.empty((height, width), dtype=np.float32)
-        for strip in strips(height, self._room.rows(1)):
+        for strip in strips(height, self._room.rows(len(frames))):
             parts = list(bands_of(strip, width))
             places = [self._sampler.places(_indices(rows, slice(0, width))) for rows in parts]
             held = self._sampler.source(places)
-            signal = self._exposure(frame, counts, held).signal
+            signal = self._light([self._exposure(*one, held) for one in zip(frames, taken, strict=True)])
             colour = signal if self._mosaic == "none" else demosaic(signal, self._mosaic, means)
             grey = colour.mean(axis=-1, keepdims=True)
             for rows, at in zip(parts, places, strict=True):
                 image[rows] = self._sampler.sampled(grey, at, held)[..., 0]
         return image
+
+    def _light(self, exposures: Sequence[Exposure]) -> Image:
+        """What was seen above black, in one unit; where every exposure is full, as bright as the shortest says, not dark."""
+        if len(exposures) == 1:
+            return exposures[0].signal
+        rate, _, lost = merge(exposures, self._frames.noise)
+        shortest = min(exposures, key=lambda one: one.factor)
+        return np.where(lost, shortest.signal / np.float32(shortest.factor), rate)
 
     def image(self, frames: Sequence[RawFrame], moves: Sequence[Displacement]) -> LightImage:
         """The exposures of one light, merged before they are interpolated where the subject was still between them, and after otherwise.

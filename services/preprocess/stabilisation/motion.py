@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +37,20 @@ def jaws(fdi: Sequence[int]) -> list[list[int]]:
 
 
 def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
-    """Tracking frames, which share one light; with fewer than two of them every light frame is matched to the first by its edges."""
+    """Tracking frames, which share one light; with fewer than two of them every light is matched to the first by its edges.
+
+    Of a light's exposures that follow one another the first stands for all: a short one may be all noise and a long one full, so that
+    neither shows an edge, and between them edges tell no motion that a subject makes in that time.
+    """
     tracking = tuple(frame for frame in frames if frame.kind == "tracking")
-    return tracking if len(tracking) >= 2 else tuple(frame for frame in frames if frame.kind == "light")
+    if len(tracking) >= 2:
+        return tracking
+    return tuple(own[0] for own in exposures_together(frames) if own[0].kind == "light")
+
+
+def exposures_together(frames: Sequence[FrameRecord]) -> list[tuple[FrameRecord, ...]]:
+    """Frames in order, those of one kind and light that follow one another together."""
+    return [tuple(own) for _, own in groupby(frames, key=lambda frame: (frame.kind, frame.light))]
 
 
 @dataclass(frozen=True)
@@ -78,6 +90,7 @@ class ViewMotion:
         self._view = view
         self._used = frames_to_match(frames)
         self._interpolated = self._used[0].kind == "tracking"
+        self._stands_for = {frame.index: own[0].index for own in exposures_together(frames) for frame in own}
         seen = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
         sides = [_shorter_side(one) for one in seen if one.any()]
         reach = int(np.ceil(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides))) + REACH_PX
@@ -99,7 +112,7 @@ class ViewMotion:
 
         Args:
             frames: numbers of some of ``frames_to_match``.
-            picture: values (H, W) or (H, W, C) of a frame in ``window``, linear in light above ``level``.
+            picture: values (H, W) or (H, W, C) in ``window``, linear in light above ``level``, of a frame, and of those that it stands for.
 
         Raises:
             CaptureInputError: moved too far to be aligned; names the frame and the camera.
@@ -135,7 +148,7 @@ class ViewMotion:
             knots = np.stack([motions[used.index] for used in self._used])
             coefficients, error = interpolate(index, knots, float(frame.index))
         else:
-            coefficients = motions[frame.index]
+            coefficients = motions[self._stands_for[frame.index]]
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # The shift's error stands for the field's: the other terms are small beside it

@@ -81,6 +81,26 @@ def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(text
     assert any("read noise of" in note for note in source.notes)
 
 
+@pytest.mark.parametrize("others_s", [(0.0005,), (5.0,), (0.0125, 3.2)])
+def test_exposures_that_show_nothing_move_no_subject(
+    textured: Path, tmp_path: Path, others_s: tuple[float, ...]
+) -> None:
+    """Without tracking frames edges are matched, and an exposure that is all noise or full has none: lights are found where one good exposure shows them.
+
+    Edges are good to about a pixel; the same edges with a little more or less noise to a tenth of that.
+    """
+    found = []
+    for name, exposures_s in (("one", (0.05,)), ("several", tuple(sorted((0.05, *others_s))))):
+        write_raw_capture(tmp_path / name, textured, Sensor(), exposures_s, tracking=0)
+        source = RawSource(tmp_path / name, None, 0.01, 0.002)
+        view = read_subject(source.root, whole=False).view_of(0, source.description.cameras[0])
+        motions = dict(source.match(view, source.matched(0)))
+        assert len(motions) == 3
+        assert all(image.motion_px is not None for _, image in source.images(view, (0, 1, 2), motions))
+        found.append([coefficients[:, 0] for coefficients in motions.values()])
+    assert np.abs(np.subtract(*found)).max() < 0.1
+
+
 def test_a_mosaic_becomes_radiance_of_all_channels(mouth: Path, tmp_path: Path) -> None:
     """Waves of 28 pixels through a mosaic: interpolation and 12 bits of noise leave 3 % rms, and no bias of 0.5 %."""
     write_raw_capture(tmp_path / "raw", mouth, Sensor(mosaic="GRBG"), (0.05, 0.2), flats=0)
