@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Beam, PixelGrid, SlabFolder
-from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults
+from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults, similarity_faults
 from services.fit.slab.dictionaries.chosen import ChosenDictionary
 from services.fit.slab.fit import fit_images
 from services.fit.slab.images import Measurements, shot_noise
@@ -77,6 +77,16 @@ def test_a_sample_that_tells_nothing_is_told_with_what_to_measure(
     found = sample_faults(henyey_greenstein(sigma_s, 0.5, sigma_a), width_mm=1.0)
     assert len(found) == len(sentences)
     assert all(told.startswith(sentence) for told, sentence in zip(found, sentences, strict=True))
+
+
+def test_a_thick_sample_of_which_only_the_reduced_scattering_is_fixed_is_told_how_to_dilute_it() -> None:
+    thick, thin = henyey_greenstein(9.0, 0.45, 0.0), henyey_greenstein(1.0, 0.45, 0.0)
+    (told,) = similarity_faults(thick, 1.0, scattering=False, reduced=True)
+    assert told.startswith("The images fix σs′, but not σs and g by themselves: at a σt·w of 9 ")
+    assert told.endswith("dilute it 4.5-fold, or take a cell of 0.22 mm.")
+    assert similarity_faults(thick, 1.0, scattering=True, reduced=True) == ()
+    assert similarity_faults(thick, 1.0, scattering=False, reduced=False) == ()
+    assert similarity_faults(thin, 1.0, scattering=False, reduced=True) == ()
 
 
 @pytest.mark.slow

@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import henyey_greenstein
+from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein
 from services.fit.slab.model.forward import Batches
-from services.fit.slab.solve.normal import UNKNOWNS, DerivativeSums, NormalEquations, normal_equations
+from services.fit.slab.solve.normal import (
+    UNKNOWNS,
+    DerivativeSums,
+    NormalEquations,
+    ResidualSums,
+    normal_equations,
+)
 from services.fit.slab.solve.weights import independent_weights
 
 MATERIAL = henyey_greenstein(5.0, 0.5, 0.1)
@@ -22,6 +28,7 @@ DRAWS = 100
 SIGNAL = np.random.default_rng(1).standard_normal((IMAGES, PIXELS, SEEN))
 RESIDUAL = SIGNAL @ np.array([0.3, -0.2, 0.5]) + np.random.default_rng(2).standard_normal((IMAGES, PIXELS))
 """Of images without the paths' noise: what is left of the way, and a measurement's noise of one."""
+NO_SINGLE = np.zeros((IMAGES, PIXELS)), np.zeros((IMAGES, PIXELS, UNKNOWNS))
 
 
 def noisy_rows(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -30,12 +37,19 @@ def noisy_rows(rng: np.random.Generator, count: int) -> np.ndarray:
     return rows
 
 
-def equations(rng: np.random.Generator, earlier: DerivativeSums | None) -> NormalEquations:
+def equations(
+    rng: np.random.Generator, earlier: DerivativeSums | None, near: ResidualSums | None = None
+) -> NormalEquations:
     images = RESIDUAL + rng.standard_normal((COUNT, IMAGES, PIXELS))
     weights = independent_weights(np.ones((IMAGES, PIXELS)), np.zeros((IMAGES, PIXELS)))
     # With ways of zero, sums of shares are the derivatives themselves.
     return normal_equations(
-        Batches(images, noisy_rows(rng, COUNT)), MATERIAL, np.zeros((IMAGES, PIXELS)), weights, earlier
+        Batches(images, noisy_rows(rng, COUNT), *NO_SINGLE),
+        MATERIAL,
+        np.zeros((IMAGES, PIXELS)),
+        weights,
+        earlier,
+        near,
     )
 
 
@@ -116,3 +130,34 @@ def test_none_are_as_no_earlier_render() -> None:
     one, other = equations(rng[0], None), equations(rng[1], nothing)
     for name in ("gradient", "matrix", "gradient_noise", "noise", "noise_gradient", "matrix_error", "data_noise"):
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12, abs=1e-12)
+
+
+def test_residuals_of_renders_before_join_without_bias_and_with_less_noise() -> None:
+    rng = np.random.default_rng(8)
+    found, alone = [], []
+    for _ in range(DRAWS):
+        first = equations(rng, None)
+        second = equations(rng, first.derivatives, first.residuals)
+        found.append(equations(rng, second.derivatives, second.residuals))
+        alone.append(equations(rng, second.derivatives))
+    assert found[0].residuals.count == 3 * COUNT
+    true = np.einsum("ipu,ip->u", SIGNAL, RESIDUAL)
+    values = np.stack([one.gradient[:SEEN] for one in found])
+    spread = values.std(axis=0)
+    assert np.abs((values.mean(axis=0) - true) / (spread / np.sqrt(DRAWS))).max() < 4
+    assert (spread < np.std([one.gradient[:SEEN] for one in alone], axis=0)).all()
+
+
+def test_the_gradient_is_that_at_the_mean_of_the_media_whose_residuals_join() -> None:
+    nearer = Material(1.1 * MATERIAL.scattering, MATERIAL.absorption_per_mm)
+    one = ResidualSums(np.ones(3), np.ones(UNKNOWNS), 4, unknowns(MATERIAL))
+    both = one + ResidualSums(np.ones(3), np.ones(UNKNOWNS), 12, unknowns(nearer))
+    assert both.count == 16
+    np.testing.assert_allclose(
+        both.place - unknowns(MATERIAL), np.append(np.full(KNOTS, 0.75 * np.log(1.1)), 0), atol=1e-12
+    )
+    np.testing.assert_array_equal(equations(np.random.default_rng(1), None).residuals.place, unknowns(MATERIAL))
+
+
+def unknowns(material: Material) -> np.ndarray:
+    return np.append(np.log(material.scattering), material.absorption_per_mm)

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from services.fit.slab.model.dictionary import henyey_greenstein
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import Quadratic
-from services.fit.slab.solve.seen import broad_step, seen_of, step_matrix
+from services.fit.slab.solve.seen import broad_step, noise_ratio, seen_of, step_matrix
 
 BROAD = Knots().broad()
+REACH = Knots().reach(henyey_greenstein(5.0, 0.5, 0.0))
 WEAK = BROAD[:, 0] / np.linalg.norm(BROAD[:, 0])
 """sigma_s at a constant shape: the direction that holds the only signal here."""
 SPREAD = 0.02
@@ -20,6 +22,8 @@ SPREAD = 0.02
 those of ten directions 0.13."""
 SIGNAL = 0.3
 PRIOR = 0.01 * np.eye(UNKNOWNS)
+GRADIENT_NOISE = 0.01 * np.eye(UNKNOWNS)
+"""Small, so that chance in the matrix alone holds a step."""
 
 
 def chance(rng: np.random.Generator) -> np.ndarray:
@@ -54,7 +58,7 @@ def test_two_steps_go_most_of_the_way_along_a_broad_direction() -> None:
         assert np.linalg.eigvalsh(matrix)[0] > 0
         first = np.linalg.solve(matrix, -one.linear)
         alone.append(float(first @ WEAK))
-        both.append(float((first + broad_step(one, PRIOR, BROAD, first)) @ WEAK))
+        both.append(float((first + broad_step(one, PRIOR, BROAD, REACH, GRADIENT_NOISE, first)) @ WEAK))
     # Chance makes a single way shorter or longer, by about 0.1 in 0.3; ten of them show the mean.
     assert np.mean(alone) < 0.3
     assert np.mean(both) > 1.8 * np.mean(alone)
@@ -64,9 +68,25 @@ def test_two_steps_go_most_of_the_way_along_a_broad_direction() -> None:
 def test_a_broad_step_moves_nothing_else_and_not_where_chance_bends_the_matrix_down() -> None:
     other = np.zeros(UNKNOWNS)
     other[50:52] = np.sqrt(0.5), -np.sqrt(0.5)
-    step = broad_step(quadratic(1), PRIOR, BROAD, np.zeros(UNKNOWNS))
+    step = broad_step(quadratic(1), PRIOR, BROAD, REACH, GRADIENT_NOISE, np.zeros(UNKNOWNS))
     # Cosines of up to eight times the angle differ by less than 8 times a knot's 0.9 degrees between neighbours.
     assert abs(other @ step) < 0.13 * np.abs(step).max()
-    bent = replace(quadratic(1), matrix=-np.eye(UNKNOWNS))
-    assert not broad_step(bent, PRIOR, BROAD, np.ones(UNKNOWNS)).any()
-    assert not broad_step(quadratic(1), PRIOR, BROAD[:, :0], np.ones(UNKNOWNS)).any()
+    bent, nothing = replace(quadratic(1), matrix=-np.eye(UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
+    assert not broad_step(bent, nothing, BROAD, REACH, GRADIENT_NOISE, np.ones(UNKNOWNS)).any()
+    assert not broad_step(quadratic(1), PRIOR, BROAD[:, :0], REACH[:0], GRADIENT_NOISE, np.ones(UNKNOWNS)).any()
+
+
+def test_a_broad_step_goes_no_further_than_the_gradients_noise_lets_it() -> None:
+    gradient = 30 * np.eye(UNKNOWNS)
+    ways = [
+        float(broad_step(quadratic(1), PRIOR, BROAD, REACH, share * gradient, np.zeros(UNKNOWNS)) @ WEAK)
+        for share in (1e-4, 1, 100)
+    ]
+    assert ways[0] > ways[1] > ways[2] > 0
+    # A hundred times the noise lets the prior hold it: what is left goes as one over the noise.
+    assert ways[2] < 0.05 * ways[1] * (1 + ways[0] / ways[1])
+
+
+def test_the_gradients_noise_is_told_in_units_of_images_that_fit() -> None:
+    one = quadratic(1, signal=3.0)
+    assert noise_ratio(one, PRIOR, 4 * (one.matrix + one.noise)) == pytest.approx(4)

@@ -10,13 +10,13 @@ import pytest
 
 from services.fit.slab.model.dictionary import Material, henyey_greenstein
 from services.fit.slab.solve.mixture import Mixture
-from services.fit.slab.solve.normal import DerivativeSums
+from services.fit.slab.solve.normal import DerivativeSums, ResidualSums
 from services.fit.slab.solve.standing import FILE, Joined, Standing, StandingFile
 
 
 def standing(material: Material, joined: Joined | None = None) -> Standing:
     noise = tuple(np.random.default_rng(k).random((4, 2, 2)) for k in range(11))
-    return Standing(material, 1, 2, 7, True, 12, 345_678, noise, joined)
+    return Standing(material, 1, 2, 7, True, 12, 345_678, noise, np.arange(12.0).reshape(3, 4), joined)
 
 
 def parts(one: object) -> list[np.ndarray]:
@@ -40,6 +40,7 @@ JOINED = Joined(
     DerivativeSums(
         np.random.default_rng(3).random((2, 8, 201)), np.random.default_rng(4).random((2, 201, 201)), (4, 5)
     ),
+    ResidualSums(np.arange(8.0), np.arange(201.0), 6, -np.arange(201.0)),
     (np.arange(4.0), np.arange(3.0)),
 )
 

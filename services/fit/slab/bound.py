@@ -18,14 +18,16 @@ from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, precision
+from services.fit.slab.solve.prior import SCALES, THICK, Quadratic, flag_scales, precision
+from services.fit.slab.solve.smooth import smoother_of
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 from services.fit.slab.solve.weights import independent_weights
 
 Array = NDArray[np.float64]
 
-BATCHES, PATHS = 8, 8000
-"""Of the render that gives the curvature: as many as a step of the search takes."""
+BATCHES, PATHS, PATHS_THICK = 8, 8000, 60_000
+"""Of the render that gives the curvature: as many as a step of the search takes, and more where sigma_t w exceeds ``prior.THICK``. There
+noise passes for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
 FIRST_STEP = 2**33
 """Numbers its random streams apart from a fit's."""
 
@@ -57,7 +59,7 @@ def bound_of(
     variances: Array | None = None,
     seed: int = 1,
     scale: float | None = None,
-    paths: int = PATHS,
+    paths: int | None = None,
     blocks: Blocks = map,
 ) -> Bound:
     """The bound from images with shot noise.
@@ -65,6 +67,7 @@ def bound_of(
     Args:
         noise: standard deviation of a pixel that has its image's mean, as a share of it.
         variances: of the measurement beside its shot noise (images, values), such as a reference's own.
+        paths: of a batch and light, instead of the number that the thickness asks for.
         scale: of the smoothness prior, per rad2; the loosest that a fit may choose where it is not given.
     """
     quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
@@ -83,15 +86,20 @@ def curvature_of(
     noise: float,
     variances: Array | None = None,
     seed: int = 1,
-    paths: int = PATHS,
+    paths: int | None = None,
     blocks: Blocks = map,
 ) -> Quadratic:
     """What images tell of ln f and sigma_a; arguments as of ``bound_of``."""
+    thick = material.extinction_per_mm * rig.width_mm > THICK
+    paths = paths or (PATHS_THICK if thick else PATHS)
     batches = render(
         rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths, scores=True, blocks=blocks
     )
     mean = batches.mean
     halves = 2 if rig.grid.folded else 1
     shot = np.stack([shot_noise(image, noise) for image in mean]) / halves
-    weights = independent_weights(shot + (0 if variances is None else variances), np.zeros_like(shot))
+    total = shot + (0 if variances is None else variances)
+    if thick:
+        batches = smoother_of(rig.grid, rig.width_mm, mean - batches.single_images, total).of(batches)
+    weights = independent_weights(total, np.zeros_like(shot))
     return quadratic_at(Knots().unknowns(material), normal_equations(batches, material, mean, weights))

@@ -92,6 +92,20 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
     return tuple(told)
 
 
+def similarity_faults(material: Material, width_mm: float, *, scattering: bool, reduced: bool) -> tuple[str, ...]:
+    """Whether only sigma_s' is fixed, as in thick samples, and what would tell sigma_s and g apart.
+
+    Args:
+        scattering: whether the images determine sigma_s; ``reduced`` says so of sigma_s'.
+    """
+    thickness = material.extinction_per_mm * width_mm
+    if scattering or not reduced or thickness <= BEST:
+        return ()
+    remedy = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
+    what = f"The images fix σs′, but not σs and g by themselves: at a σt·w of {thickness:.2g} light has forgotten its single deflections"
+    return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
+
+
 def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
     """Whether the images are beyond what a dictionary of few atoms can make; the tents can make any.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.store import write_atomic
-from services.fit.slab.diagnosis import mixture_faults, sample_faults
+from services.fit.slab.diagnosis import mixture_faults, sample_faults, similarity_faults
 from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.model.dictionary import Material
@@ -92,15 +92,21 @@ def fit_images(
         if not dictionary.names
         else ""
     )
-    phase = phase_of(material, uncertainty)
+    parameters, phase = parameters_of(material, uncertainty, index), phase_of(material, uncertainty)
     first, second = last_look(rig, material, solver.budget, options.seed, blocks)
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
-        parameters=parameters_of(material, uncertainty, index),
+        parameters=parameters,
         phase=phase,
         errors=_errors(measured, first, second),
         notes=measured.faults
         + sample_faults(material, rig.width_mm)
+        + similarity_faults(
+            material,
+            rig.width_mm,
+            scattering=parameters.sigma_s.determined,
+            reduced=parameters.sigma_s_reduced.determined,
+        )
         + mixture_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
         + _notes(measured, phase, converged=solution.converged)
         + ((advice,) if advice else ()),

@@ -56,6 +56,11 @@ class Material:
         return float(self.scattering @ cosine_moments()) / self.scattering_per_mm
 
     @property
+    def reduced_scattering_per_mm(self) -> float:
+        """sigma_s' = sigma_s (1 - g)."""
+        return self.scattering_per_mm * (1 - self.mean_cosine)
+
+    @property
     def phase_per_sr(self) -> Array:
         """Phase function at the knots, 1/sr (KNOTS,)."""
         return self.scattering / self.scattering_per_mm

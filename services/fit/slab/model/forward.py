@@ -64,6 +64,10 @@ class Batches:
 
     images: Array
     rows: Array
+    single_images: Array
+    """What has scattered once, which is the same in all batches and has no noise (images, pixels)."""
+    single_rows: Array
+    """(images, pixels, KNOTS + 1)."""
 
     @property
     def mean(self) -> Array:
@@ -107,7 +111,7 @@ def render(
         images[number, seen] += sums.images
         if scores:
             rows[number, seen] += sums.rows
-    return Batches(images, rows)
+    return Batches(images, rows, first_images, first_rows)
 
 
 def _late_share(block: Block) -> float:

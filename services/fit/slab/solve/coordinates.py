@@ -6,13 +6,14 @@ end with sigma_a. The forward model tells derivatives by ln f and sigma_a, and e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales, precision
 
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 LARGEST_CHANGE = 1.0
 """Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
 
+LONGEST = 0.3
+"""Of ln sigma_s in one step of a thick cell."""
 BROAD = 9
 """Multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells tell of none that is smaller."""
 
@@ -52,11 +55,17 @@ class Coordinates(Protocol):
     def broad(self) -> Array:
         """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where unknowns are few."""
 
+    def reach(self, material: Material) -> Array:
+        """Standard deviations (K,) of how far off a medium may be along these directions."""
+
     def minimum(self, matrix: Array, right: Array) -> Array:
         """The x within bounds at which x^T matrix x / 2 - right^T x is least."""
 
     def held_back(self, change: Array, material: Material) -> Array:
         """A step of which no unknown moves further than a linearisation is good for."""
+
+    def similar(self, change: Array, material: Material) -> Array:
+        """A step in a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with sigma_s'."""
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
         """Which unknowns lie at a bound that they may not pass."""
@@ -100,6 +109,10 @@ class Knots:
         directions[KNOTS, BROAD] = 1
         return directions
 
+    def reach(self, material: Material) -> Array:
+        """As a Henyey-Greenstein start may be: by a factor of e in sigma_s, and less in what turns faster with the angle."""
+        return np.append(1 / np.maximum(np.arange(BROAD), 1.0) ** 2, 0.1 * material.extinction_per_mm)
+
     def minimum(self, matrix: Array, right: Array) -> Array:
         """For all unknowns; where the absorption comes out negative, for the others with none."""
         x = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
@@ -110,6 +123,16 @@ class Knots:
     def held_back(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
         """Each unknown by itself."""
         return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+
+    def similar(self, change: Array, material: Material) -> Array:
+        """No longer than is good for, and with f scaled so that sigma_s' becomes what the step says to first order."""
+        slope = reduced_scattering_slope(material)
+        length = abs(float(material.slope_of_scattering() @ change)) / material.scattering_per_mm
+        step = change * min(1.0, LONGEST / max(length, 1e-300))
+        moved = self.material_at(self.unknowns(material) + step)
+        aimed = math.log(material.reduced_scattering_per_mm) + float(slope @ step)
+        step[:KNOTS] += aimed - math.log(moved.reduced_scattering_per_mm)
+        return np.asarray(step)
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
         """None counts as bound: ln f has no bound, and the ± of an absorption at zero are those of a free one."""
@@ -130,3 +153,9 @@ class Knots:
             if sign > 0
             else -np.inf
         )
+
+
+def reduced_scattering_slope(material: Material) -> Array:
+    """Derivatives of ln sigma_s' by ln f and sigma_a (UNKNOWNS,)."""
+    parts = material.scattering * (tent_solid_angles() - cosine_moments())
+    return np.append(parts / material.reduced_scattering_per_mm, 0.0)

@@ -8,6 +8,7 @@ finish      one more step, from many more paths
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,9 +20,10 @@ from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Coordinates
-from services.fit.slab.solve.normal import NormalEquations, normal_equations
+from services.fit.slab.solve.normal import NormalEquations, ResidualSums, normal_equations
 from services.fit.slab.solve.prior import THICK, Quadratic
-from services.fit.slab.solve.seen import broad_step, step_matrix
+from services.fit.slab.solve.seen import broad_step, noise_ratio, step_matrix
+from services.fit.slab.solve.smooth import Smoother, smoother_of
 from services.fit.slab.solve.standing import Joined, Standing, StandingFile
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
@@ -35,6 +37,10 @@ WORTHWHILE = 2.0
 UNFINISHED, UNFINISHED_THICK = 5.0, 1.0
 """At the end, a step that promised more than so many times what noise does is followed by another. Where sigma_t w exceeds ``prior.THICK``,
 what is left along sigma_s at a constant sigma_s' promises little beside the noise of all directions and is still a tenth of sigma_s."""
+NEAR = 0.05
+"""Of ln sigma_s, within which residuals of several media join: what is not linear is then below a thousandth."""
+ENOUGH_PATHS = 0.5
+"""At the end of a fit of a thick cell the variance by its paths is to be at most so many times that by the measurements."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it strayed."""
 
@@ -116,6 +122,8 @@ class GaussNewton:
     paths: int = 0
     path_noise: tuple[Array, ...] | None = None
     """Monte Carlo covariance of one path by light (pixels, C, C), a running mean over the renders before."""
+    multiple: Array | None = None
+    """What has scattered twice and more (images, pixels), the same mean of renders."""
     joined: Joined | None = None
     """Renders of this stage that later ones join, in a thick cell."""
     kept: StandingFile | None = None
@@ -127,7 +135,7 @@ class GaussNewton:
         if standing is None:
             return self.finish(self.search(guess()))
         self.renders, self.paths, self.path_noise = standing.renders, standing.paths, standing.path_noise
-        self.joined = standing.joined
+        self.multiple, self.joined = standing.multiple, standing.joined
         return self.finish(standing)
 
     def search(self, material: Material) -> Standing:
@@ -139,7 +147,10 @@ class GaussNewton:
             state, converged = self.step(state)
             steps += 1
         assert self.path_noise is not None
-        return Standing(state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise, None)
+        assert self.multiple is not None
+        return Standing(
+            state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise, self.multiple, None
+        )
 
     def init(self, material: Material) -> State:
         """The first point."""
@@ -151,12 +162,16 @@ class GaussNewton:
         x = self.coordinates.unknowns(state.material)
         quadratic = quadratic_at(x, state.equations)
         prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic))
-        change = self.change(quadratic, prior, state.material, state.damping)
+        change = self.change(quadratic, prior, state.equations, state.material, state.damping)
         promise = promised(quadratic, prior, x, change)
         noise = noise_of_promise(quadratic, prior, state.equations.gradient_noise)
         if promise < WORTHWHILE * noise and state.paths >= self.budget.search_paths:
             return state, True
         paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
+        if paths > state.paths and self.is_thick(state.material):
+            # Weights there are mostly those of the paths, so misfits of different numbers of paths cannot be compared.
+            again = self.linearised(state.material, paths, self.budget.batches)
+            return State(state.material, again, paths, state.damping), False
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
         for halving in range(MAX_HALVINGS + 1):
             y = x + change / 2**halving
@@ -178,13 +193,19 @@ class GaussNewton:
             material, (paths, batches) = standing.material, self.budget.last[standing.stage]
             equations = self.linearised(material, paths, batches, join=self.is_thick(material))
             x = self.coordinates.unknowns(material)
-            quadratic = quadratic_at(x, equations)
+            # Where residuals of media near by join, the gradient is that at the mean of these media.
+            centre = x if self.coordinates.chain(material) is not None else equations.residuals.place
+            quadratic = quadratic_at(centre, equations)
             scale = self.coordinates.scale(material, quadratic)
             prior = self.coordinates.precision(scale)
-            change = self.change(quadratic, prior, material, DAMPING)
+            change = self.change(quadratic, prior, equations, material, DAMPING)
             moved = self.coordinates.material_at(x + change)
             worth = promised(quadratic, prior, x, change) / noise_of_promise(quadratic, prior, equations.gradient_noise)
-            standing = self.after(standing, moved, worth)
+            rest = 0.0
+            if self.is_thick(material) and standing.stage + 1 == len(self.budget.last):
+                data = noise_of_promise(quadratic, prior, equations.data_noise)
+                rest = noise_of_promise(quadratic, prior, equations.gradient_noise) / data
+            standing = self.after(standing, moved, worth, rest)
         return Solution(
             moved, quadratic, equations.gradient_noise, scale, equations.used, standing.search_steps,
             standing.is_converged and worth < UNFINISHED, self.paths,
@@ -193,19 +214,19 @@ class GaussNewton:
             equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
         )  # fmt: skip
 
-    def after(self, standing: Standing, moved: Material, worth: float) -> Standing:
+    def after(self, standing: Standing, moved: Material, worth: float, rest: float) -> Standing:
         """The next step of the stage, or the first of the next stage where this one has ended.
 
         Args:
             worth: what the last step promised, in units of what noise alone does.
+            rest: noise of the paths in units of that of the measurements, where more of them help: renders of a stage join.
         """
-        enough, most = (
-            (UNFINISHED_THICK, self.budget.most_last_thick)
-            if self.is_thick(moved)
-            else (UNFINISHED, self.budget.most_last)
-        )
-        is_over = worth < enough or standing.step + 1 >= most
+        thick = self.is_thick(moved)
+        enough, most = (UNFINISHED_THICK, self.budget.most_last_thick) if thick else (UNFINISHED, self.budget.most_last)
+        went = abs(math.log(moved.scattering_per_mm / standing.material.scattering_per_mm))
+        is_over = (worth < enough and rest < ENOUGH_PATHS and (went < NEAR or not thick)) or standing.step + 1 >= most
         assert self.path_noise is not None
+        assert self.multiple is not None
         if is_over:
             self.joined = None  # the next stage has batches of another size
         return replace(
@@ -216,6 +237,7 @@ class GaussNewton:
             renders=self.renders,
             paths=self.paths,
             path_noise=self.path_noise,
+            multiple=self.multiple,
             joined=self.joined,
         )
 
@@ -223,24 +245,32 @@ class GaussNewton:
         """Whether cameras of one side see nearly the same of every path, and sigma_s and g are hardly told apart."""
         return material.extinction_per_mm * self.rig.width_mm > THICK
 
-    def change(self, quadratic: Quadratic, prior: Array, around: Material, damping: float) -> Array:
+    def change(
+        self, quadratic: Quadratic, prior: Array, equations: NormalEquations, around: Material, damping: float
+    ) -> Array:
         """The step to the damped minimum, no unknown further than is good.
 
         The Levenberg term is about the present point: what noise may have bent is held there. It moves no fixed point, so that
         repeated steps from fresh paths end where an undamped one would.
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
-        if not self.is_thick(around):
+        noise = equations.gradient_noise + equations.data_noise
+        if self.is_thick(around):
+            damping *= max(1.0, noise_ratio(quadratic, prior, noise))
+        else:
             broad = broad[:, :0]  # in a thin cell signals stand out, and a second step only adds noise
         matrix = step_matrix(quadratic, prior, damping)
         slope = quadratic.linear + (quadratic.matrix + prior) @ x
         first = x + self.coordinates.held_back(self.coordinates.minimum(matrix, matrix @ x - slope) - x, around)
-        second = first + broad_step(quadratic, prior, broad, first)
-        if second[-1] < 0 and broad.size:
+        if not broad.size:
+            return self.coordinates.held_back(first - x, around)
+        reach = self.coordinates.reach(around)
+        second = first + broad_step(quadratic, prior, broad, reach, noise, first)
+        if second[-1] < 0:
             # No absorption below zero: the others go where they are best with none.
             first[-1] = 0
-            second = first + broad_step(quadratic, prior, broad[:, :-1], first)
-        return self.coordinates.held_back(second - x, around)
+            second = first + broad_step(quadratic, prior, broad[:, :-1], reach[:-1], noise, first)
+        return self.coordinates.similar(self.coordinates.held_back(second - x, around), around)
 
     def linearised(self, material: Material, paths: int, batches: int, *, join: bool = False) -> NormalEquations:
         """Normal equations of fresh batches.
@@ -268,6 +298,11 @@ class GaussNewton:
         earlier = self.joined if join else None
         known = recent if earlier is None else earlier.path_noise
         variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
+        multiple = estimates.mean - estimates.single_images
+        before = multiple if self.multiple is None else self.multiple
+        if self.is_thick(material):
+            estimates = self.smoother(before, variances, [one / (batches * paths) for one in recent]).of(estimates)
+        self.multiple = (multiple + before) / 2
         noise = [one / (batches * paths) for one in known]
         if not self.is_thick(material):
             # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would only add noise.
@@ -275,10 +310,30 @@ class GaussNewton:
         weights = weights_of(seen, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))
         equations = normal_equations(
-            estimates, material, self.measured.values, weights, None if earlier is None else earlier.derivatives
+            estimates,
+            material,
+            self.measured.values,
+            weights,
+            None if earlier is None else earlier.derivatives,
+            self.near(earlier, material),
         )
-        self.joined = Joined(equations.derivatives, known) if join else None
+        self.joined = Joined(equations.derivatives, equations.residuals, known) if join else None
         return equations.chained(self.coordinates.chain(material))
+
+    def near(self, earlier: Joined | None, material: Material) -> ResidualSums | None:
+        """Residuals of renders before, where these are of media so near that derivatives tell how they would be here."""
+        if earlier is None or self.coordinates.chain(material) is not None:
+            return None
+        place = self.coordinates.material_at(earlier.residuals.place)
+        moved = abs(math.log(material.scattering_per_mm / place.scattering_per_mm))
+        return earlier.residuals if moved < NEAR else None
+
+    def smoother(self, multiple: Array, variances: Array, noise: list[Array]) -> Smoother:
+        """Smoothing of derivatives by what renders before have seen; ``noise`` as of ``weights_of``."""
+        own = np.zeros_like(variances)
+        for views, one in zip(self.rig.lights, noise, strict=True):
+            own[views.images] = np.einsum("pii->ip", one)
+        return smoother_of(self.rig.grid, self.rig.width_mm, multiple, variances + own)
 
 
 def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:

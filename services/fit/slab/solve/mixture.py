@@ -93,6 +93,14 @@ class Mixtures:
         """None: atoms are few, and each is judged by its bound."""
         return np.zeros((self.atoms.shape[1] + 1, 0))
 
+    def reach(self, material: Material) -> Array:  # noqa: ARG002 - there are no such directions
+        """None."""
+        return np.zeros(0)
+
+    def similar(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
+        """The step itself."""
+        return change
+
     def minimum(self, matrix: Array, right: Array) -> Array:
         """By non-negative least squares: with matrix = R^T R, |R x - R^-T right|^2 is least."""
         # In units in which the diagonal is 1, as an absorption and a weight differ.

@@ -10,6 +10,9 @@ each over a != b and divided by B (B - 1). One batch alone would add the power o
 Derivatives of E batches rendered before, with the same weights, may join: then J_a and J_b of the matrix run over all, and J_a of the
 gradient does, with the divisor B (B + E - 1). Their noise is independent of the present images whatever medium they were taken at, so
 the gradient is still zero where images fit. In a thick cell most of its noise is that of J times the residuals, and falls with E.
+
+Residuals of media near by may join as well, as J tells how they would be here: then the gradient is that at the mean of all their
+media, with the divisor R (B + E - 1) for residuals of R batches.
 """
 
 from __future__ import annotations
@@ -66,6 +69,25 @@ def _over_pairs(summed: Array, own: Array, count: int) -> Array:
 
 
 @dataclass(frozen=True)
+class ResidualSums:
+    """Sums over batches of whitened residuals, which may be of several media."""
+
+    total: Array
+    """(images * pixels,)."""
+    products: Array
+    """Of each batch's J^T W (C - y) (UNKNOWNS,)."""
+    count: int
+    place: Array
+    """Mean of the media's ln f and sigma_a over the batches (UNKNOWNS,)."""
+
+    def __add__(self, other: ResidualSums) -> ResidualSums:
+        """Of both sets of batches."""
+        count = self.count + other.count
+        place = (self.count * self.place + other.count * other.place) / count
+        return ResidualSums(self.total + other.total, self.products + other.products, count, place)
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """A quadratic model of half the misfit around one material, in U unknowns."""
 
@@ -88,6 +110,8 @@ class NormalEquations:
     """Number of pixels."""
     derivatives: DerivativeSums
     """By ln f and sigma_a whatever the unknowns are: what later equations of the same weights may join."""
+    residuals: ResidualSums
+    """The same; the gradient is that at their place."""
 
     def chained(self, chain: Array | None) -> NormalEquations:
         """The same in other unknowns, by the derivatives (UNKNOWNS, U) of these; None leaves them as they are."""
@@ -112,13 +136,19 @@ def derivative_rows(rows: Array, material: Material) -> Array:
 
 
 def normal_equations(
-    batches: Batches, material: Material, values: Array, weights: Weights, earlier: DerivativeSums | None = None
+    batches: Batches,
+    material: Material,
+    values: Array,
+    weights: Weights,
+    earlier: DerivativeSums | None = None,
+    near: ResidualSums | None = None,
 ) -> NormalEquations:
     """Sums over all pixels that weigh.
 
     Args:
         values: measurements (images, pixels).
         earlier: derivatives of batches before, whitened by the same weights.
+        near: residuals of some of these batches, of media near by.
     """
     residuals = weights.whitened(batches.images - values).reshape(len(batches.images), -1)
     count = len(residuals)
@@ -146,11 +176,14 @@ def normal_equations(
     present = DerivativeSums(halves, own, (middle, count - middle))
     every = present if earlier is None else earlier + present
     matrix = every.matrix()
-    # Pairs of two present batches stand in the terms twice, those with an earlier one once.
-    gradient = terms.mean(axis=0) / 2 + before.T @ total / (2 * count * others)
+    place = np.append(np.log(material.scattering), material.absorption_per_mm)
+    own_products = np.sum([j.reshape(-1, UNKNOWNS).T @ r for j, r in zip(jacobians, residuals, strict=True)], axis=0)
+    seen = ResidualSums(total, own_products, count, place)
+    seen = seen if near is None else seen + near
+    gradient = (whole.T @ seen.total - seen.products) / (seen.count * others)
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
     parts = terms - terms.mean(axis=0)
-    gradient_noise = parts.T @ parts / pairs
+    gradient_noise = parts.T @ parts / pairs * (count / seen.count)
     # The noise of earlier derivatives meets that of the measurements alike in all batches, where no spread shows it: so it counts here.
     scattered = weights.of_measurements(whole.reshape(jacobians[0].shape)[None])[0].reshape(-1, UNKNOWNS)
     mean = whole / every.count
@@ -160,6 +193,6 @@ def normal_equations(
     misfit_se = float(np.sqrt((variance * (np.maximum(products, 0) + variance / 2)).sum()))
     return NormalEquations(
         misfit, misfit_se, gradient, matrix, gradient_noise, noise=mean.T @ mean - matrix,
-        noise_gradient=mean.T @ total / count - gradient, used=int(weights.used.sum()), matrix_error=every.matrix_error(),
-        data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count), derivatives=every,
+        noise_gradient=mean.T @ seen.total / seen.count - gradient, used=int(weights.used.sum()), matrix_error=every.matrix_error(),
+        data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count), derivatives=every, residuals=seen,
     )  # fmt: skip

@@ -19,8 +19,10 @@ Array = NDArray[np.float64]
 
 MIN_SIGNAL = 0.1
 """Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
-HELD = 1.0
-"""What holds a step in broad directions, in units of what the matrix may be off by there."""
+
+
+TURNS = 10
+"""By which a step and the noise that its length makes agree; the second is within a few per cent already."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +70,53 @@ def step_matrix(quadratic: Quadratic, prior: Array, damping: float) -> Array:
     return np.asarray(quadratic.matrix + prior + damping * quadratic.noise + _ridge(quadratic))
 
 
-def broad_step(quadratic: Quadratic, prior: Array, broad: Array, x: Array) -> Array:
+def broad_step(
+    quadratic: Quadratic, prior: Array, broad: Array, reach: Array, gradient_noise: Array, x: Array
+) -> Array:
     """A second step (U,) from x, along broad directions alone and not held by the noise of J.
 
     That noise adds up over all pixels, but the unbiased matrix is off by its fluctuation alone, which many pixels average. In a thick
     cell the direction of sigma_s at a constant sigma_s' has less signal than noise: held by all of it, steps went a tenth of their
     way there, and fits ended where their budget did. Both steps in turn are a cycle of two grids.
+
+    The gradient is taken for a measurement g = -M d + noise of the way d. In directions of signal s and unit noise of J an element
+    of M is off by about h sqrt(1 + s_i + s_j), so an element of g has a variance of h^2 sum_j (1 + s_i + s_j) d_j^2 beside its own.
+    With R the covariance of both, and T what d may be beforehand, the most probable way has (M R^-1 M + T^-1 + prior) d =
+    -M R^-1 g - prior x: all of it where signals stand out, none of it where they do not. As R depends on d, it is found in turns.
+
+    Args:
+        broad: directions (U, K).
+        reach: standard deviations (K,) of how far the way may be along them.
+        gradient_noise: covariance of the gradient (U, U).
     """
     if not broad.size:
         return np.zeros(len(x))
-    reference = prior + quadratic.noise + _ridge(quadratic)
-    # Units in which each direction has unit noise, as ln f and an absorption differ.
-    unit = broad / np.sqrt(np.einsum("ik,ij,jk->k", broad, reference, broad, optimize=True))
-    own = unit.T @ reference @ unit
-    chance = np.abs(linalg.eigh(unit.T @ quadratic.error @ unit, own, eigvals_only=True)).max()
-    matrix = unit.T @ (quadratic.matrix + prior) @ unit + HELD * chance * own
-    if np.linalg.eigvalsh(matrix)[0] <= 0:
-        return np.zeros(len(x))
-    slope = quadratic.linear + (quadratic.matrix + prior) @ x
-    return np.asarray(unit @ np.linalg.solve(matrix, -(unit.T @ slope)))
+    own = broad.T @ (quadratic.noise + _ridge(quadratic)) @ broad
+    found, vectors = linalg.eigh(broad.T @ quadratic.matrix @ broad, own)
+    axes = broad @ vectors
+    signals = np.maximum(found, 0)
+    sums = 1 + signals[:, None] + signals
+    chance = float(
+        (np.abs(np.einsum("ik,ij,jk->k", axes, quadratic.error, axes, optimize=True)) ** 2 / np.diag(sums)).max()
+    )
+
+    noise, gradient = axes.T @ gradient_noise @ axes, axes.T @ (quadratic.linear + quadratic.matrix @ x)
+    held = axes.T @ prior @ axes + vectors.T @ (vectors / reach[:, None] ** 2)
+    squares, way = np.zeros(len(signals)), np.zeros(len(signals))
+    for _ in range(TURNS):
+        gain = signals[:, None] * np.linalg.inv(noise + np.diag(chance * sums @ squares))
+        covariance = np.linalg.inv(gain * signals + held)
+        way = -covariance @ (gain @ gradient + axes.T @ (prior @ x))
+        squares = way**2 + np.diag(covariance)
+    return np.asarray(axes @ way)
+
+
+def noise_ratio(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
+    """By how many times the gradient's noise exceeds that of images that fit, which is the normal matrix with its noise."""
+    whole = quadratic.matrix + quadratic.noise
+    total = whole + prior + _ridge(quadratic)
+    both = np.linalg.solve(total, np.stack([gradient_noise, whole]))
+    return float(np.trace(both[0]) / np.trace(both[1]))
 
 
 def _ridge(quadratic: Quadratic) -> Array:

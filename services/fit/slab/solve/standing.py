@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from services.core.store import write_atomic
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.solve.mixture import Mixture
-from services.fit.slab.solve.normal import DerivativeSums
+from services.fit.slab.solve.normal import DerivativeSums, ResidualSums
 
 Array = NDArray[np.float64]
 
@@ -24,9 +24,10 @@ FILE = "steps.npz"
 
 @dataclass(frozen=True)
 class Joined:
-    """Renders of one stage whose derivatives go together."""
+    """Renders of one stage whose derivatives go together, and residuals of the last of them."""
 
     derivatives: DerivativeSums
+    residuals: ResidualSums
     path_noise: tuple[Array, ...]
     """That their weights were made from; see ``GaussNewton.path_noise``."""
 
@@ -46,6 +47,8 @@ class Standing:
     paths: int
     path_noise: tuple[Array, ...]
     """See ``GaussNewton``."""
+    multiple: Array
+    """See ``GaussNewton``."""
     joined: Joined | None
 
 
@@ -62,13 +65,17 @@ class StandingFile:
     def write(self, standing: Standing) -> None:
         """Keep it in place of the one before."""
         arrays: dict[str, Any] = {name: np.array(getattr(standing, name)) for name in _NUMBERS}
-        arrays |= _numbered("path_noise", standing.path_noise)
+        arrays |= _numbered("path_noise", standing.path_noise) | {"multiple": standing.multiple}
         if (joined := standing.joined) is not None:
             arrays |= _numbered("joined_noise", joined.path_noise)
             arrays |= {
                 "halves": joined.derivatives.halves,
                 "own": joined.derivatives.own,
                 "counts": np.array(joined.derivatives.counts),
+                **{
+                    f"residuals_{field.name}": np.array(getattr(joined.residuals, field.name))
+                    for field in fields(ResidualSums)
+                },
             }
         for field in fields(standing.material):
             arrays[f"material_{field.name}"] = np.asarray(getattr(standing.material, field.name))
@@ -89,7 +96,9 @@ class StandingFile:
             return None
         numbers: dict[str, Any] = {name: arrays[name].item() for name in _NUMBERS}
         noise = _of_numbered("path_noise", arrays)
-        return Standing(_material(arrays), path_noise=noise, joined=_joined(arrays), **numbers)
+        return Standing(
+            _material(arrays), path_noise=noise, multiple=arrays["multiple"], joined=_joined(arrays), **numbers
+        )
 
     def remove(self) -> None:
         """The fit is done."""
@@ -111,7 +120,9 @@ def _joined(arrays: dict[str, Array]) -> Joined | None:
         return None
     first, second = (int(count) for count in arrays["counts"])
     sums = DerivativeSums(arrays["halves"], arrays["own"], (first, second))
-    return Joined(sums, _of_numbered("joined_noise", arrays))
+    total, products, count, place = (arrays[f"residuals_{field.name}"] for field in fields(ResidualSums))
+    residuals = ResidualSums(total, products, int(count), place)
+    return Joined(sums, residuals, _of_numbered("joined_noise", arrays))
 
 
 def _numbered(name: str, values: tuple[Array, ...]) -> dict[str, Array]:
