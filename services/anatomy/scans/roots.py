@@ -30,6 +30,8 @@ ROUNDING_MM = 1.2
 """Height of the root's rounded end, part of ``STUB_MM``."""
 WHOLE_TAPER, MOLAR_TAPER = 0.35, 0.5
 """The same of a root as long as those of its kind: a single root ends in a blunt point, the roots of a molar stand apart."""
+WHOLE_NARROWING = 1.5
+"""Roots stay nearly as wide as the neck for some millimetres, and are conical further on: half way down they have 0.77 of its width."""
 FIRST_MOLAR = 6
 ROW_MM = 0.45
 WIDEST_BRIDGE_MM = 3.5
@@ -42,7 +44,7 @@ HARMONICS = 3
 
 @dataclass(frozen=True)
 class Root:
-    """Form of a made-up root; its cross-section narrows evenly from the cervical line to the end."""
+    """Form of a made-up root; its cross-section narrows from the cervical line to the end."""
 
     length_mm: float = STUB_MM
     """Beyond the cervical line's most apical point."""
@@ -50,6 +52,8 @@ class Root:
     """Width at the end, before it is rounded, to that of the cervical line."""
     rounding_mm: float = ROUNDING_MM
     """Height of the rounded end, part of the length."""
+    narrowing: float = 1.0
+    """Power of the depth by which it narrows: above 1, slowly below the neck and more towards the end."""
 
 
 STUB = Root()
@@ -58,7 +62,8 @@ STUB = Root()
 def whole_root(fdi: int) -> Root:
     """The root of a tooth of average length for its kind; molars' several roots are one, as wide as they are together."""
     place = fdi % 10
-    return Root(root_length_mm(place, is_upper=is_upper(fdi)), MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER)
+    taper = MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER
+    return Root(root_length_mm(place, is_upper=is_upper(fdi)), taper, narrowing=WHOLE_NARROWING)
 
 
 def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Root = STUB) -> Mesh:
@@ -171,6 +176,10 @@ def _stub_rows(
 
     steps = max(4, int(np.ceil((height.mean() - end_height) / ROW_MM)))
     wall = harmonic_rows(loop_mm, end + end_height * occlusal, steps)
+    depth = np.arange(1, len(wall) + 1) / len(wall)
+    wider = (1 - (1 - root.taper) * depth**root.narrowing) / (1 - (1 - root.taper) * depth)
+    across = wall - centre - (wall @ occlusal)[..., None] * occlusal
+    wall = wall + (wider - 1)[:, None, None] * across
     bends = np.linspace(0, np.pi / 2, max(3, int(np.ceil(2 * root.rounding_mm / ROW_MM))) + 1)[1:-1]
     lid = np.stack(
         [

@@ -39,7 +39,7 @@ class MouthLight:
         self._all, self._alone = RayScene(*outers, mouth.gums, mouth.lips), RayScene(outers[0])
         self._colours = np.array([*[TOOTH] * len(outers), GUMS, LIP, DARK])
         self._wrap = np.array([*[WRAP] * len(outers), 0.0, 0.0, 0.0])
-        tooth = order[0]
+        tooth = mouth.fitted
         assert tooth.dentin is not None
         # Images are linear in each light's intensity, so one scene serves all channels.
         places, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from services.anatomy.scans.scan import LabelledScan
 from services.anatomy.templates.jaw import build_jaw
 from services.core.geometry import Mesh, Tooth
+from services.phantom.lab.root import with_whole_root
 from services.phantom.lab.scan import scan_of, write_labelled_ply
 from services.phantom.lips import lips_and_retractor
 
@@ -29,22 +30,19 @@ class LabMouth:
     """Surfaces as they truly are, in the world of the rig, whose origin is the middle of the crowns.
 
     Attributes:
-        teeth: from the patient's right to the left, the fitted one with its dentin among them.
+        teeth: from the patient's right to the left, with stubs of their roots, which end in the gums.
+        fitted: the one that is measured, with its dentin and its whole root.
         gums, lips: what is around them.
         scan: in the frame of its own.
         world_from_scan: rigid transform (4, 4).
     """
 
     teeth: tuple[Tooth, ...]
+    fitted: Tooth
     gums: Mesh
     lips: Mesh
     scan: LabelledScan
     world_from_scan: Floats
-
-    @property
-    def fitted(self) -> Tooth:
-        """The tooth that is measured."""
-        return next(tooth for tooth in self.teeth if tooth.fdi == FITTED)
 
 
 def true_mouth(subject: int | None, seed: int) -> LabMouth:
@@ -61,7 +59,10 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     crowns = np.concatenate([tooth.outer.vertices_mm for tooth in own])
     shift = -(crowns.min(axis=0) + crowns.max(axis=0)) / 2
     shift[1] = -np.quantile(crowns[:, 1], 0.9)
-    teeth = tuple(Tooth(one.fdi, _moved(one.outer, shift), _moved(one.dentin, shift)) for one in own)
+    teeth = tuple(Tooth(one.fdi, _moved(one.outer, shift)) for one in own)
+    rooted = with_whole_root(jaw.tooth(FITTED))
+    assert rooted.dentin is not None
+    fitted = Tooth(FITTED, _moved(rooted.outer, shift), _moved(rooted.dentin, shift))
 
     random = np.random.default_rng([seed, 0x5CA])
     scan = scan_of(jaw, SCAN_NOISE_MM, seed, PLACES)
@@ -72,6 +73,7 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     world_from_scan[:3, :3], world_from_scan[:3, 3] = turn.T, -turn.T @ away
     return LabMouth(
         teeth,
+        fitted,
         _near(_moved(jaw.gums, shift), float(min(tooth.outer.vertices_mm[:, 1].min() for tooth in teeth))),
         lips_and_retractor([tooth.outer for tooth in teeth]),
         LabelledScan(Mesh(vertices, scan.mesh.faces), scan.fdi),
