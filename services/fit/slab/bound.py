@@ -18,7 +18,7 @@ from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import SCALES, THICK, Quadratic, flag_scales, precision
+from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, is_thick, precision
 from services.fit.slab.solve.smooth import smoother_of
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 from services.fit.slab.solve.weights import independent_weights
@@ -26,7 +26,7 @@ from services.fit.slab.solve.weights import independent_weights
 Array = NDArray[np.float64]
 
 BATCHES, PATHS, PATHS_THICK = 8, 8000, 60_000
-"""Of the render that gives the curvature: as many as a step of the search takes, and more where sigma_t w exceeds ``prior.THICK``. There
+"""Of the render that gives the curvature: as many as a step of the search takes, and more where a cell ``is_thick``. There
 noise passes for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
 FIRST_STEP = 2**33
 """Numbers its random streams apart from a fit's."""
@@ -90,7 +90,7 @@ def curvature_of(
     blocks: Blocks = map,
 ) -> Quadratic:
     """What images tell of ln f and sigma_a; arguments as of ``bound_of``."""
-    thick = material.extinction_per_mm * rig.width_mm > THICK
+    thick = is_thick(material, rig.width_mm)
     paths = paths or (PATHS_THICK if thick else PATHS)
     batches = render(
         rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths, scores=True, blocks=blocks

@@ -21,7 +21,7 @@ from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.normal import NormalEquations, ResidualSums, normal_equations
-from services.fit.slab.solve.prior import THICK, Quadratic
+from services.fit.slab.solve.prior import Quadratic, is_thick
 from services.fit.slab.solve.seen import broad_step, noise_ratio, step_matrix
 from services.fit.slab.solve.smooth import Smoother, smoother_of
 from services.fit.slab.solve.standing import Joined, Standing, StandingFile
@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 
 TOLERATED_RISE = 2.0
 """Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
+WEIGHTS_DIFFER = 0.5
+"""Of the misfit, which may rise by that in a thick cell: weights there are mostly those of the paths and are estimated anew for each render,
+and misfits of one medium were seen to differ by a third. A low one would else refuse all steps after it."""
 MAX_HALVINGS = 4
 WORTHWHILE = 2.0
 """A step that promises less than so many times what noise alone does waits for more paths."""
@@ -173,12 +176,14 @@ class GaussNewton:
             again = self.linearised(state.material, paths, self.budget.batches)
             return State(state.material, again, paths, state.damping), False
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
+        differs = WEIGHTS_DIFFER * abs(state.equations.misfit) if self.is_thick(state.material) else 0.0
         for halving in range(MAX_HALVINGS + 1):
             y = x + change / 2**halving
             moved = self.coordinates.material_at(y)
             equations = self.linearised(moved, paths, self.budget.batches)
             after = equations.misfit + 0.5 * float(y @ prior @ y)
-            if after <= before + TOLERATED_RISE * float(np.hypot(state.equations.misfit_se, equations.misfit_se)):
+            spread = float(np.hypot(state.equations.misfit_se, equations.misfit_se))
+            if after <= before + TOLERATED_RISE * spread + differs:
                 return State(moved, equations, paths, max(state.damping / 4, DAMPING)), False
         more = min(2 * state.paths, self.budget.search_paths)
         return State(
@@ -243,7 +248,7 @@ class GaussNewton:
 
     def is_thick(self, material: Material) -> bool:
         """Whether cameras of one side see nearly the same of every path, and sigma_s and g are hardly told apart."""
-        return material.extinction_per_mm * self.rig.width_mm > THICK
+        return is_thick(material, self.rig.width_mm)
 
     def change(
         self, quadratic: Quadratic, prior: Array, equations: NormalEquations, around: Material, damping: float

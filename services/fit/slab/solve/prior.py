@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, SPACING_RAD
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, SPACING_RAD, Material
 from services.fit.slab.solve.normal import UNKNOWNS
 
 Array = NDArray[np.float64]
@@ -26,8 +26,16 @@ SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
 HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
 RIDGE = 1e-12
 """Of the largest curvature, so that a direction that nothing tells of can be solved for."""
-THICK = 4.0
-"""Of sigma_t w, from which cameras of one side see nearly the same of every path."""
+THICK, THICK_REDUCED = 4.0, 2.5
+"""Of sigma_t w, and of sigma_s' w, from which cameras of one side see nearly the same of every path. A fit may begin half off in sigma_t
+and knows sigma_s' at once: 200 nm spheres at sigma_t w = 5.4 were taken for a thin sample at 3.9, and the search stopped there."""
+
+
+def is_thick(material: Material, width_mm: float) -> bool:
+    """Whether a cell's light has scattered so often that sigma_s and g are hardly told apart."""
+    return (
+        material.extinction_per_mm * width_mm > THICK or material.reduced_scattering_per_mm * width_mm > THICK_REDUCED
+    )
 
 
 def second_differences() -> Array:
