@@ -199,7 +199,7 @@ class GaussNewton:
             equations = self.linearised(material, paths, batches, join=self.is_thick(material))
             x = self.coordinates.unknowns(material)
             # Where residuals of media near by join, the gradient is that at the mean of these media.
-            centre = x if self.coordinates.chain(material) is not None else equations.residuals.place
+            centre = equations.residuals.place if self.joins(material) else x
             quadratic = quadratic_at(centre, equations)
             scale = self.coordinates.scale(material, quadratic)
             prior = self.coordinates.precision(scale)
@@ -207,7 +207,7 @@ class GaussNewton:
             moved = self.coordinates.material_at(x + change)
             worth = promised(quadratic, prior, x, change) / noise_of_promise(quadratic, prior, equations.gradient_noise)
             rest = 0.0
-            if self.is_thick(material) and standing.stage + 1 == len(self.budget.last):
+            if self.is_thick(material) and self.joins(material) and standing.stage + 1 == len(self.budget.last):
                 data = noise_of_promise(quadratic, prior, equations.data_noise)
                 rest = noise_of_promise(quadratic, prior, equations.gradient_noise) / data
             standing = self.after(standing, moved, worth, rest)
@@ -260,10 +260,10 @@ class GaussNewton:
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
         noise = equations.gradient_noise + equations.data_noise
-        if self.is_thick(around):
-            damping *= max(1.0, noise_ratio(quadratic, prior, noise))
-        else:
+        if not self.is_thick(around):
             broad = broad[:, :0]  # in a thin cell signals stand out, and a second step only adds noise
+        if broad.size:
+            damping *= max(1.0, noise_ratio(quadratic, prior, noise))
         matrix = step_matrix(quadratic, prior, damping)
         slope = quadratic.linear + (quadratic.matrix + prior) @ x
         first = x + self.coordinates.held_back(self.coordinates.minimum(matrix, matrix @ x - slope) - x, around)
@@ -325,9 +325,13 @@ class GaussNewton:
         self.joined = Joined(equations.derivatives, equations.residuals, known) if join else None
         return equations.chained(self.coordinates.chain(material))
 
+    def joins(self, material: Material) -> bool:
+        """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media are told at their mean."""
+        return self.coordinates.chain(material) is None
+
     def near(self, earlier: Joined | None, material: Material) -> ResidualSums | None:
         """Residuals of renders before, where these are of media so near that derivatives tell how they would be here."""
-        if earlier is None or self.coordinates.chain(material) is not None:
+        if earlier is None or not self.joins(material):
             return None
         place = self.coordinates.material_at(earlier.residuals.place)
         moved = abs(math.log(material.scattering_per_mm / place.scattering_per_mm))
