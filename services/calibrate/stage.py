@@ -48,14 +48,15 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
 
 
 def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record and its report as the asset.
+    """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record as the asset.
 
-    A calibration beyond its limits is published all the same, with what to photograph again; jobs that name it refuse it.
+    The report lies in the job's folder, where those of other kinds lie. A calibration beyond its limits is published all the
+    same, with what to photograph again; jobs that name it refuse it.
 
     Raises:
         CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy. JobCancelledError.
     """
-    from services.calibrate.session.report import REPORT, write_report
+    from services.calibrate.session.report import write_report
     from services.calibrate.session.run import CALIBRATION, RESIDUALS, write_session
     from services.calibrate.session.run import calibrate as calibrate_folder
     from services.core.results import AssetManifest
@@ -75,11 +76,10 @@ def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
         context.report(StageEvent(stage="export", kind="log", message=sentence))
     writer = StageWriter(context.root, "asset", context.attempt)
     write_session(session, writer.folder)
-    write_report(session, writer.folder)
+    write_report(session, context.root)
     broken = session.judgement.broken
     manifest = AssetManifest(
-        files=(CALIBRATION, RESIDUALS, REPORT),
-        held_out_error=0.0,
+        files=(CALIBRATION, RESIDUALS),
         converged=not broken,
         advice=session.judgement.advice,
     )

@@ -55,7 +55,7 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
             "held_out_error": asset.held_out_error,
             "verdict": None if asset.verdict is None else asset.verdict.model_dump(mode="json"),
             "report": str(report),
-            "parameters": str(out / "parameters.json"),
+            "parameters": str(parameters) if (parameters := out / "parameters.json").exists() else None,
             "files": list(asset.files),
         }
         print(json.dumps(result))
@@ -67,7 +67,7 @@ def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool
 
 def _errors(asset: AssetManifest) -> str:
     if (verdict := asset.verdict) is None:  # a calibration, or exported by an earlier version
-        if asset.advice:
+        if asset.held_out_error is None:
             return asset.advice
         return f"held-out error: {100 * asset.held_out_error:.2f} %"
     from services.core.verdict import percent

@@ -143,7 +143,9 @@ class AssetManifest(Record):
     """Published by the export stage."""
 
     files: tuple[str, ...]
-    held_out_error: float = Field(description="mean over channels")
+    held_out_error: float | None = Field(
+        default=None, description="mean over channels; null where nothing was fitted to images, as of a calibration"
+    )
     converged: bool = Field(default=True, description="whether the fit behind it did")
     advice: str = Field(default="", description="what to do where it did not")
     verdict: Verdict | None = Field(

@@ -277,7 +277,9 @@ def test_a_job_publishes_the_record_and_its_report(
     spec = JobSpec(kind="calibration", capture=tmp_path / "session")
     calibrate_job(spec, LocalContext(tmp_path / "job", 1, told.append))
     folder, manifest = open_stage(tmp_path / "job", "asset", AssetManifest)
-    assert manifest.files == ("calibration.json", "residuals.json", "report.html")
+    assert manifest.files == ("calibration.json", "residuals.json")
+    assert "<html" in (tmp_path / "job" / "report.html").read_text()
+    assert manifest.held_out_error is None, "nothing was fitted to images"
     assert read_record(folder / "calibration.json", Calibration).limits == session.judgement.recorded
     assert manifest.converged == (session.judgement.broken == ())
     assert [event.kind for event in told] == ["started", "progress", "finished"]
@@ -287,4 +289,5 @@ def test_a_job_publishes_the_record_and_its_report(
 @pytest.mark.slow
 def test_a_job_of_kind_calibration_runs_as_any_other(made: tuple[Path, Truth], tmp_path: Path) -> None:
     asset = run_job(JobSpec(kind="calibration", capture=made[0]), tmp_path / "job")
-    assert "report.html" in asset.files
+    assert asset.files == ("calibration.json", "residuals.json")
+    assert (tmp_path / "job" / "report.html").exists()

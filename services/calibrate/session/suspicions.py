@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.calibrate.cameras.bundle import draw
 from services.calibrate.lights.listed import swapped_names
@@ -17,7 +17,6 @@ from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.core.raw.records import RawFolder
 
-Floats = NDArray[np.float64]
 MAX_EDGE_SHIFT_PX = 1.0
 """Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
 MAX_BAD_SHARE = 0.5
@@ -125,7 +124,7 @@ def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
     limit = 10 * float(fit.sigma_px.max())
 
     def off(camera: int, place: int) -> float:
-        tried = type(corners)(np.full_like(corners.camera, camera), np.full_like(corners.place, place), *_rest(corners))
+        tried = replace(corners, camera=np.full_like(corners.camera, camera), place=np.full_like(corners.place, place))
         return float(np.median(np.abs(corners.pixels - draw(fit.rig, tried))))
 
     camera, place = int(corners.camera[0]), int(corners.place[0])
@@ -142,10 +141,6 @@ def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
     return f"Most corners of {name} fit no pose: the board or the camera moved there between photographs; leave the place out or take it again."
 
 
-def _rest(corners: object) -> tuple[NDArray[np.int64], Floats, Floats]:
-    return corners.view, corners.corners_mm, corners.pixels  # type: ignore[attr-defined]
-
-
 def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
     fit = lights.fit
     for number, shift in enumerate(fit.edge_shifts_px):
@@ -154,22 +149,10 @@ def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
                 f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
                 "measure the sphere's radius_mm and the board's square_mm again."
             )
-    rms = np.array(
-        [
-            np.sqrt(
-                np.mean(
-                    (
-                        outline_errors(
-                            fit.eyes[view.camera], view.outline_px, fit.centres_mm[view.place], view.radius_mm
-                        )
-                        - fit.edge_shifts_px[view.camera]
-                    )
-                    ** 2
-                )
-            )
-            for view in lights.views
-        ]
-    )
+    rms = np.empty(len(lights.views))
+    for number, view in enumerate(lights.views):
+        off = outline_errors(fit.eyes[view.camera], view.outline_px, fit.centres_mm[view.place], view.radius_mm)
+        rms[number] = np.sqrt(np.mean((off - fit.edge_shifts_px[view.camera]) ** 2))
     moved = {
         view.place: name
         for view, name, one in zip(lights.views, lights.view_names, rms, strict=True)
