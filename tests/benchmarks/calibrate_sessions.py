@@ -26,9 +26,9 @@ from services.calibrate.lights.mirror import Eye, highlight_points, nearest_poin
 from services.calibrate.lights.positions import fit_lights
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.reweighted import solve_reweighted
+from services.phantom.lab.session import XYZ_FROM_SENSOR
 from tests.support.board_sessions import CHESSBOARD, SIZE, photographed, true_rig
 from tests.support.sphere_sessions import STEEPEST, dome_lights, outline_points
-from tests.support.virtual_session import XYZ_FROM_SENSOR
 
 Floats = NDArray[np.float64]
 NAMES = ["left", "middle", "right"]

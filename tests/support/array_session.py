@@ -22,9 +22,9 @@ from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep, place_lights
 from services.calibrate.session.suspicions import suspicions
 from services.core.raw.records import RawFolder
+from services.phantom.lab.session import XYZ_FROM_SENSOR
 from tests.support.board_sessions import photographed, true_rig
 from tests.support.sphere_sessions import STEEPEST, dome_lights, outline_points
-from tests.support.virtual_session import XYZ_FROM_SENSOR
 
 Floats = NDArray[np.float64]
 NAMES = ("left", "middle", "right")

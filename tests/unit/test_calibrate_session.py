@@ -31,39 +31,44 @@ from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage, read_record
+from services.phantom.lab.rig import Lens, RigSize, in_session_frame, true_rig
+from services.phantom.lab.sensor import Sensor
+from services.phantom.lab.session import BOARD, XYZ_FROM_SENSOR
+from services.phantom.lab.session import write_session as write_virtual_session
 from services.pipeline.stages import run_job
 from tests.support.board_sessions import CHESSBOARD, charuco
-from tests.support.virtual_session import BOARD, XYZ_FROM_SENSOR, Truth, write_virtual_session
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Truth]]:
-    root = tmp_path_factory.mktemp("session")
-    sizes = {"n_cameras": 2, "n_lights": 4, "n_places": 6, "n_mirror": 2, "n_white": 1}
-    yield root, write_virtual_session(root, np.random.default_rng(1), **sizes)
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Calibration]]:
+    """The folder, and the true rig in the frame of its first board."""
+    root, sensor = tmp_path_factory.mktemp("session"), Sensor(mosaic="none")
+    rig = true_rig(RigSize((640, 480), 0.13, 2, 4), sensor.black, 1)
+    first_board = write_virtual_session(root, rig, sensor, 1, n_boards=6, n_mirror=2, n_white=1)
+    yield root, in_session_frame(rig, first_board)
     shutil.rmtree(root)
 
 
 @pytest.fixture(scope="module")
-def session(made: tuple[Path, Truth]) -> Session:
+def session(made: tuple[Path, Calibration]) -> Session:
     return calibrate(made[0])
 
 
 @pytest.mark.slow
-def test_cameras_are_where_they_were(made: tuple[Path, Truth], session: Session) -> None:
+def test_cameras_are_where_they_were(made: tuple[Path, Calibration], session: Session) -> None:
     truth, fit = made[1], session.cameras.fit
-    for number, eye in enumerate(truth.eyes):
+    for number, camera in enumerate(truth.cameras):
         assert fit.rms_px(number) < 0.12
         # Points around the teeth are drawn where the true camera draws them, within four times the largest ±.
-        points = np.random.default_rng(0).uniform(-20, 20, (50, 3)) + np.array([54.0, 42.0, 0.0])
-        off = np.linalg.norm(session.cameras.eyes[number].project(points) - eye.project(points), axis=1)
+        points = np.random.default_rng(0).uniform(-20, 20, (50, 3)) + np.array([31.5, 24.5, 0.0])
+        off = np.linalg.norm(session.cameras.eyes[number].project(points) - Lens(camera).seen(points), axis=1)
         assert off.max() < 0.4
 
 
-def test_lights_are_as_far_off_as_their_errors_say(made: tuple[Path, Truth], session: Session) -> None:
+def test_lights_are_as_far_off_as_their_errors_say(made: tuple[Path, Calibration], session: Session) -> None:
     assert session.lights is not None
     fit = session.lights.fit
-    error = (fit.positions_mm - made[1].lights_mm).ravel()
+    error = (fit.positions_mm - [light.position_mm for light in made[1].lights]).ravel()
     covariance = fit.covariance[:12, :12]
     # Twelve values: a rms of whitened errors beyond 1.7 has a chance below 0.1 %.
     assert np.sqrt(np.mean(np.linalg.solve(np.linalg.cholesky(covariance), error) ** 2)) < 1.7
@@ -77,7 +82,7 @@ def test_colours_are_the_sensors(session: Session) -> None:
         assert np.median(fit.held_out) < 1
 
 
-def test_the_record_is_one_that_jobs_read(made: tuple[Path, Truth], session: Session, tmp_path: Path) -> None:
+def test_the_record_is_one_that_jobs_read(made: tuple[Path, Calibration], session: Session, tmp_path: Path) -> None:
     write_session(session, tmp_path)
     write_report(session, tmp_path)
     record = read_record(tmp_path / "calibration.json", Calibration)
@@ -121,7 +126,7 @@ def test_a_good_session_raises_no_suspicion(session: Session) -> None:
 
 
 @pytest.mark.slow
-def test_a_wrong_radius_is_named(made: tuple[Path, Truth], session: Session) -> None:
+def test_a_wrong_radius_is_named(made: tuple[Path, Calibration], session: Session) -> None:
     folder = read_raw_folder(made[0])
     spheres = tuple(
         one.model_copy(update={"radius_mm": one.radius_mm * (1.05 if one.kind == "mirror" else 1)})
@@ -134,7 +139,7 @@ def test_a_wrong_radius_is_named(made: tuple[Path, Truth], session: Session) -> 
 
 
 @pytest.mark.slow
-def test_one_light_under_two_names_is_named(made: tuple[Path, Truth], session: Session) -> None:
+def test_one_light_under_two_names_is_named(made: tuple[Path, Calibration], session: Session) -> None:
     folder = read_raw_folder(made[0])
     frames = []
     for frame in folder.frame:
@@ -148,7 +153,7 @@ def test_one_light_under_two_names_is_named(made: tuple[Path, Truth], session: S
     assert "Lights L0 and L1 lie 0.0 mm apart" in told
 
 
-def test_a_sphere_that_is_not_there_is_named(made: tuple[Path, Truth], session: Session) -> None:
+def test_a_sphere_that_is_not_there_is_named(made: tuple[Path, Calibration], session: Session) -> None:
     folder = read_raw_folder(made[0])
     black = next(frame for frame in folder.frame if frame.kind == "black" and frame.camera == "c0")
     frames = tuple(
@@ -161,7 +166,7 @@ def test_a_sphere_that_is_not_there_is_named(made: tuple[Path, Truth], session: 
         with_lights(session, made[0], folder.model_copy(update={"frame": frames}))
 
 
-def test_a_folder_without_boards_is_refused(made: tuple[Path, Truth]) -> None:
+def test_a_folder_without_boards_is_refused(made: tuple[Path, Calibration]) -> None:
     from services.calibrate.session.boards import calibrate_cameras
 
     folder = read_raw_folder(made[0])
@@ -202,7 +207,7 @@ def test_a_printed_board_is_opencvs(board) -> None:  # type: ignore[no-untyped-d
 
 
 def test_a_pdf_has_the_boards_size() -> None:
-    content = board_pdf(BOARD)
+    content = board_pdf(BOARD.model_copy(update={"square_mm": 12.0, "marker_mm": 9.0}))
     box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", content)
     assert box is not None
     assert [float(one) * 25.4 / 72 for one in box.groups()] == pytest.approx([128, 114], abs=1e-3)
@@ -287,7 +292,7 @@ def test_a_job_publishes_the_record_and_its_report(
 
 
 @pytest.mark.slow
-def test_a_job_of_kind_calibration_runs_as_any_other(made: tuple[Path, Truth], tmp_path: Path) -> None:
+def test_a_job_of_kind_calibration_runs_as_any_other(made: tuple[Path, Calibration], tmp_path: Path) -> None:
     asset = run_job(JobSpec(kind="calibration", capture=made[0]), tmp_path / "job")
     assert asset.files == ("calibration.json", "residuals.json")
     assert (tmp_path / "job" / "report.html").exists()

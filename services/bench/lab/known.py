@@ -22,6 +22,7 @@ from services.core.raw.registration import REGISTRATION, Registration
 from services.core.raw.toml_writing import description_toml
 from services.core.store import read_record, write_atomic, write_record
 from services.phantom.lab.make import CALIBRATION, CALIBRATION_FILE, LAB_RECORD, MOUTH, TRUTH, LabRecord
+from services.phantom.lab.rig import in_session_frame
 
 Floats = NDArray[np.float64]
 
@@ -60,19 +61,7 @@ def true_calibration(root: Path) -> Calibration:
     """The true rig in the frame of the session's first board."""
     told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
     rig = read_record(root / TRUTH / CALIBRATION_FILE, Calibration)
-    world_from_session = np.array(told.world_from_session)
-    session_from_world = np.linalg.inv(world_from_session)
-    cameras = tuple(
-        one.model_copy(update={"camera_from_world": _rows(np.array(one.camera_from_world) @ world_from_session)})
-        for one in rig.cameras
-    )
-    lights = tuple(
-        one.model_copy(
-            update={"position_mm": tuple(_applied(session_from_world, np.array([one.position_mm]))[0].tolist())}
-        )
-        for one in rig.lights
-    )
-    return rig.model_copy(update={"cameras": cameras, "lights": lights})
+    return in_session_frame(rig, np.array(told.world_from_session))
 
 
 def session_from_scan(root: Path) -> Floats:
@@ -142,7 +131,3 @@ def _placed(mesh: Mesh, move: Floats) -> Mesh:
 
 def _applied(move: Floats, points_mm: Floats) -> Floats:
     return np.asarray(points_mm @ move[:3, :3].T + move[:3, 3])
-
-
-def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix.tolist()))

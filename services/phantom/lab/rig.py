@@ -69,6 +69,24 @@ def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
     return Calibration(units="mm", channels=CHANNELS, cameras=tuple(cameras), lights=tuple(lights))
 
 
+def in_session_frame(rig: Calibration, world_from_session: Floats) -> Calibration:
+    """The same rig in the frame of a session's first board, as a calibration gives it."""
+    session_from_world = np.linalg.inv(world_from_session)
+    cameras = tuple(
+        one.model_copy(update={"camera_from_world": _rows(np.array(one.camera_from_world) @ world_from_session)})
+        for one in rig.cameras
+    )
+    lights = tuple(
+        one.model_copy(update={"position_mm": tuple((session_from_world @ [*one.position_mm, 1.0])[:3].tolist())})
+        for one in rig.lights
+    )
+    return rig.model_copy(update={"cameras": cameras, "lights": lights})
+
+
+def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
+
+
 def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.random.Generator) -> CalibratedCamera:
     from scipy.spatial.transform import Rotation
 

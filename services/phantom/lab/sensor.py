@@ -45,7 +45,7 @@ class Sensor:
     def photograph(
         self, camera: CalibratedCamera, radiance: Floats, exposure_s: float, random: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """Counts (H, W) of an image of radiance (H, W, 3)."""
+        """Counts (H, W) of an image of radiance (H, W, 3), or (H, W, 3) without a mosaic."""
         assert camera.radiance_per_count is not None
         through = self.filtered(radiance / np.array(camera.radiance_per_count))
         electrons = np.maximum(through, 0) * (exposure_s / self.counts_per_electron)
@@ -55,7 +55,9 @@ class Sensor:
         return np.clip(np.rint(counts), 0, self.full).astype(np.uint16)
 
     def filtered(self, image: Floats) -> Floats:
-        """What the mosaic's filters let through (H, W) of an image (H, W, 3)."""
+        """What the mosaic's filters let through (H, W) of an image (H, W, 3); all of it without a mosaic."""
+        if self.mosaic == "none":
+            return image
         through = np.empty(image.shape[:2])
         for (row, column), channel in np.ndenumerate(site_channels(self.mosaic)):
             through[row::2, column::2] = image[row::2, column::2, channel]
