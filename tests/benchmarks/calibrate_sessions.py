@@ -1,7 +1,9 @@
 """Whole calibration sessions with drawn errors: how far off cameras, lights, intensities and colours come out, and whether they know it.
 
 ``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time a draw and goes on
-where a file already holds draws. Boards are drawn by projection with normal errors of 0.1 px, spheres by their formulae (outlines
+where a file already holds draws; ``--width 5184`` draws cameras of 20 megapixels in place of 2.
+
+Boards are drawn by projection with normal errors of 0.1 px, spheres by their formulae (outlines
 0.1 px and shifted alike by up to 0.2 px, highlights 0.05 px, white pixels 1 % shot noise), and every chart patch is off by 0.3 %.
 Each step gets what the step before found, never the truth.
 """
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.boards import corners_on_board
-from services.calibrate.cameras.bundle import fit_bundle, pose_apply
+from services.calibrate.cameras.bundle import BundleFit, Rig, fit_bundle, pose_apply
+from services.calibrate.cameras.sightings import View
 from services.calibrate.cameras.start import first_lens, first_rig
 from services.calibrate.colour.transform import fit_colour
 from services.calibrate.lights.centres import OutlineView, fit_centres
-from services.calibrate.lights.intensity import WhitePhoto, WhiteSphere, fit_intensity, shading
+from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity, shading
 from services.calibrate.lights.mirror import Eye, highlight_points, nearest_point
-from services.calibrate.lights.positions import fit_lights
+from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.reweighted import solve_reweighted
 from services.phantom.lab.session import XYZ_FROM_SENSOR
@@ -42,42 +46,66 @@ What decides is how far apart they are, and how many; they are as far apart as t
 WHITE_PLACES_MM = np.array([[-32.0, -20, -20], [32, 20, -10], [0, 0, 30]])
 REFLECTANCE = np.array([0.92, 0.9, 0.88])
 SHOT, PATCH_ERROR = 0.01, 0.003
+COUNTS = 1e3
+"""Of a white sphere's photograph, for radiance 1."""
 MARGIN_PX = 5.0
 """Between a whole sphere and the image's border, as the search for its edge needs."""
 
 
-def one_session(seed: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Spheres:
+    """What the spheres of a session tell."""
+
+    views: list[SphereView]
+    fit: LightsFit
+    photos: list[WhitePhoto]
+    white_mm: Floats
+    """Of the white spheres' centres, as found (P, 3)."""
+    intensity: IntensityFit
+    true_intensity: Floats
+
+
+def one_session(seed: int, width: int = SIZE[0]) -> dict[str, Any]:
     """Errors of one session: rms, and whitened or normalised scores."""
     random = np.random.default_rng(1000 + seed)
-    rig = true_rig(random, N_PLACES)
+    size = (width, width * SIZE[1] // SIZE[0])
+    rig = true_rig(random, N_PLACES, size)
     # The teeth are where the boards were turned about: the middle of the board at the first place.
     teeth = corners_on_board(CHESSBOARD).mean(axis=0)
-    views = photographed(rig, 0.1, random)
-    lenses = [
-        first_lens([view for view in views if view.camera == k], SIZE, "radial-tangential-4", name)
-        for k, name in enumerate(NAMES)
-    ]
-    fit = fit_bundle(views, first_rig(views, lenses, NAMES))
+    fit, _ = found_rig(random, rig, NAMES)
     layout = fit.layout
     columns = np.concatenate([np.r_[layout.lens_columns(k), layout.camera_columns(k)] for k in range(3)])
     covariance = fit.covariance[np.ix_(columns, columns)]
-    true = tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
-    found = tuple(Eye(lens, pose) for lens, pose in zip(fit.rig.lenses, fit.rig.cameras, strict=True))
+    true, found = eyes_of(rig), eyes_of(fit.rig)
     error = layout.pack(fit.rig) - layout.pack(rig)
     shift_mm, turn_deg = _seen_at_the_teeth(true, found, teeth)
     told: dict[str, Any] = {"seed": seed, "shift_mm": shift_mm, "turn_deg": turn_deg}
     told["z_cameras"] = _whitened(error[columns], covariance)
     # The dome shines from the cameras' side of the teeth.
-    away = np.mean([eye.centre_mm for eye in true], axis=0) - teeth
-    lights = _turned(dome_lights(N_LIGHTS, random), away) + teeth
-    looked_at = nearest_point(np.array([eye.centre_mm for eye in true]), np.array([eye.rotation[2] for eye in true]))
-    mirror, white = (
-        _turned(places, away) + looked_at + random.normal(0, 2, places.shape)
-        for places in (MIRROR_PLACES_MM, WHITE_PLACES_MM)
-    )
-    told |= _lights_and_intensity(random, true, found, covariance, lights, mirror, white)
+    lights = _turned(dome_lights(N_LIGHTS, random), away_from(true, teeth)) + teeth
+    told |= _lights_and_intensity(random, true, found, covariance, lights, teeth)
     told["delta_e"] = _colour(random)
     return told
+
+
+def eyes_of(rig: Rig) -> tuple[Eye, ...]:
+    """The cameras of a rig."""
+    return tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+
+
+def away_from(eyes: tuple[Eye, ...], point_mm: Floats) -> Floats:
+    """From a point to the middle of the cameras (3,)."""
+    return np.asarray(np.mean([eye.centre_mm for eye in eyes], axis=0) - point_mm)
+
+
+def found_rig(random: np.random.Generator, rig: Rig, names: list[str]) -> tuple[BundleFit, list[View]]:
+    """What boards of 0.1 px say of a rig."""
+    views = photographed(rig, 0.1, random)
+    lenses = [
+        first_lens([view for view in views if view.camera == k], rig.lenses[k].size, "radial-tangential-4", name)
+        for k, name in enumerate(names)
+    ]
+    return fit_bundle(views, first_rig(views, lenses, names)), views
 
 
 def _lights_and_intensity(
@@ -86,21 +114,56 @@ def _lights_and_intensity(
     found: tuple[Eye, ...],
     covariance: Floats,
     lights: Floats,
-    mirror: Floats,
-    white: Floats,
+    teeth: Floats,
 ) -> dict[str, Any]:
-    shifts = random.uniform(-0.2, 0.2, 3)
-    views = _mirror_views(random, true, shifts, lights, mirror)
     names = [f"L{n}" for n in range(N_LIGHTS)]
-    fit = fit_lights(views, found, names, covariance)
+    spheres = photographed_spheres(random, true, found, covariance, lights, teeth, names)
+    fit, answer = spheres.fit, spheres.intensity
     off = fit.positions_mm - lights[fit.lights]
     count = 3 * len(fit.lights)
-    told = {"lights_mm": float(np.sqrt((off**2).sum(axis=1).mean())), "mirror_views": len(views)}
+    told = {"lights_mm": float(np.sqrt((off**2).sum(axis=1).mean())), "mirror_views": len(spheres.views)}
     told |= {"lights_se_mm": float(np.sqrt(np.trace(fit.covariance[:count, :count]) / len(fit.lights)))}
+    logs = np.log(answer.intensity / spheres.true_intensity)
     scores = {"z_lights": _whitened(off.ravel(), fit.covariance[:count, :count])}
+    scores["z_intensity"] = (logs.ravel() / np.sqrt(np.diag(answer.covariance))).tolist()
+    return told | scores | {"intensity": float(np.sqrt(np.mean(logs**2)))}
+
+
+def photographed_spheres(
+    random: np.random.Generator,
+    true: tuple[Eye, ...],
+    found: tuple[Eye, ...],
+    covariance: Floats,
+    lights: Floats,
+    teeth: Floats,
+    names: list[str],
+    intensity: Floats | None = None,
+    reflectance_off: float = 0.0,
+) -> Spheres:
+    """Mirror and white spheres about the teeth by true cameras, and what found ones make of them.
+
+    Args:
+        covariance: of the found cameras.
+        lights: true positions (L, 3), mm.
+        teeth: about where the cameras look (3,), mm.
+        intensity: true, mean 1 (L, C); drawn where it is not given.
+        reflectance_off: by how much the white spheres reflect more than they are said to, relative.
+    """
+    looked_at = nearest_point(np.array([eye.centre_mm for eye in true]), np.array([eye.rotation[2] for eye in true]))
+    away = away_from(true, teeth)
+    mirror, white = (
+        _turned(places, away) + looked_at + random.normal(0, 2, places.shape)
+        for places in (MIRROR_PLACES_MM, WHITE_PLACES_MM)
+    )
+    shifts = random.uniform(-0.2, 0.2, 3)
+    views = _mirror_views(random, true, shifts, lights, mirror)
+    fit = fit_lights(views, found, names, covariance)
+    count = 3 * len(fit.lights)
     # White spheres are seen through the cameras that boards and mirror spheres gave.
-    intensity = random.uniform(0.6, 1.4, (N_LIGHTS, 3))
-    intensity /= intensity.mean(axis=0)
+    if intensity is None:
+        intensity = random.uniform(0.6, 1.4, (len(lights), 3))
+        intensity /= intensity.mean(axis=0)
+    said = REFLECTANCE[: intensity.shape[1]]
     outlines, photos = [], []
     for place, centre in enumerate(white):
         for camera, eye in enumerate(true):
@@ -109,14 +172,13 @@ def _lights_and_intensity(
                 continue
             outlines.append(OutlineView(camera, place, WHITE_MM, edge))
             photos += [
-                _photo(random, eye, centre, camera, place, light, lights[light], intensity[light])
-                for light in range(N_LIGHTS)
+                _photo(random, eye, centre, camera, place, light, lights[light], (1 + reflectance_off) * said * own)
+                for light, own in enumerate(intensity)
             ]
-    spheres = [WhiteSphere(centre, WHITE_MM, REFLECTANCE) for centre in fit_centres(outlines, fit.eyes)]
+    centres = fit_centres(outlines, fit.eyes)
+    spheres = [WhiteSphere(centre, WHITE_MM, said) for centre in centres]
     answer = fit_intensity(photos, fit.eyes, spheres, fit.positions_mm, names, fit.covariance[:count, :count])
-    logs = np.log(answer.intensity / intensity)
-    scores["z_intensity"] = (logs.ravel() / np.sqrt(np.diag(answer.covariance))).tolist()
-    return told | scores | {"intensity": float(np.sqrt(np.mean(logs**2)))}
+    return Spheres(views, fit, photos, centres, answer, intensity)
 
 
 def _mirror_views(
@@ -156,12 +218,14 @@ def _photo(
     place: int,
     light: int,
     light_mm: Floats,
-    intensity: Floats,
+    radiosity: Floats,
 ) -> WhitePhoto:
+    """Pixels of a white sphere; radiosity is its reflectance times the light's intensity by channel."""
     aim = eye.project(centre[None])[0]
-    grid = np.stack(np.meshgrid(*(np.arange(-150, 151, 15.0),) * 2), axis=-1).reshape(-1, 2) + aim
-    factor, usable = shading(eye, WhiteSphere(centre, WHITE_MM, REFLECTANCE), light_mm, grid)
-    clean = 1e3 * factor[:, None] * REFLECTANCE * intensity
+    reach = 1.05 * WHITE_MM * eye.lens.values[0] / np.linalg.norm(centre - eye.centre_mm)
+    grid = np.stack(np.meshgrid(*(np.linspace(-reach, reach, 21),) * 2), axis=-1).reshape(-1, 2) + aim
+    factor, usable = shading(eye, WhiteSphere(centre, WHITE_MM, np.ones(1)), light_mm, grid)
+    clean = COUNTS * factor[:, None] * radiosity
     level = clean[usable].mean() if usable.any() else 0.0
     noise = SHOT * np.sqrt(np.maximum(clean, 0) * level)
     return WhitePhoto(camera, place, light, grid, clean + random.normal(size=clean.shape) * noise)
@@ -219,13 +283,14 @@ def main() -> None:
     """Draw sessions and print their summary."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--width", type=int, default=SIZE[0], help="of images, pixels; they are three quarters as high")
     parser.add_argument("--json", type=Path, default=None)
     options = parser.parse_args()
     draws: list[dict[str, Any]] = []
     if options.json is not None and options.json.exists():
         draws = json.loads(options.json.read_text())["draws"]
     for seed in range(len(draws), options.draws):
-        draws.append(one_session(seed))
+        draws.append(one_session(seed, options.width))
         if options.json is not None:
             options.json.write_text(json.dumps({"summary": summary(draws), "draws": draws}))
         print(seed, {key: round(value, 5) for key, value in draws[-1].items() if isinstance(value, float)}, flush=True)

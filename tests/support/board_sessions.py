@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,26 +39,50 @@ def looking(position_mm: NDArray[np.float64], target_mm: NDArray[np.float64]) ->
     return pose_vector(matrix)
 
 
-def true_rig(random: np.random.Generator, n_places: int = 12) -> Rig:
-    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth."""
+def true_rig(random: np.random.Generator, n_places: int = 12, size: tuple[int, int] = SIZE) -> Rig:
+    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth; all sizes of image show as much."""
+    scale = size[0] / SIZE[0]
     lenses, cameras = [], []
     for azimuth in np.deg2rad([-35.0, 0.0, 35.0]):
         distortion = np.array([-0.12, 0.08, 0.0006, -0.0004]) * random.uniform(0.7, 1.3, 4)
-        focal = 3200 * random.uniform(0.95, 1.05)
-        lenses.append(Lens(SIZE, np.array([focal, focal * 1.002, 805.0, 590.0, *distortion])))
+        focal = 3200 * scale * random.uniform(0.95, 1.05)
+        lenses.append(Lens(size, np.array([focal, focal * 1.002, 805.0 * scale, 590.0 * scale, *distortion])))
         cameras.append(looking(450 * np.array([np.sin(azimuth), 0.2, np.cos(azimuth)]), np.zeros(3)))
-    centre = corners_on_board(CHESSBOARD).mean(axis=0)
-    places = []
+    return in_first_frame(tuple(lenses), cameras, tilted_places(random, n_places))
+
+
+def tilted_places(
+    random: np.random.Generator, n_places: int, towards: NDArray[np.float64] | None = None
+) -> list[NDArray[np.float64]]:
+    """Poses (4, 4) world_from_board of boards about the origin that face cameras on the side of +z.
+
+    Args:
+        towards: rotation (3, 3) that brings +z to another side.
+    """
+    centre, turned, places = corners_on_board(CHESSBOARD).mean(axis=0), np.eye(4), []
+    if towards is not None:
+        turned[:3, :3] = towards
     for _ in range(n_places):
         # Turned by π about x the plate faces the cameras; tilts of up to 35° tell focal length from distance.
         turn = np.array([np.pi, 0, 0]) + random.uniform(-0.6, 0.6, 3)
         matrix = pose_matrix(np.concatenate([turn, np.zeros(3)]))
         matrix[:3, 3] = random.uniform(-25, 25, 3) - matrix[:3, :3] @ centre
-        places.append(matrix)
-    # The world is that of the board at place 0.
+        places.append(turned @ matrix)
+    return places
+
+
+def in_first_frame(
+    lenses: tuple[Lens, ...], cameras: Sequence[NDArray[np.float64]], places: Sequence[NDArray[np.float64]]
+) -> Rig:
+    """A rig in the world of the board at place 0.
+
+    Args:
+        cameras: poses (6,) camera_from_world.
+        places: poses (4, 4) world_from_board.
+    """
     to_first = np.linalg.inv(places[0])
     moved = [pose_vector(pose_matrix(camera) @ places[0]) for camera in cameras]
-    return Rig(tuple(lenses), np.array(moved), np.array([pose_vector(to_first @ place) for place in places]))
+    return Rig(lenses, np.array(moved), np.array([pose_vector(to_first @ place) for place in places]))
 
 
 def photographed(rig: Rig, noise_px: float, random: np.random.Generator) -> list[View]:
