@@ -138,7 +138,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     problems.install(app)
     app.include_router(build_router(jobs, feed, readers, openers, lookers, cancellers))
     app.include_router(build_captures_router(jobs.captures))
-    app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures))
+    app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures, jobs, openers))
     app.include_router(build_masks_router(jobs, Masks(jobs)))
     app.include_router(build_dome_router(dome, darkeners, operators))
     app.include_router(build_workers_router(workers, jobs.repository))

@@ -49,6 +49,7 @@ def build_app() -> typer.Typer:
     from services.cli.client.demo import demo
     from services.cli.client.download import download
     from services.cli.client.jobs import jobs
+    from services.cli.client.keep_calibration import keep_calibration
     from services.cli.client.retry import retry
     from services.cli.client.submit import submit
     from services.cli.client.upload import upload
@@ -77,7 +78,7 @@ def build_app() -> typer.Typer:
     )
     app.callback()(_root)
     local = serve, dome_sim, capture, run, export, register, phantom, bench
-    for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo):
+    for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, keep_calibration):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     app.command("sphere")(sphere_command)

@@ -70,6 +70,10 @@ class Client:
         """A stored calibration; its 'option' is what a job takes."""
         return self.run(self._requests.calibration(name))
 
+    def keep_calibration(self, job_id: str, name: str) -> dict[str, Any]:
+        """Put what a calibration job made under a name, which jobs then give; the same again changes nothing."""
+        return self.run(self._requests.keep_calibration(job_id, name))
+
     def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
     ) -> UploadResult:
@@ -190,6 +194,10 @@ class AsyncClient:
     async def calibration(self, name: str) -> dict[str, Any]:
         """See ``Client``."""
         return await self.run(self._requests.calibration(name))
+
+    async def keep_calibration(self, job_id: str, name: str) -> dict[str, Any]:
+        """See ``Client``."""
+        return await self.run(self._requests.keep_calibration(job_id, name))
 
     async def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None

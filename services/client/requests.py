@@ -58,6 +58,10 @@ class Requests:
         """A stored calibration; its 'option' is what a job takes."""
         return self._answer("GET", f"/calibrations/{quote(name, safe='')}")
 
+    def keep_calibration(self, job_id: str, name: str) -> Flow[dict[str, Any]]:
+        """Put what a calibration job made under a name."""
+        return self._answer("PUT", f"/jobs/{quote(job_id, safe='')}/calibration/{quote(name, safe='')}")
+
     def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
     ) -> Flow[UploadResult]:

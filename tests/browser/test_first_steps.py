@@ -17,6 +17,7 @@ from services.api.app import create_app
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
 from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.support.calibration_jobs import publish_calibration
 from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving, toy_server
 from tests.support.uploading import contents_of, upload_capture, write_capture
@@ -118,6 +119,33 @@ def test_calibrations_are_shown_with_their_state_and_offered_to_jobs(
         expect(page.locator("#known-option-calibration option[value='calibrations/new-rig']")).to_have_text(
             "new-rig: good"
         )
+
+
+@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
+def test_what_a_calibration_job_made_is_kept_from_its_page(
+    chromium: Browser, tmp_path: Path, scheme: str, width: int
+) -> None:
+    folder = write_capture(tmp_path / "session")
+    tree = json.loads((folder / "capture.json").read_text())
+    del tree["images"]
+    (folder / "calibration.json").write_text(json.dumps(tree))
+    with serving(create_app(ServerSettings(data=tmp_path / "data"), publish_calibration)) as server:
+        job = server.post("/v1/jobs", json={"kind": "calibration", "capture": str(folder)}).json()["id"]
+        server.get(f"/v1/jobs/{job}/events")
+        with watched_page(chromium, address_of(server), scheme, width) as page:
+            page.goto(f"/#/{job}")
+            page.get_by_role("button", name="Keep the calibration…").click()
+            page.get_by_label("Its name").fill("rig 1")
+            page.keyboard.press("Enter")
+            assert server.get("/v1/calibrations").json() == [], "a blank is no part of a name"
+            page.get_by_label("Its name").fill("rig-1")
+            looked_at(page, f"keep-calibration-{scheme}-{width}")
+            page.keyboard.press("Enter")
+            expect(page.locator(".actions [role=status]")).to_have_text(
+                "Jobs name it as calibrations/rig-1. Its state: not known."
+            )
+            looked_at(page, f"kept-calibration-{scheme}-{width}")
+        assert [one["name"] for one in server.get("/v1/calibrations").json()] == ["rig-1"]
 
 
 def test_a_server_without_a_dome_says_so(chromium: Browser, server: httpx.Client) -> None:

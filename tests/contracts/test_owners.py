@@ -90,6 +90,7 @@ def path_of(template: str, ids: Mapping[str, str], receipt: str) -> str:
         "picture": "render",
         "camera": "c0",
         "light": "l0",
+        "name": "rig",
     }
     return template.format(**others | ids)
 

@@ -24,13 +24,17 @@ from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.pipeline.event_log import EventAddress
 from services.preprocess import stage
+from tests.support.calibration_jobs import publish_calibration
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth
 from tests.support.uploading import announce, contents_of, send
 
 
 def prepare(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """A job's preparation, without a worker around it."""
+    """A job's preparation, without a worker around it; a calibration job publishes what its folder holds."""
+    if spec.kind == "calibration":
+        publish_calibration(spec, folder, events)
+        return
     with events.open() as log:
         attempt = log.begin_stage("prepare")
         stage.run(spec, LocalContext(folder, attempt, lambda event: log.append(attempt, event)))
@@ -233,6 +237,51 @@ def test_the_command_line_names_a_stored_calibration(
         pytest.raises(UnknownCalibrationError, match="There is no calibration other-rig"),
     ):
         typed.calibration("other-rig")
+
+
+def test_what_a_calibration_job_made_is_put_under_a_name(
+    client: httpx.Client, mouth: Path, calibration: dict[str, Any]
+) -> None:
+    def ended(**options: str) -> str:
+        job = str(client.post("/v1/jobs", json={"capture": str(mouth)} | options).json()["id"])
+        client.get(f"/v1/jobs/{job}/events")
+        return job
+
+    failed = ended(kind="calibration")
+    refused = client.put(f"/v1/jobs/{failed}/calibration/by-job")
+    assert (refused.status_code, refused.json()["code"]) == (409, "job-state")
+    assert "is FAILED and has no calibration to keep" in refused.json()["detail"]
+    (mouth / "calibration.json").write_text(json.dumps(calibration | BEYOND))
+    made = ended(kind="calibration")
+    kept = client.put(f"/v1/jobs/{made}/calibration/by-job")
+    assert (kept.status_code, kept.headers["location"]) == (201, "/v1/calibrations/by-job"), kept.text
+    assert kept.json()["state"] == "beyond its limits", "kept, and refused by jobs as any other"
+    command = [sys.executable, "-m", "services", "keep-calibration", made, "by-job", "--server", str(client.base_url)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert told == "calibrations/by-job: beyond its limits\n"
+    assert client.put(f"/v1/jobs/{made}/calibration/by-job").status_code == 200
+    assert client.put("/v1/calibrations/by-hand", json=calibration | BEYOND).json()["id"] == kept.json()["id"]
+    # Whoever names it does not need the job any more.
+    client.delete(f"/v1/jobs/{made}").raise_for_status()
+    assert client.get("/v1/calibrations/by-job").json() == kept.json()
+    assert client.put(f"/v1/jobs/{made}/calibration/again").json()["code"] == "job-unknown"
+
+
+def test_names_that_are_taken_and_jobs_that_make_no_calibration(
+    client: httpx.Client, mouth: Path, calibration: dict[str, Any]
+) -> None:
+    client.put("/v1/calibrations/taken", json=calibration | BEYOND).raise_for_status()
+    (mouth / "calibration.json").write_text(json.dumps(calibration))
+    jobs = {}
+    for kind in ("calibration", "tooth"):
+        jobs[kind] = client.post("/v1/jobs", json={"capture": str(mouth), "kind": kind}).json()["id"]
+        client.get(f"/v1/jobs/{jobs[kind]}/events")
+    taken = client.put(f"/v1/jobs/{jobs['calibration']}/calibration/taken")
+    assert (taken.status_code, taken.json()["code"]) == (409, "calibration-taken")
+    other = client.put(f"/v1/jobs/{jobs['tooth']}/calibration/new")
+    assert (other.status_code, other.json()["code"]) == (409, "job-state")
+    assert "is of kind tooth and makes no calibration" in other.json()["detail"]
+    assert client.put(f"/v1/jobs/{jobs['calibration']}/calibration/.hidden").status_code == 422
 
 
 @pytest.mark.parametrize("option", ["calibrations/none", "calibrations/" + 64 * "0", "relative.json", "/no/such.json"])

@@ -19,13 +19,13 @@ from services.calibrate.session.judge import Judgement, judge
 from services.calibrate.session.photos import Photos
 from services.calibrate.session.record import light_positions, record_of
 from services.calibrate.session.spheres import IntensityStep, LightsStep, find_lights, measure_intensity
-from services.core.calibration.record import Calibration
+from services.core.calibration.record import CALIBRATION_FILE, Calibration
 from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.store import write_atomic, write_record
 
 VALID_DAYS = 30.0
 """A rig that stands in a practice is touched within a month."""
-CALIBRATION, RESIDUALS = "calibration.json", "residuals.json"
+CALIBRATION, RESIDUALS = CALIBRATION_FILE, "residuals.json"
 
 
 @dataclass(frozen=True)

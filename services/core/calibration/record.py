@@ -15,6 +15,8 @@ from services.core.geometry import Camera, Record, Vector3
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
 
+CALIBRATION_FILE = "calibration.json"
+"""As a calibration is written, also among the files of the job that made it."""
 RAW_DESCRIPTION = "raw.toml"
 """Makes a folder of photographs a capture; see ``services.core.raw``."""
 MAX_LIGHTS = 1000

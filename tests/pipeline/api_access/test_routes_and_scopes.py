@@ -34,6 +34,7 @@ KNOWN_SCOPES = {
     "PUT /v1/jobs/{job_id}/masks/{camera}/{light}": Scope.SUBMIT,
     "GET /v1/jobs/{job_id}/masks/{camera}/{light}": Scope.READ,
     "PUT /v1/calibrations/{name}": Scope.SUBMIT,
+    "PUT /v1/jobs/{job_id}/calibration/{name}": Scope.SUBMIT,
     "GET /v1/calibrations": Scope.READ,
     "GET /v1/metrics": Scope.METRICS,
     "GET /v1/dome": Scope.OPERATE_DOME,

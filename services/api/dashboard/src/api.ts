@@ -263,6 +263,8 @@ export const listPresets = (): Promise<Preset[]> => ask("/presets");
 export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name}`);
 export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
 export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibrations");
+/** Puts what a calibration job made under a name. */
+export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> => ask(`/jobs/${job}/calibration/${encodeURIComponent(name)}`, "PUT");
 export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
 export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");

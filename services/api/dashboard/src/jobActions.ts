@@ -1,6 +1,6 @@
-/** What a person does with one job: name, cancel, retry, download, delete. Deleting asks first, and says what goes. */
+/** What a person does with one job: name, cancel, retry, download, delete, keep the calibration that it made. Deleting asks first, and says what goes. */
 
-import { archiveUrl, cancelJob, deleteJob, type Job, type JobState, listArtifacts, renameJob, retryJob, Unauthenticated } from "./api";
+import { archiveUrl, cancelJob, deleteJob, type Job, type JobState, keepCalibration, listArtifacts, renameJob, retryJob, Unauthenticated } from "./api";
 import { element } from "./element";
 import { bytes } from "./format";
 
@@ -17,10 +17,12 @@ export interface Consequences {
 export class JobActions {
   private readonly act = element("button", { type: "button" });
   private readonly rename = element("button", { type: "button" }, "Name…");
+  private readonly keep = element("button", { type: "button" }, "Keep the calibration…");
   private readonly download = element("a", { class: "button", download: "" }, "Download all (zip)");
   private readonly remove = element("button", { type: "button", class: "danger" }, "Delete…");
   private readonly dialog = element("dialog");
-  readonly root = element("div", { class: "actions" }, this.act, this.rename, this.download, this.remove, this.dialog);
+  private readonly kept = element("p", { class: "soft", role: "status" });
+  readonly root = element("div", { class: "actions" }, this.keep, this.act, this.rename, this.download, this.remove, this.dialog, this.kept);
   private job: Job | null = null;
 
   constructor(
@@ -31,6 +33,7 @@ export class JobActions {
   ) {
     this.download.href = archiveUrl(id);
     this.act.addEventListener("click", () => void this.cancelOrRetry());
+    this.keep.addEventListener("click", () => this.askForCalibration());
     this.rename.addEventListener("click", () => this.askForName());
     this.remove.addEventListener("click", () => void this.askToDelete());
   }
@@ -39,6 +42,7 @@ export class JobActions {
     this.job = job;
     const hasEnded = ENDED.includes(job.state);
     this.rename.hidden = !this.mayChange;
+    this.keep.hidden = !this.mayChange || job.spec.kind !== "calibration" || job.state !== "SUCCEEDED";
     this.act.hidden = !this.mayChange || job.state === "SUCCEEDED" || job.state === "CANCELLING" || job.state === "DELETING";
     this.act.textContent = hasEnded ? "Retry" : "Cancel";
     this.remove.hidden = !this.mayChange || !hasEnded;
@@ -55,6 +59,18 @@ export class JobActions {
     const keep = element("button", { class: "primary" }, "Keep the name");
     this.ask("Name of this job", [element("label", { for: name.id }, `A label for people, up to ${LONGEST_NAME} characters; empty for none`), name], keep, async () => {
       this.then.changed(await renameJob(this.id, name.value.trim() || null), false);
+    });
+    name.select();
+  }
+
+  /** A name never means another calibration, so one with a date is offered. */
+  private askForCalibration(): void {
+    const offered = `rig-${new Date().toISOString().slice(0, 10)}`;
+    const name = element("input", { id: "calibration-name", type: "text", required: "", pattern: "[A-Za-z0-9][A-Za-z0-9._\\-]{0,59}", autocomplete: "off", value: offered });
+    const keep = element("button", { class: "primary" }, "Keep it");
+    this.ask("Keep the calibration", [element("label", { for: name.id }, "Its name: 1 to 60 letters, digits, '.', '_' or '-'"), name], keep, async () => {
+      const { name: kept, state } = await keepCalibration(this.id, name.value);
+      this.kept.textContent = `Jobs name it as calibrations/${kept}. Its state: ${state}.`;
     });
     name.select();
   }

@@ -26,7 +26,7 @@ export class RigView {
         "2. The calibration",
         element("p", {}, "A folder with ", code("capture.json"), " (cameras, lights and channels, lengths in mm) and the scan's meshes as ", code("teeth/<FDI>/outer.ply"), ". Upload it like a capture, or put it where server and workers see it and give its path."),
         element("p", {}, element("a", { href: "#/new" }, "Upload the folder")),
-        element("p", {}, "A calibration of ", code("dentine calibrate"), " is put under a name of its own by ", code("PUT /v1/calibrations/NAME"), "; jobs name it as ", code("calibrations/NAME"), "."),
+        element("p", {}, "A job of kind ", code("calibration"), " measures the rig from a raw folder; ", element("em", {}, "Keep the calibration"), " on its page puts the result under a name. A calibration of ", code("dentine calibrate"), " is put there by ", code("PUT /v1/calibrations/NAME"), ". Jobs name it as ", code("calibrations/NAME"), "."),
         this.calibrations,
       ),
       section(

@@ -1,0 +1,30 @@
+"""What calibration jobs made, to be put under names."""
+
+from __future__ import annotations
+
+from services.api.jobs.jobs import Jobs
+from services.api.jobs.lifecycle import JobState
+from services.client.errors import JobStateError
+from services.core.calibration.record import CALIBRATION_FILE, Calibration
+from services.core.results import AssetManifest
+from services.core.store import open_stage, read_record
+
+KIND = "calibration"
+
+
+def made_by(jobs: Jobs, job_id: str) -> Calibration:
+    """The record of a calibration job.
+
+    Raises:
+        UnknownJobError: there is no such job. JobStateError: it makes no calibration, or has made none yet. CorruptStoreError:
+            its files are not as they were published.
+    """
+    job = jobs.repository.get(job_id)
+    if job.spec.kind != KIND:
+        raise JobStateError(
+            f"Job {job.id} is of kind {job.spec.kind} and makes no calibration; name one of kind {KIND}."
+        )
+    if job.state is not JobState.SUCCEEDED:
+        raise JobStateError(f"Job {job.id} is {job.state} and has no calibration to keep; wait until it has succeeded.")
+    folder, _ = open_stage(jobs.folder(job.id), "asset", AssetManifest)
+    return read_record(folder / CALIBRATION_FILE, Calibration)
