@@ -129,6 +129,8 @@ class GaussNewton:
     """What has scattered twice and more (images, pixels), the same mean of renders."""
     joined: Joined | None = None
     """Renders of this stage that later ones join, in a thick cell."""
+    is_searching: bool = False
+    """Whether the fit may still be far off: then steps go by smooth derivatives and along broad directions in any cell."""
     kept: StandingFile | None = None
     """Where to go on from, and where to keep how far the fit has come; None for neither."""
 
@@ -143,12 +145,14 @@ class GaussNewton:
 
     def search(self, material: Material) -> Standing:
         """Iterate with few paths, as far as these tell."""
+        self.is_searching = True
         state = self.init(self.coordinates.begun(material))
         steps = 0
         converged = False
         while steps < self.budget.most_steps and not converged:
             state, converged = self.step(state)
             steps += 1
+        self.is_searching = False
         assert self.path_noise is not None
         assert self.multiple is not None
         return Standing(
@@ -260,8 +264,10 @@ class GaussNewton:
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
         noise = equations.gradient_noise + equations.data_noise
-        if not self.is_thick(around):
-            broad = broad[:, :0]  # in a thin cell signals stand out, and a second step only adds noise
+        if not self.is_broad(around):
+            broad = broad[
+                :, :0
+            ]  # near the end of a thin cell's fit signals stand out, and a second step only adds noise
         if broad.size:
             damping *= max(1.0, noise_ratio(quadratic, prior, noise))
         matrix = step_matrix(quadratic, prior, damping)
@@ -305,7 +311,7 @@ class GaussNewton:
         variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
         multiple = estimates.mean - estimates.single_images
         before = multiple if self.multiple is None else self.multiple
-        if self.is_thick(material):
+        if self.is_broad(material):
             estimates = self.smoother(before, variances, [one / (batches * paths) for one in recent]).of(estimates)
         self.multiple = (multiple + before) / 2
         noise = [one / (batches * paths) for one in known]
@@ -324,6 +330,10 @@ class GaussNewton:
         )
         self.joined = Joined(equations.derivatives, equations.residuals, known) if join else None
         return equations.chained(self.coordinates.chain(material))
+
+    def is_broad(self, material: Material) -> bool:
+        """Whether derivatives are made smooth, and a second step goes along broad directions."""
+        return self.is_thick(material) or (self.is_searching and self.joins(material))
 
     def joins(self, material: Material) -> bool:
         """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media are told at their mean."""
