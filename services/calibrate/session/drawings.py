@@ -1,4 +1,7 @@
-"""Drawings of a calibration's report as SVG: corners and their residuals, uncertainty over the image, lights, charts."""
+"""Drawings of a calibration's report as SVG: corners and their residuals, uncertainty over the image, lights, charts.
+
+Their colours are classes of the report's style, light or dark as the page is; a chart's are its own.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ SRGB_FROM_XYZ_D50 = np.array(
 
 
 def corners_drawing(fit: BundleFit, camera: int) -> str:
-    """All corners of a camera with their residuals, as arrows of a common scale; corners that were left out in red."""
+    """All corners of a camera with their residuals, as arrows of a common scale; those of corners that were left out are marked."""
     size = fit.rig.lenses[camera].size
     scale = WIDTH / size[0]
     mine = fit.corners.camera == camera
@@ -32,14 +35,14 @@ def corners_drawing(fit: BundleFit, camera: int) -> str:
     length = np.linalg.norm(off, axis=1, keepdims=True)
     off = off * np.minimum(1, 2 * ARROW_PX / np.maximum(length, 1e-12))
     shapes = [
-        f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" stroke="{"#25c" if good else "#c22"}"/>'
+        f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" class="{"used" if good else "left-out"}"/>'
         for (x, y), (dx, dy), good in zip(places, off, fit.inliers[mine], strict=True)
     ]
     return _svg(shapes, WIDTH, size[1] * scale)
 
 
 def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tuple[str, float]:
-    """Uncertainty of projection over the image, white at 0 and dark at the largest, and that largest in px."""
+    """Uncertainty of projection over the image, faint at 0 and full at the largest, and that largest in px."""
     lens = fit.rig.lenses[camera]
     scale = WIDTH / lens.size[0]
     sigma = projection_sigma(fit, camera, image_grid(lens.size, *GRID), distance_mm)
@@ -47,7 +50,7 @@ def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tupl
     width, height = WIDTH / columns, lens.size[1] * scale / rows
     shapes = [
         f'<rect x="{(n % columns) * width:.1f}" y="{(n // columns) * height:.1f}" width="{width:.1f}" height="{height:.1f}" '
-        f'fill="hsl(215,60%,{95 - 65 * value / largest:.0f}%)"><title>{value:.3f} px</title></rect>'
+        f'class="share" fill-opacity="{value / largest:.3f}"><title>{value:.3f} px</title></rect>'
         for n, value in enumerate(sigma)
     ]
     return _svg(shapes, WIDTH, lens.size[1] * scale), largest
@@ -55,7 +58,8 @@ def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tupl
 
 def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, errors_mm: Floats | None) -> str:
     """Lights and cameras from above (x, z) and from the side (y, z), lights with circles of 10 σ."""
-    everything = np.concatenate([lights_mm, cameras_mm])
+    reach = np.zeros((len(lights_mm), 1)) if errors_mm is None else 10 * errors_mm[:, None]
+    everything = np.concatenate([lights_mm - reach, lights_mm + reach, cameras_mm])
     low, high = everything.min(axis=0), everything.max(axis=0)
     scale = (WIDTH - 40) / max(float((high - low).max()), 1.0)
     shapes = []
@@ -63,13 +67,13 @@ def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, 
         left = view * WIDTH + 20
         for number, name in enumerate(names):
             x, y = ((lights_mm[number] - low) * scale)[list(axes)]
-            radius = 2.5 if errors_mm is None else max(10 * float(errors_mm[number]) * scale, 2.5)
+            radius = max(float(reach[number, 0]) * scale, 2.5)
             shapes.append(
-                f'<circle cx="{left + x:.1f}" cy="{20 + y:.1f}" r="{radius:.1f}" fill="#e90" fill-opacity="0.6"><title>{_safe(name)}</title></circle>'
+                f'<circle cx="{left + x:.1f}" cy="{20 + y:.1f}" r="{radius:.1f}" class="lamp"><title>{_safe(name)}</title></circle>'
             )
         for camera in cameras_mm:
             x, y = ((camera - low) * scale)[list(axes)]
-            shapes.append(f'<rect x="{left + x - 3:.1f}" y="{20 + y - 3:.1f}" width="6" height="6" fill="#333"/>')
+            shapes.append(f'<rect x="{left + x - 3:.1f}" y="{20 + y - 3:.1f}" width="6" height="6" class="camera"/>')
     return _svg(shapes, 2 * WIDTH, float((high - low)[2]) * scale + 40)
 
 
