@@ -81,6 +81,17 @@ def test_a_photograph_that_no_light_makes_is_odd_only_where_the_others_are_well_
     assert not named(sums_of(render, poor))
 
 
+def test_single_photographs_are_not_blamed_for_a_misplaced_mesh() -> None:
+    render, photos = scene(4)
+    photos[2] = 1.01 * photos[5]
+    photos[[0, 3]] = photos[[3, 0]]
+    lights = {"green": LIGHTS}
+    sums = {"green": {"c0": sums_of(render, photos)}}
+    assert {frame.light for frame in frames_told(sums, lights)[1]} == {"l0", "l2"}
+    (left,) = frames_told(sums, lights, is_placed=False)[1]
+    assert (left.light, left.other, left.exchanged) == ("l0", "l3", True)
+
+
 def test_what_several_cameras_show_is_told_once() -> None:
     render, photos = scene(5)
     photos[[1, 4]] = photos[[4, 1]]

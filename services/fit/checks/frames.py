@@ -88,12 +88,17 @@ def _are_exchanged(errors: Array, first: int, second: int) -> bool:
 
 
 def photographs_told(
-    evaluations: Mapping[str, Evaluation], observations: Observations, views: Mapping[str, tuple[ViewStack, ...]]
+    evaluations: Mapping[str, Evaluation],
+    observations: Observations,
+    views: Mapping[str, tuple[ViewStack, ...]],
+    *,
+    is_placed: bool,
 ) -> list[str]:
     """A sentence for each wrong frame of a fit.
 
     Args:
         evaluations: by channel, of the final answer, with sums over frames.
+        is_placed: whether the mesh lies where the photographs show it; see ``frames_told``.
     """
     lights = {
         channel: [
@@ -105,22 +110,26 @@ def photographs_told(
         ]
         for channel, own in views.items()
     }
-    return frames_told({channel: one.frames for channel, one in evaluations.items()}, lights)[0]
+    return frames_told({channel: one.frames for channel, one in evaluations.items()}, lights, is_placed=is_placed)[0]
 
 
 def frames_told(
-    sums: Mapping[str, Mapping[str, FrameSums]], lights: Mapping[str, Sequence[str]]
+    sums: Mapping[str, Mapping[str, FrameSums]], lights: Mapping[str, Sequence[str]], *, is_placed: bool = True
 ) -> tuple[list[str], tuple[WrongFrame, ...]]:
     """A sentence for each wrong frame, what several cameras show alike told once; and the frames.
 
     Args:
         sums: by channel and camera.
         lights: names, by channel.
+        is_placed: whether the mesh lies where the photographs show it. Renders of a misplaced one are like no photograph, so that single ones seem odd
+            or another light's; two that explain each other are exchanged there, too.
     """
     found: dict[tuple[str, str, str, bool], tuple[WrongFrame, list[str]]] = {}
     for channel, cameras in sums.items():
         for camera, own in cameras.items():
             for frame in wrong_frames(camera, lights[channel], own):
+                if not is_placed and not frame.exchanged:
+                    continue
                 # Odd ones are told by camera, as what is wrong with one need not be with another.
                 key = frame.camera if not frame.other else "", frame.light, frame.other, frame.exchanged
                 seen = found.setdefault(key, (frame, []))[1]

@@ -63,8 +63,8 @@ def report(
         _views(fits),
         "the jaw's meshes",
     )
-    wrong = photographs_told(_evaluations(fits), observations, _views(fits))
-    advice = wrong + misplaced + advice
+    wrong = photographs_told(_evaluations(fits), observations, _views(fits), is_placed=not misplaced)
+    advice = misplaced + wrong + advice
     teeth = {
         str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
         for k, start in enumerate(first.starts)

@@ -157,8 +157,8 @@ class FitDriver:
             views,
             f"the mesh of tooth {observations.teeth[0].fdi}",
         )
-        wrong = photographs_told(evaluations, observations, views)
-        converged, advice = converged and not misplaced and not wrong, wrong + misplaced + advice
+        wrong = photographs_told(evaluations, observations, views, is_placed=not misplaced)
+        converged, advice = converged and not misplaced and not wrong, misplaced + wrong + advice
         correlations = {c: correlation(known[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
         thickness = fitted_thickness(
