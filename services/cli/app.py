@@ -59,6 +59,7 @@ def build_app() -> typer.Typer:
     from services.cli.export import export
     from services.cli.import_folder import import_command
     from services.cli.lab_demo import lab_demo
+    from services.cli.options import options
     from services.cli.phantom import phantom
     from services.cli.register import register
     from services.cli.run import run
@@ -77,7 +78,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_root)
-    local = serve, dome_sim, capture, run, export, register, phantom, bench
+    local = serve, dome_sim, capture, run, options, export, register, phantom, bench
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, keep_calibration):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)

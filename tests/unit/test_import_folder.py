@@ -41,6 +41,7 @@ def test_names(file: str, told: tuple[object, ...]) -> None:
     ("file", "pattern"),
     [
         ("0.05s.tif", "does not name its camera"),
+        ("c0_L0_0.02.npy", "says 0.02 without a unit, such as 0.02s"),
         ("left_0.05s.tif", "names camera left, and neither a light nor a kind"),
         ("left_white_0.05s.tif", "is of kind white-sphere and does not name its light"),
     ],
@@ -49,6 +50,22 @@ def test_names_that_lack_something(file: str, pattern: str) -> None:
     found = named_frame(file)
     assert isinstance(found, str)
     assert found.startswith(pattern)
+
+
+@pytest.mark.parametrize(
+    ("file", "place"),
+    [
+        ("c0_board3_5ms.npy", "board3"),
+        ("c0_board_003_5ms.npy", "board003"),
+        ("c0_mirror1_L2_5ms.npy", "mirror1"),
+        ("c0_white_L2_1_5ms.npy", "white1"),
+        ("c0_tracking_003_5ms.npy", None),
+    ],
+)
+def test_where_a_board_or_sphere_lay(file: str, place: str | None) -> None:
+    found = named_frame(file)
+    assert isinstance(found, NamedFrame)
+    assert found.place == place
 
 
 @pytest.fixture
@@ -102,9 +119,7 @@ def test_what_one_camera_lacks_is_said(photographs: Path) -> None:
 
 def test_an_exposure_that_nothing_says(photographs: Path) -> None:
     (photographs / "left" / "L3.png").write_bytes((photographs / "left" / "L1_10ms.png").read_bytes())
-    with pytest.raises(
-        CaptureInputError, match=r"File left/L3\.png does not say its exposure; rename it, .*--exposure-s"
-    ):
+    with pytest.raises(CaptureInputError, match=r"File left/L3\.png does not say the exposure; rename .*--exposure-s"):
         import_folder(photographs, None, None, None)
     assert not (photographs / "raw.toml").exists()
     answer = CliRunner().invoke(build_app(), ["import", str(photographs), "--exposure-s", "0.02", "--mosaic", "GBRG"])
@@ -116,3 +131,21 @@ def test_an_exposure_that_nothing_says(photographs: Path) -> None:
 def test_a_folder_without_photographs(tmp_path: Path) -> None:
     with pytest.raises(CaptureInputError, match="holds no photograph; put"):
         import_folder(tmp_path, None, None, None)
+
+
+def test_tracking_frames_in_one_block_are_told(tmp_path: Path) -> None:
+    """Names do not tell that these were taken between the lights, so motion would be interpolated to where there is none."""
+    for name in ("black", "L1", "L2", "L3", "all0", "all1", "all2", "all3"):
+        np.save(tmp_path / f"left_{name}_10ms.npy", counts(1, 1))
+    told = import_folder(tmp_path, None, "RGGB", None).missing
+    assert any("Tracking frames of camera left all stand before or after its lights" in one for one in told)
+
+
+def test_a_scan_is_offered_to_be_filled_in(tmp_path: Path) -> None:
+    np.save(tmp_path / "left_L1_10ms.npy", counts(1, 1))
+    (tmp_path / "upper.stl").write_bytes(b"")
+    imported = import_folder(tmp_path, None, "RGGB", None)
+    assert imported.missing[-1].endswith("to be filled in for upper.stl at the end of raw.toml.")
+    text = (tmp_path / "raw.toml").read_text()
+    assert '# [scan]\n# file = "upper.stl"' in text
+    assert "# [[landmark]]" in text

@@ -29,8 +29,13 @@ MAX_EMPTY = 0.3
 CHANNELS_OF_COLOUR = 3
 """XYZ is fitted to three channels alone; a chart tells nothing of other numbers of them."""
 AGAIN = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
+PLAN = {
+    "boards": "take boards in ten places and more, tilted by 20° to 40° in several directions, and fill the image with them",
+    "spheres": "take the mirror sphere in ten places that lie far apart, sharp and as large as the teeth's surroundings allow",
+    "chart": "take the chart sharp, evenly lit and not overexposed",
+}
 MAX_TIMES = 10
-"""Nobody takes ten times as many photographs, and errors that large are none of chance."""
+"""Nobody takes ten times as many photographs."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def judge(
     """Hold a calibration to its limits. They are those that keep a tooth's absorption within a few per cent."""
     limits = list(_limits(cameras, lights, uncertainty, colours))
     wrong = tuple(suspicions(folder, cameras, lights, intensity, colours, black, inputs))
-    return Judgement(tuple(limits), wrong, _advice(folder, limits, cameras, lights, intensity, colours))
+    return Judgement(tuple(limits), wrong, _advice(folder, limits, cameras, lights, intensity, colours, wrong))
 
 
 def _limits(
@@ -143,11 +148,12 @@ def _advice(
     lights: LightsStep | None,
     intensity: IntensityStep | None,
     colours: ColourStep | None,
+    wrong: tuple[str, ...],
 ) -> str:
     """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of photographs."""
     worst = max(limits, key=lambda one: one.value / one.limit)
     if not worst.is_kept:
-        return _again(worst)
+        return _again(worst, is_anything_wrong=bool(wrong))
     if lights is None:
         return "Photograph a mirror sphere light by light in three or more places: without it the lights are where the list says."
     if intensity is None:
@@ -163,7 +169,7 @@ def _advice(
     return "All limits are kept; nothing needs to be photographed again."
 
 
-def _again(worst: Limit) -> str:
+def _again(worst: Limit, *, is_anything_wrong: bool) -> str:
     """What would mend the limit that is kept least."""
     thing = AGAIN[worst.mended_by]
     if not math.isfinite(worst.value):
@@ -174,6 +180,8 @@ def _again(worst: Limit) -> str:
     told = (
         f"Photograph {thing} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}"
     )
+    if times > MAX_TIMES and is_anything_wrong:
+        return f"{told}; look at what looks wrong in the report first."
     if times > MAX_TIMES:
-        return f"{told}; that is no chance, so look at what looks wrong in the report first."
+        return f"{told}; photographs as these would not meet it: {PLAN[worst.mended_by]}."
     return f"{told}; {times} times as many photographs would meet it, if chance alone is the cause."

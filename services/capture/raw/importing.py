@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,6 +21,7 @@ from services.core.raw.toml_writing import description_toml, toml_value
 from services.core.store import write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
+SCANS = frozenset({".ply", ".stl", ".obj", ".vtp"})
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits that analogue-to-digital converters of cameras have."""
 LOOKED_AT = 8
@@ -94,11 +96,17 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
     ]
     if not frames:
         raise CaptureInputError(unnamed[0].replace(", so it is left out", ""))
-    if exposure_s is None and (silent := next((one for one in frames if one.exposure_s is None), None)) is not None:
+    if exposure_s is None and (silent := [one.file for one in frames if one.exposure_s is None]):
+        which = f"File {silent[0]} does" if len(silent) == 1 else f"File {silent[0]} and {len(silent) - 1} more do"
         raise CaptureInputError(
-            f"File {silent.file} does not say its exposure; rename it, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
+            f"{which} not say the exposure; rename them, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
         )
-    content = description_toml(_tree(root, frames, exposure_s, mosaic, calibration)) + _to_complete(frames, exposure_s)
+    scans = sorted(p.name for p in root.iterdir() if p.suffix.lower() in SCANS)
+    content = (
+        description_toml(_tree(root, frames, exposure_s, mosaic, calibration))
+        + _to_complete(frames, exposure_s)
+        + b"".join(_of_a_scan(scan, frames[0].camera) for scan in scans[:1])
+    )
     folder = parse_raw_folder(content, str(root / DESCRIPTION))
     write_atomic(root / DESCRIPTION, content)
     things = sorted({THING_OF[one.kind] for one in frames if one.kind in THING_OF})
@@ -106,7 +114,7 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         f"Frames of a {thing} are written as comments, since its measures are not known; give them in raw.toml and take the # away."
         for thing in things
     ]
-    return Imported(folder, (*unnamed, *of_things, *_missing(root, folder)))
+    return Imported(folder, (*unnamed, *of_things, *_missing(root, folder, scans)))
 
 
 def _tree(
@@ -130,6 +138,8 @@ def _frame(one: NamedFrame, exposure_s: float | None) -> Entry:
         entry["light"] = one.light
     if one.gain != 1.0:
         entry["gain"] = one.gain
+    if one.place is not None:
+        entry["place"] = one.place
     return entry
 
 
@@ -171,7 +181,7 @@ def _bits(images: Iterable[np.ndarray]) -> Entry:
     return {"bits": depth} | ({"shift": shift} if shift else {})
 
 
-def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
+def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[str]:
     lit = {frame.light for frame in folder.frame if frame.kind == "light"}
     for camera in folder.camera:
         name = camera.name
@@ -185,6 +195,11 @@ def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
             yield f"Camera {name} has no flat frame; two of one exposure would tell its noise and its fall of light."
         if len(folder.frames_of(name, "tracking")) < MIN_TRACKING:
             yield f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed less well."
+        elif _is_out_of_order(folder, name):
+            yield (
+                f"Tracking frames of camera {name} all stand before or after its lights, as names do not tell when they were taken, and motion "
+                "would be followed wrongly: put the [[frame]] entries in the order taken, or give each its time_s."
+            )
         if lacking := sorted(str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}):
             shown = ", ".join(lacking[:MAX_NAMED]) + (" and more" if len(lacking) > MAX_NAMED else "")
             yield f"Camera {name} has no frame of light {shown}, which another camera has."
@@ -193,7 +208,23 @@ def _missing(root: Path, folder: RawFolder) -> Iterator[str]:
     if folder.calibration is None:
         yield "No calibration is named; add [calibration] file, or give a job one by its option 'calibration'."
     if not (root / "teeth").is_dir() and folder.scan is None:
-        yield "There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks."
+        found = f" to be filled in for {scans[0]} at the end of {DESCRIPTION}" if scans else ""
+        yield f"There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks{found}."
+
+
+def _is_out_of_order(folder: RawFolder, camera: str) -> bool:
+    """Whether tracking frames stand in one block beside the lights, and no times say otherwise."""
+    own = [frame for frame in folder.frame if frame.camera == camera and frame.kind in {"light", "tracking"}]
+    changes = sum(one.kind != other.kind for one, other in pairwise(own))
+    return changes == 1 and any(frame.time_s is None for frame in own)
+
+
+def _of_a_scan(file: str, camera: str) -> bytes:
+    """Comments: a scan's entry and one landmark, to fill in."""
+    lines = ["", "[scan]", f'file = "{file}"', 'units = "mm"', 'jaw = "upper"', ""]
+    lines += ["[[landmark]]", "tooth = ?", 'point = "edge"', "xyz_mm = [?, ?, ?]"]
+    lines += [f'pixels = [{{camera = "{camera}", xy_px = [?, ?]}}]']
+    return "".join(f"# {line}\n" if line else "\n" for line in lines).encode()
 
 
 def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:

@@ -39,9 +39,12 @@ KINDS: Mapping[str, FrameKind] = MappingProxyType(
     }
 )
 """Words by which laboratories call a kind of photograph, with an optional number behind."""
+PLACED: frozenset[FrameKind] = frozenset({"board", "mirror-sphere", "white-sphere"})
+"""Kinds of photographs of a thing that is moved from place to place."""
 _SECONDS = re.compile(r"(?:(\d+)-(\d+)|(\d+(?:\.\d+)?))(s|ms|us)")
 _GAIN = re.compile(r"gain(\d+(?:\.\d+)?)")
 _NUMBER = re.compile(r"\d+")
+_DECIMAL = re.compile(r"\d*\.\d+")
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
@@ -55,13 +58,15 @@ class NamedFrame:
     light: str | None
     exposure_s: float | None
     gain: float
+    place: str | None = None
+    """Of a board or sphere: where it lay, as its word and number say."""
 
 
 def named_frame(file: str) -> NamedFrame | str:
     """What a name says, or the part of a sentence that says what it lacks."""
     pure = PurePosixPath(file)
     parts = [part for whole in (*pure.parent.parts, pure.stem) for part in re.split(r"[_ ]+", whole) if part]
-    exposure_s, gain, kind = None, 1.0, None
+    exposure_s, gain, kind, place = None, 1.0, None, None
     words: list[str] = []
     for part in parts:
         word = part.lower()
@@ -70,8 +75,12 @@ def named_frame(file: str) -> NamedFrame | str:
             exposure_s = (float(over) / float(under) if over else float(whole)) * _UNITS[unit]
         elif (told := _GAIN.fullmatch(word)) is not None:
             gain = float(told[1])
+        elif _DECIMAL.fullmatch(word) is not None:
+            return f"says {part} without a unit, such as {part}s"
         elif (found := KINDS.get(word.rstrip("0123456789").rstrip("-"))) is not None and kind is None:
-            kind = found
+            kind, place = found, word
+        elif _NUMBER.fullmatch(word) is not None and place is not None and not place[-1].isdigit():
+            place += word
         elif _NUMBER.fullmatch(word) is None or not words:
             words.append(part)
     if not words:
@@ -83,4 +92,6 @@ def named_frame(file: str) -> NamedFrame | str:
     if kind in LIT_BY_ONE and light is None:
         return f"is of kind {kind} and does not name its light"
     takes_light = kind in LIT_BY_ONE or kind in {"flat", "board", "chart"}
-    return NamedFrame(file, words[0], kind, light if takes_light else None, exposure_s, gain)
+    return NamedFrame(
+        file, words[0], kind, light if takes_light else None, exposure_s, gain, place if kind in PLACED else None
+    )

@@ -9,11 +9,14 @@ from typing import Any
 
 def description_toml(tree: Mapping[str, Any]) -> bytes:
     """Text of ``raw.toml``: values below the second level stand in one line, and those that are None are left out."""
-    lines = [f"{key} = {toml_value(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
-    for key, value in tree.items():
-        tables = [(f"[{key}]", value)] if isinstance(value, dict) else []
-        tables += [(f"[[{key}]]", one) for one in value] if isinstance(value, list) else []
-        for head, table in tables:
+    tables = {
+        key: [(f"[{key}]", value)] if isinstance(value, dict) else [(f"[[{key}]]", one) for one in value]
+        for key, value in tree.items()
+        if isinstance(value, dict) or (isinstance(value, list) and all(isinstance(one, dict) for one in value))
+    }
+    lines = [f"{key} = {toml_value(value)}" for key, value in tree.items() if key not in tables]
+    for entries in tables.values():
+        for head, table in entries:
             lines += ["", head, *(f"{name} = {toml_value(one)}" for name, one in table.items() if one is not None)]
     return ("\n".join(lines) + "\n").encode()
 

@@ -53,10 +53,14 @@ def summarise(
     seen = np.sum([done.tooth_pixels for done in images], axis=0)
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:
-        what = "is dark: no tooth is above the noise" if brightness.dark else "lacks a valid tooth pixel"
-        raise CaptureInputError(
-            f"Every image of {source.root} {what}; check exposure, lights, noise and masks, then capture again."
-        )
+        if brightness.dark:
+            what, remedy = "is dark: no tooth is above the noise", "check exposure and lights, then capture again"
+        elif all(max(report.masked, key=report.masked.__getitem__, default="") == "motion" for report in reports):
+            what = "lacks a valid tooth pixel, mostly as motion is not known there"
+            remedy = "see that its frames are listed in the order taken, or have time_s, and that tracking frames stand between the lights"
+        else:
+            what, remedy = "lacks a valid tooth pixel", "check exposure, lights, noise and masks, then capture again"
+        raise CaptureInputError(f"Every image of {source.root} {what}; {remedy}.")
     brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in subject.teeth)
     # What a source finds out while it reads is told once
