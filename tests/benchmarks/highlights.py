@@ -8,7 +8,8 @@ it reflects is the difference to the same render without reflection. A row says 
 masked, and what share of the dull pixels, whose reflection is below 1 % of their diffuse light, is masked falsely.
 The best threshold knows the reflection of every pixel and masks the strongest until 3 % are false: what no mask of
 pixels can beat. Where no pixel is dull it masks all; so a row also says what the strongest pixels reflect, as many as
-the mask has. Rows that the file has already are kept. Some 5 seconds of a core a roughness.
+the mask has. The row "matte" is the tooth without its reflection, of which nothing should be masked. Rows that the
+file has already are kept. Some 5 seconds of a core a roughness.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from services.preprocess.masking.valid import valid_bits
 from services.preprocess.projection import project
 from services.preprocess.source import LightImage
 
+MATTE = "matte"
 ROUGHNESS = (0.05, 0.1, 0.2, 0.3)
 LIGHTS, VIEWS_DEG = 12, ((0, 0), (30, 10))
 SIZE, PIXEL_MM, SAMPLES = (124, 156), 0.09, 16
@@ -53,6 +55,10 @@ def main() -> None:
             rows[str(roughness)] = row_of(renders(roughness), np.random.default_rng(options.seed))
             write_atomic(options.json, json.dumps(rows, indent=1).encode())
         print(roughness, rows[str(roughness)])
+    if MATTE not in rows:
+        rows[MATTE] = matte_row(renders(options.roughness[0]), np.random.default_rng(options.seed))
+        write_atomic(options.json, json.dumps(rows, indent=1).encode())
+    print(MATTE, rows[MATTE])
 
 
 def renders(roughness: float) -> dict[str, NDArray[Any]]:
@@ -92,6 +98,13 @@ def row_of(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> di
         "masked": float(masked.mean()),
         "pixels": len(masked),
     }
+
+
+def matte_row(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> dict[str, float]:
+    """What share of the pixels is masked where nothing reflects."""
+    pixels = _pixels(rendered | {"total": rendered["diffuse"]}, random)
+    masked = np.concatenate([own for _, _, own in pixels])
+    return {"masked": float(masked.mean()), "pixels": len(masked)}
 
 
 Column = NDArray[Any]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
+from services.preprocess.masking.lobe import PROFILE_DEG, LobeProfile
 from services.preprocess.projection import Footprint
 from services.preprocess.window import bands
 
@@ -125,6 +126,7 @@ def highlight_mask(
     mask = np.zeros(usable.shape, dtype=bool)
     if not (near | burnt).any():
         return mask
+    around = usable & (cosines > np.float32(np.cos(np.radians(PROFILE_DEG))))
     axis = np.asarray(light_colour, dtype=np.float64)
     axis /= np.linalg.norm(axis)
     brightness = along_axis(radiance, axis)
@@ -134,9 +136,9 @@ def highlight_mask(
 
     # A few rows at a time: both estimates of the reflected part joined by their inverse variances, and what they say of each pixel
     weak, strong = burnt.astype(np.uint8), burnt
-    sums = _LobeSums()
+    profile = LobeProfile()
     for rows in bands(usable.shape):
-        own = near[rows]
+        own = around[rows]
         if not own.any():
             continue
         estimate, weight = _reflected(
@@ -145,11 +147,12 @@ def highlight_mask(
         bright = brightness[rows]
         fraction = estimate / np.maximum(bright, np.float32(1e-30))
         significance = estimate * np.sqrt(weight)
-        is_weak = own & (fraction > np.float32(o.weak)) & (significance > np.float32(o.weak_sigma))
+        is_weak = near[rows] & (fraction > np.float32(o.weak)) & (significance > np.float32(o.weak_sigma))
         weak[rows] |= is_weak
         strong[rows] |= is_weak & (fraction > np.float32(o.strong)) & (significance > np.float32(o.strong_sigma))
-        sums.add(cosines[rows][own], bright[own], estimate[own], weight[own])
-    if not strong.any():
+        profile.add(cosines[rows][own], bright[own], estimate[own], weight[own])
+    half_angle = profile.half_angle(o.tolerated, o.cone_deg)
+    if half_angle == 0 and not strong.any():
         return mask
 
     # Hysteresis: a strong core, continued through weak neighbours, and one pixel of bloom
@@ -159,7 +162,7 @@ def highlight_mask(
     of_core[0] = 0
     core = of_core[labels]
     bloom = cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0
-    lobe = cosines > np.float32(np.cos(sums.angle(o)))
+    lobe = cosines > np.float32(np.cos(half_angle))
     return np.asarray((usable | saturated) & (bloom | lobe))
 
 
@@ -324,30 +327,3 @@ def _wide_blur(image: Image, sigma_px: float, factor: int) -> Image:
     if factor > 1:
         image = cv2.resize(image, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px / factor), dtype=np.float32)
-
-
-class _LobeSums:
-    """Light and its reflected part by whole degrees from the mirror direction."""
-
-    def __init__(self) -> None:
-        self._total, self._reflected, self._variance = (np.zeros(180) for _ in range(3))
-
-    def add(self, cosines: Image, brightness: Image, estimate: Image, weight: Image) -> None:
-        """Add pixels (N,)."""
-        degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1))).astype(np.int64)
-        self._total += np.bincount(degrees, brightness, minlength=180)
-        self._reflected += np.bincount(degrees, estimate, minlength=180)
-        self._variance += np.bincount(degrees, 1 / np.maximum(weight, np.float32(1e-30)), minlength=180)
-
-    def angle(self, o: HighlightOptions) -> float:
-        """Half-angle in rad within which the mean reflected fraction exceeds ``tolerated``: averaging sees tails that single pixels hide."""
-        total, reflected, noise = self._total, self._reflected, np.sqrt(self._variance)
-        # What remains outside the lobe is the method's own bias
-        outside = slice(int(o.lobe_deg), int(o.cone_deg))
-        bias = reflected[outside].sum() / max(total[outside].sum(), 1e-30)
-        cone = 0
-        for degree in np.flatnonzero(total[: int(o.cone_deg)] > 0):
-            if reflected[degree] - bias * total[degree] < max(o.tolerated * total[degree], 2 * noise[degree]):
-                break
-            cone = int(degree) + 1
-        return float(np.radians(cone))
