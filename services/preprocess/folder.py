@@ -15,6 +15,7 @@ from services.core.files.arrays import as_float32, map_radiance
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
 from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import bands
 
 # Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
@@ -100,6 +101,10 @@ class FolderSource:
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:  # noqa: ARG002
         """See ``Source``."""
         return iter(())
+
+    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:  # noqa: ARG002
+        """See ``Source``."""
+        return None
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:  # noqa: ARG002
         """See ``Source``. A variance file is the variance of the pixel's value and used as it is."""

@@ -48,10 +48,21 @@ class ImageQuality(Record):
     )
 
 
+class CameraFlow(Record):
+    """Flow between the first tracking frame of a camera and the one that moved most, over the teeth."""
+
+    camera: str
+    frame: int = Field(description="number of the frame that moved most")
+    before_px: tuple[float, float] = Field(description="median and 95th percentile before the motion is taken out")
+    after_px: tuple[float, float] = Field(description="the same afterwards, the flow's own errors among it")
+    scale_px: float = Field(description="flow that the pictures show in full colour")
+
+
 class QualityReport(Record):
     """``quality.json`` of a prepared store."""
 
     images: tuple[ImageQuality, ...]
+    flows: tuple[CameraFlow, ...] = Field(default=(), description="of cameras whose motion was measured in one light")
 
 
 def assess(

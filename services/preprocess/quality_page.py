@@ -10,7 +10,7 @@ import numpy as np
 
 from services.core.page import page_template
 from services.core.store import write_atomic
-from services.preprocess.quality import STOPS, ImageQuality
+from services.preprocess.quality import STOPS, CameraFlow, ImageQuality
 
 TEMPLATE = Path(__file__).parent / "quality.html.j2"
 WIDTH, HEIGHT = 320, 120
@@ -25,6 +25,7 @@ class CameraPage:
         motion: by image the motion in pixels that was taken out, and how wrong it may be; None where nothing tells.
         coverage: by tooth its FDI number and by image the share of its valid pixels in the image that shows most of it.
         levels: by stop below each image's brightest pixel the share of all teeth's pixels, and the bar's height.
+        flow: what flow sees before and after the motion is taken out; None where no two frames share their light.
         noise: SVG points of relative noise by stop, and the largest, per cent.
     """
 
@@ -33,23 +34,26 @@ class CameraPage:
     motion: tuple[tuple[str, float | None, float | None], ...]
     coverage: tuple[tuple[int, tuple[float, ...]], ...]
     levels: tuple[tuple[float, float], ...]
+    flow: CameraFlow | None
     noise: str
     most_noise: float
 
 
-def write_page(folder: Path, images: Sequence[ImageQuality], notes: Sequence[str]) -> None:
+def write_page(folder: Path, images: Sequence[ImageQuality], flows: Sequence[CameraFlow], notes: Sequence[str]) -> None:
     """Write ``quality/index.html`` beside the pictures.
 
     Args:
         folder: of the stage.
+        flows: of cameras whose motion was measured in one light; their pictures are in ``quality/flow``.
         notes: sentences the operator should read first.
     """
-    cameras = [_page_of(name, images) for name in dict.fromkeys(image.camera for image in images)]
+    flow_of = {flow.camera: flow for flow in flows}
+    cameras = [_page_of(name, images, flow_of.get(name)) for name in dict.fromkeys(image.camera for image in images)]
     text = page_template(TEMPLATE).render(cameras=cameras, notes=notes, width=WIDTH, height=HEIGHT, stops=STOPS)
     write_atomic(folder / "quality" / "index.html", text.encode())
 
 
-def _page_of(name: str, images: Sequence[ImageQuality]) -> CameraPage:
+def _page_of(name: str, images: Sequence[ImageQuality], flow: CameraFlow | None) -> CameraPage:
     own = tuple(image for image in images if image.camera == name)
     levels = np.sum([image.levels for image in own], axis=0, dtype=float)
     share = levels / max(levels.sum(), 1)
@@ -65,6 +69,7 @@ def _page_of(name: str, images: Sequence[ImageQuality]) -> CameraPage:
         images=own,
         motion=tuple((image.light, image.motion_px, image.motion_error_px) for image in own),
         coverage=tuple((fdi, _coverage(own, fdi)) for fdi in own[0].valid_by_tooth),
+        flow=flow,
         levels=tuple((float(one), float(HEIGHT * one / max(share.max(), 1e-9))) for one in share),
         noise=points,
         most_noise=100 * most,

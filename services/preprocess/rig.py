@@ -17,6 +17,7 @@ from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import write_array
 from services.preprocess.source import Image, LightImage, Motions, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws
+from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import Window, bands
 
 # Below this, resampling would blur more than it aligns
@@ -92,6 +93,16 @@ class RigSource:
             return array[view.number, frame.index, motion.window.rows, motion.window.columns]
 
         return motion.measure(frames, picture, level)
+
+    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+        """See ``Source``."""
+        motion = self._motion(view)
+        array = StoredArray(self.root / "capture.zarr")
+
+        def picture(frame: FrameRecord) -> NDArray[np.uint16]:
+            return array[view.number, frame.index, motion.window.rows, motion.window.columns]
+
+        return motion.seen_flow(picture, motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``: one frame at a time, its radiance and its variance."""

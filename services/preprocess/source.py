@@ -14,6 +14,7 @@ from services.core.geometry import Camera
 from services.core.records import FolderCapture
 from services.preprocess.colours import FrameColour
 from services.preprocess.projection import Footprint
+from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -105,6 +106,9 @@ class Source(Protocol):
         Raises:
             CaptureInputError: moved too far to be aligned; names the frame and the camera.
         """
+
+    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+        """What flow sees before and after the motion is taken out; None where no two frames share their light."""
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """Light index and image, one at a time.

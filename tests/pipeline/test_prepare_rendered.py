@@ -184,6 +184,14 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
         (root / "prepared" / "quality" / f"{image.camera}_{image.light}.png").stat().st_size > 1000
         for image in report.images
     )
+    # Flow knows nothing of the scan: it sees the motion, and little but its own errors of some 0.2 px once it is taken out
+    assert [flow.camera for flow in report.flows] == [camera.name for camera in rendered.cameras]
+    for flow in report.flows:
+        assert flow.before_px[0] > 2
+        assert flow.after_px[0] < 0.35
+        for name in ("before", "after"):
+            assert (root / "prepared" / "quality" / "flow" / f"{flow.camera}_{name}.png").stat().st_size > 1000
+            assert f'src="flow/{flow.camera}_{name}.png"' in (root / "prepared" / "quality" / "index.html").read_text()
     # No light was named and the capture marks none: every fourth is kept from the fit, in all cameras
     assert manifest.held_out == tuple((camera.name, f"l{k}") for camera in rendered.cameras for k in (3, 7, 11))
 

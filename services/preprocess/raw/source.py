@@ -19,6 +19,7 @@ from services.preprocess.raw.view import RawView
 from services.preprocess.rig import MIN_TRACKING
 from services.preprocess.source import LightImage, Motions, View
 from services.preprocess.stabilisation.motion import ViewMotion, exposures_together, frames_to_match, jaws
+from services.preprocess.stabilisation.seen import SeenFlow
 
 
 class RawSource:
@@ -90,6 +91,11 @@ class RawSource:
             return raw.brightness([taken[one.index] for one in together.get(row.index, (row,))])
 
         return raw.motion.measure(frames, picture)
+
+    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+        """See ``Source``."""
+        raw, taken = self._raw_view(view), self._of(view.whole.name)
+        return raw.motion.seen_flow(lambda row: raw.brightness([taken[row.index]]), motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``: the exposures of one light at a time, merged."""

@@ -13,6 +13,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import Motions, View
+from services.preprocess.stabilisation.seen import SeenFlow, seen_flow
 from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
 from services.preprocess.window import Window
 
@@ -165,6 +166,23 @@ class ViewMotion:
             if seen.any():
                 np.copyto(places, body.places(coefficients, own_rows, columns), where=seen)
         return places
+
+    def seen_flow(self, picture: Callable[[FrameRecord], NDArray[np.generic]], motions: Motions) -> SeenFlow | None:
+        """Flow of the tracking frame that moved most, before and after; None where fewer than two share their light.
+
+        Args:
+            picture: values in ``window`` of a frame. motions: of all ``frames_to_match``.
+        """
+        if not self._interpolated or len(self._used) < 2 or not self._bodies:
+            return None
+        moves = [self.at(frame, motions) for frame in self._used]
+        farthest = max(range(len(moves)), key=lambda k: moves[k].median_px)
+        # The first frame has not moved; where none has, any other shows as much
+        farthest = farthest or len(moves) - 1
+        places = self.places(moves[farthest], slice(0, self._view.window.shape[0]))
+        first, moved = (picture(self._used[k]) for k in (0, farthest))
+        teeth = self._view.footprint.covered & np.any([body.seen[self._inner] for body in self._bodies], axis=0)
+        return seen_flow(self._used[farthest].index, first, moved, self._inner, places, teeth)
 
     def stored(self, displacement: Displacement) -> Image:
         """Displacement (h, w, 2) at every ``stored_step``-th pixel of the whole image that lies in the view.

@@ -3,6 +3,7 @@
 ::
 
     look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows are asked for
+                                                 └──> compare (camera), where motion is measured
 
 One block writes an image's shards and no other does.
 """
@@ -24,15 +25,16 @@ from services.preprocess.masking.shade import shade
 from services.preprocess.masking.valid import require_seen, valid_bits
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, by_stop, write_picture
-from services.preprocess.source import Bits, LightImage, Source, View
+from services.preprocess.quality_flow import camera_flow, write_flow
+from services.preprocess.source import Bits, LightImage, Motions, Source, View
 from services.preprocess.stabilisation.motion import stored_step
 from services.preprocess.subject import NOTHING, Subject, read_subject
-from services.preprocess.tasks.records import FrameMotion, ImageDone
+from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
 from services.preprocess.tasks.workshop import Workshop
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
 """Pixels that tell nothing of an image's levels and noise."""
-Step = Literal["look", "match", "develop", "shade"]
+Step = Literal["look", "match", "compare", "develop", "shade"]
 BLOCKS_PER_THREAD = 4
 """So many blocks for each thread leave none without work for long at the end."""
 LARGEST_BLOCK = 8
@@ -78,8 +80,11 @@ class Block:
         if self.step == "shade":
             shade(self.workshop, source, subject, view, context)
             return
-        lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
         motions = self.workshop.motions(self.camera, source.matched(self.camera))
+        if self.step == "compare":
+            _compare(self.workshop, source, view, motions)
+            return
+        lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
         desk = Desk(self.workshop, source, subject, HandMasks(context.root, source.description), view)
         began_s = time.monotonic()
         for light, image in source.images(view, lights, motions):
@@ -122,6 +127,15 @@ def _look(workshop: Workshop, source: Source, subject: Subject, camera: int) -> 
     for light in sorted(set(range(valid.shape[1])) - set(source.lights_of(camera))):
         valid[camera, light] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
     workshop.put_view(view)
+
+
+def _compare(workshop: Workshop, source: Source, view: View, motions: Motions) -> None:
+    """Draw what flow sees before and after the motion is taken out."""
+    seen = source.seen_flow(view, motions)
+    flow = None if seen is None else camera_flow(view.whole.name, seen)
+    if seen is not None and flow is not None:
+        write_flow(workshop.folder / "quality" / "flow", seen, flow)
+    workshop.put_flow(view.number, FlowDone(flow=flow))
 
 
 @dataclass(frozen=True)

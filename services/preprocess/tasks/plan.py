@@ -12,7 +12,7 @@ from services.preprocess.masking.masks import HandMasks
 from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
 
-FORMAT = 8
+FORMAT = 9
 """Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
 INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
 """Options that change no pixel."""

@@ -7,7 +7,7 @@ from pydantic import Field
 from services.core.geometry import Record
 from services.preprocess.brightness import ImageLight
 from services.preprocess.colours import FrameColour
-from services.preprocess.quality import ImageQuality
+from services.preprocess.quality import CameraFlow, ImageQuality
 from services.preprocess.window import Window
 
 
@@ -27,6 +27,12 @@ class FrameMotion(Record):
     coefficients: tuple[tuple[tuple[float, float], ...], ...] = Field(
         description="(bodies, terms, 2) of the displacement in pixels since the first frame"
     )
+
+
+class FlowDone(Record):
+    """It was looked at what flow sees of a camera's motion."""
+
+    flow: CameraFlow | None = Field(description="null where no two frames share their light")
 
 
 class StoredFile(Record):

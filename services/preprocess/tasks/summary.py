@@ -74,8 +74,10 @@ def summarise(
         done.quality.model_copy(update={"valid_by_tooth": dict(zip(fdi, done.tooth_pixels, strict=True))})
         for done in images
     )
-    write_record(workshop.folder / "quality.json", QualityReport(images=covered))
-    write_page(workshop.folder, covered, notes)
+    looked_at = [workshop.flow(k) for k in range(len(source.description.cameras))]
+    flows = tuple(done.flow for done in looked_at if done is not None and done.flow is not None)
+    write_record(workshop.folder / "quality.json", QualityReport(images=covered, flows=flows))
+    write_page(workshop.folder, covered, flows, notes)
     _copy_meshes(source.root, workshop.folder, fdi)
     # What a kill has left of a file that was being written
     for partial in workshop.folder.rglob("*.partial"):

@@ -6,7 +6,7 @@
       .prepared.<attempt>/      the store being written
       .prepared.work/
         plan.json               digest of all that the store depends on
-        <camera>/               footprint and black image as .npy, view.json, measures.json, motion-<frame>.json, image-<light>.json
+        <camera>/               footprint and black image as .npy, view.json, measures.json, motion-<frame>.json, flow.json, image-<light>.json
 
 A record is written last, once what it speaks of is on the disk, so a kill at any moment costs what was being made and nothing else.
 """
@@ -27,7 +27,7 @@ from services.core.store import StageWriter, write_atomic, write_record
 from services.preprocess.projection import Footprint
 from services.preprocess.scratch import write_array
 from services.preprocess.source import Motions, View
-from services.preprocess.tasks.records import FrameMotion, ImageDone, StoredFile, ViewDone
+from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, StoredFile, ViewDone
 
 R = TypeVar("R", bound=Record)
 STAGE = "prepared"
@@ -126,6 +126,14 @@ class Workshop:
         """What is known of some frames' motion."""
         found = {frame: _read(self.scratch(camera) / f"motion-{frame}.json", FrameMotion) for frame in frames}
         return {frame: np.asarray(one.coefficients) for frame, one in found.items() if one is not None}
+
+    def put_flow(self, camera: int, done: FlowDone) -> None:
+        """Say that a camera's flow was looked at and its pictures are written."""
+        self._put(self.scratch(camera) / "flow.json", done)
+
+    def flow(self, camera: int) -> FlowDone | None:
+        """What flow sees of a camera's motion; None where it was not looked at yet."""
+        return _read(self.scratch(camera) / "flow.json", FlowDone)
 
     def put_image(self, camera: int, light: int, done: ImageDone) -> None:
         """Say that an image is stored."""

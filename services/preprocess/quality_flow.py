@@ -1,0 +1,50 @@
+"""What flow sees in one camera before and after its motion is taken out, in numbers and two small pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.preprocess.quality import PICTURE_PX, CameraFlow
+from services.preprocess.stabilisation.seen import SeenFlow
+
+Image = NDArray[np.float32]
+LEAST_SCALE_PX = 0.5
+"""Flow drawn in full colour is no less: smaller ones are the flow's own errors and would look like motion."""
+
+
+def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
+    """Numbers of a flow; None where it shows no tooth."""
+    if not flow.teeth.any():
+        return None
+    lengths = [np.linalg.norm(field[flow.teeth], axis=-1) for field in (flow.before, flow.after)]
+    before, after = ((float(np.median(one)), float(np.quantile(one, 0.95))) for one in lengths)
+    return CameraFlow(
+        camera=camera, frame=flow.frame, before_px=before, after_px=after, scale_px=max(before[1], LEAST_SCALE_PX)
+    )
+
+
+def write_flow(folder: Path, flow: SeenFlow, numbers: CameraFlow) -> None:
+    """Write ``<camera>_before.png`` and ``<camera>_after.png``: hue is direction, pure colour is ``scale_px`` or more, white is none."""
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    step = max(1, -(-max(flow.teeth.shape) // PICTURE_PX))
+    for name, field in (("before", flow.before), ("after", flow.after)):
+        picture = _picture(field[::step, ::step], flow.teeth[::step, ::step], numbers.scale_px)
+        cv2.imwrite(str(folder / f"{numbers.camera}_{name}.png"), picture)
+
+
+def _picture(field: Image, teeth: NDArray[np.bool_], scale_px: float) -> NDArray[np.uint8]:
+    """Blue, green, red (h, w, 3); black beside the teeth."""
+    import cv2
+
+    length, angle_deg = cv2.cartToPolar(field[..., 0], field[..., 1], angleInDegrees=True)
+    # OpenCV's hue of a byte counts in steps of two degrees
+    hue, colour = angle_deg / 2 % 180, 255 * np.minimum(length / scale_px, 1)
+    bright = np.where(teeth, np.float32(255), np.float32(0))
+    return np.asarray(
+        cv2.cvtColor(np.stack([hue, colour, bright], axis=-1).astype(np.uint8), cv2.COLOR_HSV2BGR), dtype=np.uint8
+    )

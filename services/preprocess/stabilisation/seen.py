@@ -1,0 +1,82 @@
+"""What dense optical flow sees between two tracking frames, before and after the measured motion is taken out.
+
+Flow knows neither the scan nor the motion that was measured, so what it still sees afterwards is an independent judgement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+FLOW_SIDE_PX = 1500
+"""Longer side of the images compared: flow has errors of some 0.1 px of its own, and a larger image takes seconds."""
+
+
+@dataclass(frozen=True)
+class SeenFlow:
+    """Flow from the first tracking frame to the one that moved most.
+
+    Attributes:
+        frame: number of that frame.
+        before, after: (h, w, 2), pixels of the photograph, x and y, at every pixel of the reduced view.
+        teeth: (h, w), which of them show teeth.
+    """
+
+    frame: int
+    before: Image
+    after: Image
+    teeth: NDArray[np.bool_]
+
+
+def seen_flow(
+    frame: int,
+    reference: NDArray[np.generic],
+    moved: NDArray[np.generic],
+    inner: tuple[slice, slice],
+    places: Image,
+    seen: NDArray[np.bool_],
+) -> SeenFlow:
+    """Flow before and after a frame is sampled at the places where its pixels went.
+
+    Args:
+        reference, moved: first tracking frame and another, each (H, W) or (H, W, C), in the window around the view.
+        inner: the view in that window, (h, w) pixels.
+        places: (2, h, w), x and y as indices into ``moved``.
+        seen: (h, w), which pixels show teeth.
+    """
+    import cv2
+
+    grey = _grey(moved)
+    back = cv2.remap(grey, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    factor = max(1, -(-max(seen.shape) // FLOW_SIDE_PX))
+    size = max(1, seen.shape[1] // factor), max(1, seen.shape[0] // factor)
+    first, second, third = (
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (_grey(reference)[inner], grey[inner], back)
+    )
+    teeth = cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    # One scale for all, or a change of exposure would be seen as a change of place
+    low, high = np.quantile(first[teeth], [0.01, 0.99]) if teeth.any() else (0.0, 1.0)
+    first, second, third = (
+        (255 * np.clip((image - low) / max(high - low, 1e-30), 0, 1)).astype(np.uint8)
+        for image in (first, second, third)
+    )
+    scale = np.array([seen.shape[1] / size[0], seen.shape[0] / size[1]], dtype=np.float32)
+    return SeenFlow(frame, scale * _flow(first, second), scale * _flow(first, third), teeth)
+
+
+def _flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Image:
+    """Dense inverse search (Kroeger et al. 2016) down to the finest scale; none in images smaller than its patches."""
+    import cv2
+
+    if min(first.shape) < 16:
+        return np.zeros((*first.shape, 2), dtype=np.float32)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    return np.asarray(flow.calc(first, second, None), dtype=np.float32)
+
+
+def _grey(image: NDArray[np.generic]) -> Image:
+    return np.asarray(image if image.ndim == 2 else image.mean(axis=-1), dtype=np.float32)
