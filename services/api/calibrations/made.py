@@ -26,5 +26,7 @@ def made_by(jobs: Jobs, job_id: str) -> Calibration:
         )
     if job.state is not JobState.SUCCEEDED:
         raise JobStateError(f"Job {job.id} is {job.state} and has no calibration to keep; wait until it has succeeded.")
-    folder, _ = open_stage(jobs.folder(job.id), "asset", AssetManifest)
+    folder, manifest = open_stage(jobs.folder(job.id), "asset", AssetManifest)
+    if CALIBRATION_FILE not in manifest.files:
+        raise JobStateError(f"Job {job.id} published no {CALIBRATION_FILE}; submit it again.")
     return read_record(folder / CALIBRATION_FILE, Calibration)
