@@ -100,7 +100,7 @@ def test_a_queued_job_waits_for_those_before_it(
     running = submit_held(server, held, capture)
     queued, last = submit(server, capture), submit(server, capture)
     own, first, second = (server.get(f"/v1/jobs/{job}").json()["remaining"] for job in (running, queued, last))
-    assert own["past_jobs"] == first["past_jobs"] == second["past_jobs"] == 5
+    assert own["past_jobs"] == first["past_jobs"] == second["past_jobs"] == 5, (own, first, second)
     for told, truth_s in ((own, 1000.0), (first, 2000.0), (second, 3000.0)):
         assert told["low_s"] < truth_s < told["high_s"] < 2 * truth_s
 
