@@ -41,8 +41,6 @@ def main() -> NoReturn:
 def build_app() -> typer.Typer:
     """Put the commands together."""
     from services.cli.bench import bench
-    from services.cli.board import board_command
-    from services.cli.calibrate import calibrate_command
     from services.cli.capture import capture
     from services.cli.client.cancel import cancel
     from services.cli.client.delete import delete
@@ -57,11 +55,13 @@ def build_app() -> typer.Typer:
     from services.cli.dask import add_dask_commands
     from services.cli.dome_sim import dome_sim
     from services.cli.export import export
-    from services.cli.import_folder import import_command
     from services.cli.lab_demo import lab_demo
     from services.cli.options import options
     from services.cli.phantom import phantom
-    from services.cli.register import register
+    from services.cli.raw.board import board_command
+    from services.cli.raw.calibrate import calibrate_command
+    from services.cli.raw.import_folder import import_command
+    from services.cli.raw.register import register
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
     from services.cli.serve import serve

@@ -107,6 +107,8 @@ def _note(event: JobEvent) -> str:
     held_out, se = event.data.get("held_out_error"), event.data.get("held_out_se")
     if event.kind != "step" or not isinstance(held_out, float):
         return event.message
+    if isinstance(se, float) and se >= held_out:
+        return f"{event.message.rstrip('.')}; held-out error not yet told from the renders' noise."
     spread = f" ± {100 * se:.1f}" if isinstance(se, float) else ""
     return f"{event.message.rstrip('.')}; held-out error {100 * held_out:.1f}{spread} %."
 

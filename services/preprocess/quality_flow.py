@@ -11,7 +11,7 @@ from services.preprocess.quality import PICTURE_PX, CameraFlow
 from services.preprocess.stabilisation.seen import SeenFlow
 
 Image = NDArray[np.float32]
-LEAST_SCALE_PX = 0.5
+MIN_SCALE_PX = 0.5
 """Flow drawn in full colour is no less: smaller ones are the flow's own errors and would look like motion."""
 
 
@@ -22,7 +22,7 @@ def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
     lengths = [np.linalg.norm(field[flow.teeth], axis=-1) for field in (flow.before, flow.after)]
     before, after = ((float(np.median(one)), float(np.quantile(one, 0.95))) for one in lengths)
     return CameraFlow(
-        camera=camera, frame=flow.frame, before_px=before, after_px=after, scale_px=max(before[1], LEAST_SCALE_PX)
+        camera=camera, frame=flow.frame, before_px=before, after_px=after, scale_px=max(before[1], MIN_SCALE_PX)
     )
 
 
