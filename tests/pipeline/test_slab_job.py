@@ -250,9 +250,9 @@ def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec:
         list(run_wavelengths(first, [task], workers=1, told=cut_short))
     stood: list[Standing] = []
     list(run_wavelengths(second, [task], workers=1, told=lambda _, standing: stood.append(standing)))
-    # The last stage and what is rendered after it alone; the search and the first stage had more blocks than that.
-    assert stood[0].stage == 1
-    assert len(second.ran) < len(first.ran)
+    # A fit from the start would tell of stage 0 first.
+    assert first.ran
+    assert {standing.stage for standing in stood} == {1}
     kept = read_kept(task.place)
     assert kept is not None
     for name in ("parameters", "phase", "errors"):

@@ -21,8 +21,8 @@ ROUGHNESS = np.geomspace(0.02, 0.45, 30)
 """Of the distributions tried, in steps of 11 %. The last hardly falls within the profile: it proves no reflection."""
 SIGMA = 5.0
 """A lobe's amplitude is told from none by so many standard errors."""
-CORE_SHARE = 0.1
-"""Least part of its light that a lobe's core reflects: errors of shading reach 0.09 where none is, GGX 0.3 has 0.25."""
+CORE_SHARE = 0.15
+"""Least part of its light that a lobe's core reflects: errors of shading reach 0.12 where none is, GGX 0.3 has 0.25."""
 DIFFUSE_ERROR = 0.02
 """Error of the diffuse light at one angle, as a part of the image's mean or of what is there, whichever is more."""
 SHAPE_ERROR = 0.1

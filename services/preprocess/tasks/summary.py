@@ -54,7 +54,10 @@ def summarise(
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:
         if brightness.dark:
-            what, remedy = "is dark: no tooth is above the noise", "check exposure and lights, then capture again"
+            what, remedy = (
+                "is dark: no tooth is above the noise",
+                "check exposure, lights and noise, then capture again",
+            )
         elif all(max(report.masked, key=report.masked.__getitem__, default="") == "motion" for report in reports):
             what = "lacks a valid tooth pixel, mostly as motion is not known there"
             remedy = "see that its frames are listed in the order taken, or have time_s, and that tracking frames stand between the lights"
