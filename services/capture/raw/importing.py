@@ -224,7 +224,7 @@ def _of_a_scan(file: str, camera: str) -> bytes:
     lines = ["", "[scan]", f'file = "{file}"', 'units = "mm"', 'jaw = "upper"', ""]
     lines += ["[[landmark]]", "tooth = ?", 'point = "edge"', "xyz_mm = [?, ?, ?]"]
     lines += [f'pixels = [{{camera = "{camera}", xy_px = [?, ?]}}]']
-    return "".join(f"# {line}\n" if line else "\n" for line in lines).encode()
+    return _commented(lines)
 
 
 def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
@@ -235,4 +235,8 @@ def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> byte
     for one in shown:
         entry = _frame(one, exposure_s) | {THING_OF[one.kind]: one.kind}
         lines += ["", "[[frame]]", *(f"{name} = {toml_value(value)}" for name, value in entry.items())]
+    return _commented(lines)
+
+
+def _commented(lines: Iterable[str]) -> bytes:
     return "".join(f"# {line}\n" if line else "\n" for line in lines).encode()
