@@ -14,6 +14,7 @@ import numpy as np
 
 from services.capture.raw.names import NamedFrame, named_frame
 from services.core.errors import CaptureInputError
+from services.core.files.scans import FORMATS
 from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import THING_OF, RawFolder
@@ -21,7 +22,6 @@ from services.core.raw.toml_writing import description_toml, toml_value
 from services.core.store import write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
-SCANS = frozenset({".ply", ".stl", ".obj", ".vtp"})
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits that analogue-to-digital converters of cameras have."""
 LOOKED_AT = 8
@@ -101,7 +101,7 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         raise CaptureInputError(
             f"{which} not say the exposure; rename them, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
         )
-    scans = sorted(p.name for p in root.iterdir() if p.suffix.lower() in SCANS)
+    scans = sorted(p.name for p in root.iterdir() if p.suffix.lower() in FORMATS)
     content = (
         description_toml(_tree(root, frames, exposure_s, mosaic, calibration))
         + _to_complete(frames, exposure_s)
